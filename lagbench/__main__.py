@@ -30,7 +30,7 @@ FAILED = 5
 PIPE_CLOSED = 141
 """Exit code that shells report when the reader of a pipe left, 128 + SIGPIPE."""
 
-RESUMABLE_COMMANDS = {"demo", "generate", "download", "train"}
+RESUMABLE_COMMANDS = {"demo", "generate", "download", "train", "season"}
 """Commands that go on where they stopped."""
 
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -202,8 +202,9 @@ def _interruption_message(command: str | None) -> str:
     if command not in RESUMABLE_COMMANDS:
         return "lagbench: interrupted"
     same_command = "the same command"
-    if "--force" in sys.argv:
-        same_command += ", without --force,"
+    for option in ("--force", "--again"):
+        if option in sys.argv:
+            same_command += f", without {option},"
     return f"lagbench: interrupted; {same_command} goes on where it stopped"
 
 

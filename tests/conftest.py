@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -44,6 +44,9 @@ from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 from lagbench.work.progress import Meter
 from lagbench.work.run import ONE_THREAD
+
+if TYPE_CHECKING:
+    from model_board import ModelBoard
 
 # Hypothesis draws the same examples every time: a failure appears to whoever caused it,
 # not by chance to somebody else.
@@ -317,6 +320,19 @@ def generated(
 ) -> GenerationResult:
     """The tiny curl-noise data, generated once and compared with no hash."""
     return tiny_split(SPLIT, "generated", workers=2, registry=unmeasured)
+
+
+@pytest.fixture(scope="session")
+def model_board(home: Path, generated: GenerationResult) -> ModelBoard:
+    """A leaderboard with an entry whose weights lie beside it.
+
+    Do not change the files.
+    """
+    from model_board import make_bench
+
+    folder = home / "model-board"
+    with FileLock(folder.with_suffix(".lock")):
+        return make_bench(folder, generated.root)
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,16 @@ from lagbench.errors import UsageError
 from lagbench.submission.issues import ValidationIssue
 
 from .entry_file import MAX_ENTRY_BYTES
-from .folder import DEPTH, REFERENCES, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
+from .folder import (
+    DEPTH,
+    REFERENCES,
+    SCORES,
+    SEASONS,
+    SUBMISSIONS,
+    VERIFIED,
+    WEIGHTS,
+    Folder,
+)
 from .issues import make_issue
 from .verified import MOST_LIST_BYTES
 
@@ -58,6 +67,8 @@ def check_base(
         if path == Path(VERIFIED):
             if not _lost_own_lines_only(folder, start, own_methods):
                 yield _maintained_issue(path, verb)
+        elif path.parts[0] == SEASONS:
+            yield _maintained_issue(path, verb)
         elif path.parts[0] == REFERENCES:
             if path in paths_at_start:
                 yield _maintained_issue(path, verb)

@@ -23,10 +23,12 @@ from lagbench.submission.issues import ValidationIssue
 from .entry import Entry, EntryBudget, Prediction, Status, Summary
 from .entry_file import examine, load_plain
 from .fields import latest_date
-from .folder import VERIFIED, Folder, Place, entry_path
+from .folder import SEASONS, VERIFIED, Folder, Place, entry_path
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
 from .ranking import TOLERANCE, combine, dataset_of, is_current, summarise
+from .season import read_season
+from .season_run import read_scores
 from .verified import read_verified, verification_of
 from .weights import check_weights
 
@@ -67,6 +69,7 @@ class FolderChecks:
         self._check_names()
         self._check_stray_score_files()
         self._check_verified()
+        self._check_seasons()
 
     def _add(
         self,
@@ -416,6 +419,18 @@ class FolderChecks:
                 names.add(entry.yaml_path.as_posix())
         for name in sorted(verified.keys() - names):
             self._add("verified", VERIFIED, ascii(name)[:120])
+
+    def _check_seasons(self) -> None:
+        """Check that seeds and scores of seasons follow from their frozen models."""
+        names = {path.parts[1] for path in self.folder.season_files()}
+        for name in sorted(names):
+            try:
+                season = read_season(self.folder, name)
+                read_scores(self.folder, season)
+            except LagbenchError as error:
+                self.issues.append(
+                    issue_from_error("season", error, error.where or SEASONS)
+                )
 
 
 def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:

@@ -157,6 +157,13 @@ CHECKS: Mapping[str, BoardCheck] = {
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
+    "season": BoardCheck(
+        "a file of a blind season that cannot be read, or whose seeds, scenarios or "
+        "models are not those that were frozen",
+        "a season is not the one that was closed",
+        "what `lagbench season close` and `lagbench season run` wrote",
+        "restore the files of the commit that closed the season",
+    ),
     "base": BoardCheck(
         "a change to an entry that was there before: edited, removed, superseded or "
         "withdrawn",

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import subset_hash
+from lagbench.data.layout import SEASON_PREFIX
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Measured, Registry, Size, Split
 from lagbench.errors import ChecksFailedError, UsageError, suggest_name
@@ -194,7 +195,7 @@ def season_root(name: str, root: str | Path | None = None) -> Path:
 
     No split can have its name, because of the dot.
     """
-    return resolve_root(root) / f"season.{name}"
+    return resolve_root(root) / f"{SEASON_PREFIX}{name}"
 
 
 def read_season(folder: Folder, name: str) -> Season:

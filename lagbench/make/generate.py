@@ -600,8 +600,13 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
 
 
 def _describe(setup: _Setup, store: Publication | None, manifest: Manifest) -> None:
-    """Write the cards, and bring the store to the state of the folder."""
+    """Write the cards, and bring the store to the state of the folder.
+
+    Blind scenarios of a season have no card: it would say how to make the public ones.
+    """
     size = setup.size
+    if size.draw_seed is not None:
+        return
     setup.meter.begin("cards", total=1, scenarios=len(manifest.files))
     if store is None:
         write_cards(setup.root, size, setup.split, manifest)

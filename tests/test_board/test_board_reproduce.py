@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import torch
-import yaml
-from simple_models import SMALL
+from model_board import NAME, PATH, ModelBoard
 from typer.testing import Result
 
-from lagbench.baselines.checkpoint import Checkpoint, round_weights, save
-from lagbench.baselines.dataset_info import read_dataset_info
-from lagbench.baselines.operators.gns import GNS
-from lagbench.baselines.predict import predict
-from lagbench.baselines.simulator import GraphNetwork
-from lagbench.board.check import CheckResult, check_board
-from lagbench.board.entry import Level, Meta
+from lagbench.board.entry import Level
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import (
     TOLERANCE,
@@ -29,110 +20,19 @@ from lagbench.board.reproduce import (
     reproduce,
     sample_scenarios,
 )
-from lagbench.board.submit import submit
 from lagbench.board.verified import read_verified
 from lagbench.data.checksums import file_sha256
-from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.make.generate import GenerationResult
-from lagbench.submission import open_predictions, write
-
-NAME = "curl-noise/tiny/gns"
-PATH = "submissions/curl-noise/tiny/gns.yaml"
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A leaderboard with the entry gns, whose weights lie beside it, and its data."""
-
-    folder: Path
-    root: Path
-    predictions: Path
-
-    @property
-    def weights(self) -> Path:
-        """The weights on the board."""
-        return self.folder / "weights/curl-noise/tiny/gns_0.pt"
-
-    def shifted(self, distance: float) -> Path:
-        """Write the predictions with every particle shifted a little."""
-        size = load().size("curl-noise", "tiny")
-        positions = {}
-        with open_predictions(self.predictions) as opened:
-            for scenario in size.subsets["test"]:
-                blocks = [block for _, block in opened.blocks(scenario)]
-                position = np.concatenate(blocks)
-                positions[scenario] = position + distance * np.sin(1e3 * position)
-        return write(
-            self.folder.parent / f"shifted-{distance}.nc",
-            positions,
-            method="gns",
-            split="curl-noise",
-            size="tiny",
-            seed=0,
-            parameters=7,
-        )
-
-    def submit(self, path: Path, **options: Any) -> None:
-        """Submit predictions of gns."""
-        meta = Meta(authors=("A. Author",), command="make")
-        submit(
-            [path], meta, board=self.folder, root=self.root, new_board=True, **options
-        )
-
-    def edit(self, path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-        """Change a YAML file of the board by hand."""
-        content = yaml.safe_load(path.read_text())
-        change(content)
-        path.write_text(yaml.safe_dump(content, sort_keys=False))
-
-    def find(self, **options: Any) -> CheckResult:
-        """Check the board."""
-        return check_board(self.folder, root=self.root, isolated=False, **options)
-
-
-@pytest.fixture(scope="module")
-def master(
-    tmp_path_factory: pytest.TempPathFactory, generated: GenerationResult
-) -> Bench:
-    """A small network that moves particles at random, predicted and submitted."""
-    folder = tmp_path_factory.mktemp("reproduce")
-    info = read_dataset_info("curl-noise", "tiny", root=generated.root)
-    torch.manual_seed(3)
-    model = GraphNetwork.with_operator(GNS).build(SMALL, info)
-    last_layer = model.network.decoder[-1]
-    assert isinstance(last_layer, torch.nn.Linear)
-    torch.nn.init.normal_(last_layer.weight, std=0.1)
-    recipe = {"name": "curl-noise/tiny", "training": {"seed": 0}}
-    checkpoint = Checkpoint(
-        baseline="gns",
-        options=SMALL,
-        info=info,
-        weights=round_weights(model),
-        training={"step": 5, "recipe": recipe},
-    )
-    save(folder / "weights.pt", checkpoint)
-    predict(
-        folder / "weights.pt",
-        folder / "predictions.nc",
-        root=generated.root,
-        device="cpu",
-        threads=1,
-        method="gns",
-    )
-    bench = Bench(folder / "board", generated.root, folder / "predictions.nc")
-    bench.submit(bench.predictions, weights=[folder / "weights.pt"])
-    return bench
 
 
 @pytest.fixture
-def own(master: Bench, tmp_path: Path) -> Bench:
+def own(model_board: ModelBoard, tmp_path: Path) -> ModelBoard:
     """A copy of the leaderboard that the test may change."""
-    shutil.copytree(master.folder, tmp_path / "board")
-    return replace(master, folder=tmp_path / "board")
+    shutil.copytree(model_board.folder, tmp_path / "board")
+    return replace(model_board, folder=tmp_path / "board")
 
 
-def run_again(own: Bench, *names: str, **options: Any) -> ReproduceResult:
+def run_again(own: ModelBoard, *names: str, **options: Any) -> ReproduceResult:
     """Reproduce entries without costs."""
     defaults: dict[str, Any] = {"costs": False}
     return reproduce(
@@ -143,7 +43,7 @@ def run_again(own: Bench, *names: str, **options: Any) -> ReproduceResult:
     )
 
 
-def test_a_model_gives_the_scores_of_its_entry(own: Bench) -> None:
+def test_a_model_gives_the_scores_of_its_entry(own: ModelBoard) -> None:
     """Its line says so, it is not run twice, and the board has nothing to object."""
     result = run_again(own, NAME, costs=True, time_solver=lambda *_: 0.5)
     assert (result.exit_code, result.predicted) == (0, [f"{NAME}, seed 0"])
@@ -166,7 +66,7 @@ def test_a_model_gives_the_scores_of_its_entry(own: Bench) -> None:
     assert own.find().findings == ()
 
 
-def test_a_model_that_gives_other_scores(own: Bench) -> None:
+def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
     """An entry whose score file belongs to other predictions is not reproduced."""
     weights = own.weights.read_bytes()
     own.submit(own.shifted(0.01), replace=True)
@@ -188,7 +88,7 @@ def test_a_model_that_gives_other_scores(own: Bench) -> None:
     assert line.reproduced[0].difference > TOLERANCE
 
 
-def test_a_line_holds_for_its_models_only(own: Bench) -> None:
+def test_a_line_holds_for_its_models_only(own: ModelBoard) -> None:
     """Other weights of the same predictions make the line stale."""
     run_again(own, NAME)
     own.edit(
@@ -198,7 +98,7 @@ def test_a_line_holds_for_its_models_only(own: Bench) -> None:
     assert [issue.check for issue in own.find().findings] == ["verified"]
 
 
-def test_what_cannot_be_run_is_refused(own: Bench) -> None:
+def test_what_cannot_be_run_is_refused(own: ModelBoard) -> None:
     """A model that was exchanged, an entry without a model, an unknown entry."""
     own.weights.write_bytes(own.weights.read_bytes() + b"1")
     with pytest.raises(ChecksFailedError) as caught:
@@ -216,7 +116,7 @@ def test_what_cannot_be_run_is_refused(own: Bench) -> None:
             run_again(own, name)
 
 
-def test_predictions_made_anew_confirm_within_the_tolerance(own: Bench) -> None:
+def test_predictions_made_anew_confirm_within_the_tolerance(own: ModelBoard) -> None:
     """Positions that differ by 1e-7 confirm the entry; those 1e-2 away do not."""
     near = own.find(predictions=[own.shifted(1e-7)])
     assert near.findings == ()
@@ -237,7 +137,9 @@ def test_a_sample_is_the_same_in_every_run() -> None:
     assert sample_scenarios(scenarios, "1", None) == tuple(scenarios)
 
 
-def test_the_command_says_what_it_did(own: Bench, run: Callable[..., Result]) -> None:
+def test_the_command_says_what_it_did(
+    own: ModelBoard, run: Callable[..., Result]
+) -> None:
     """Options that contradict each other are refused before any work."""
     board = ("--board", own.folder)
     for words in ((), (NAME, "--all"), (NAME, "--costs", "--no-costs")):

@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from lagbench.__main__ import app
-from lagbench.cli.commands import COMMANDS, LEADERBOARD_COMMANDS
+from lagbench.cli.commands import COMMANDS, LEADERBOARD_COMMANDS, SEASON_COMMANDS
 from lagbench.cli.lazy_group import CommandEntry
 
 Run = Callable[..., Result]
 
-ENTRIES = (*COMMANDS, *LEADERBOARD_COMMANDS)
+ENTRIES = (*COMMANDS, *LEADERBOARD_COMMANDS, *SEASON_COMMANDS)
 LOADED_MODULES = """
 import sys
 from typer.testing import CliRunner
@@ -37,6 +37,8 @@ def path_of(entry: CommandEntry) -> tuple[str, ...]:
     """Return the words by which a command is called."""
     if entry in LEADERBOARD_COMMANDS:
         return ("leaderboard", entry.name)
+    if entry in SEASON_COMMANDS:
+        return ("season", entry.name)
     return (entry.name,)
 
 
@@ -62,7 +64,7 @@ def test_the_help_lists_all_commands_in_the_order_of_use(run: Run) -> None:
 
 
 def test_the_help_of_a_group_loads_no_command() -> None:
-    modules = loaded_modules([["--help"], ["leaderboard", "--help"], ["--version"]])
+    modules = loaded_modules([["--help"], ["leaderboard", "--help"], ["season", "-h"]])
     assert modules <= {
         "lagbench.__main__",
         "lagbench.addresses",

@@ -1,0 +1,113 @@
+"""A leaderboard with a small graph network, whose weights lie beside its entry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from simple_models import SMALL
+
+from lagbench.baselines.checkpoint import Checkpoint, round_weights, save
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.operators.gns import GNS
+from lagbench.baselines.predict import predict
+from lagbench.baselines.simulator import GraphNetwork
+from lagbench.board.check import CheckResult, check_board
+from lagbench.board.entry import Meta
+from lagbench.board.submit import submit
+from lagbench.data.registry import load
+from lagbench.submission import open_predictions, write
+
+NAME = "curl-noise/tiny/gns"
+PATH = "submissions/curl-noise/tiny/gns.yaml"
+
+
+@dataclass(frozen=True)
+class ModelBoard:
+    """A leaderboard with the entry gns, whose weights lie beside it, and its data."""
+
+    folder: Path
+    root: Path
+    predictions: Path
+
+    @property
+    def weights(self) -> Path:
+        """The weights on the board."""
+        return self.folder / "weights/curl-noise/tiny/gns_0.pt"
+
+    def shifted(self, distance: float) -> Path:
+        """Write the predictions with every particle shifted a little."""
+        size = load().size("curl-noise", "tiny")
+        positions = {}
+        with open_predictions(self.predictions) as opened:
+            for scenario in size.subsets["test"]:
+                blocks = [block for _, block in opened.blocks(scenario)]
+                position = np.concatenate(blocks)
+                positions[scenario] = position + distance * np.sin(1e3 * position)
+        return write(
+            self.folder.parent / f"shifted-{distance}.nc",
+            positions,
+            method="gns",
+            split="curl-noise",
+            size="tiny",
+            seed=0,
+            parameters=7,
+        )
+
+    def submit(self, path: Path, **options: Any) -> None:
+        """Submit predictions of gns."""
+        meta = Meta(authors=("A. Author",), command="make")
+        submit(
+            [path], meta, board=self.folder, root=self.root, new_board=True, **options
+        )
+
+    def edit(self, path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+        """Change a YAML file of the board by hand."""
+        content = yaml.safe_load(path.read_text())
+        change(content)
+        path.write_text(yaml.safe_dump(content, sort_keys=False))
+
+    def find(self, **options: Any) -> CheckResult:
+        """Check the board."""
+        return check_board(self.folder, root=self.root, isolated=False, **options)
+
+
+def make_bench(folder: Path, root: Path) -> ModelBoard:
+    """Return a board with a network that moves particles at random.
+
+    A board that another process has made is taken as it is.
+    """
+    bench = ModelBoard(folder / "board", root, folder / "predictions.nc")
+    if (bench.folder / PATH).exists():
+        return bench
+    folder.mkdir(parents=True, exist_ok=True)
+    info = read_dataset_info("curl-noise", "tiny", root=root)
+    torch.manual_seed(3)
+    model = GraphNetwork.with_operator(GNS).build(SMALL, info)
+    last_layer = model.network.decoder[-1]
+    assert isinstance(last_layer, torch.nn.Linear)
+    torch.nn.init.normal_(last_layer.weight, std=0.1)
+    recipe = {"name": "curl-noise/tiny", "training": {"seed": 0}}
+    checkpoint = Checkpoint(
+        baseline="gns",
+        options=SMALL,
+        info=info,
+        weights=round_weights(model),
+        training={"step": 5, "recipe": recipe},
+    )
+    save(folder / "weights.pt", checkpoint)
+    predict(
+        folder / "weights.pt",
+        folder / "predictions.nc",
+        root=root,
+        device="cpu",
+        threads=1,
+        method="gns",
+    )
+    bench.submit(bench.predictions, weights=[folder / "weights.pt"])
+    return bench

@@ -1,0 +1,264 @@
+"""Blind seasons: seeds, blind scenarios, scores that come back, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_board import NAME, PATH, ModelBoard
+from typer.testing import Result
+
+from lagbench.board.entry import Level
+from lagbench.board.folder import Folder
+from lagbench.board.reproduce import reproduce
+from lagbench.board.season import (
+    Season,
+    close,
+    draw_seed,
+    read_season,
+    reveal,
+    season_registry,
+    season_root,
+)
+from lagbench.board.season_run import SeasonResult, run_season
+from lagbench.board.season_table import record_blind, season_rows
+from lagbench.board.verified import read_verified
+from lagbench.data.registry import load
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import ChecksFailedError, DataError, UsageError
+from lagbench.generators.draws import generator, seed_text
+from lagbench.make.generate import generate
+
+SEASON = "trial"
+
+
+@pytest.fixture(scope="module")
+def master(
+    tmp_path_factory: pytest.TempPathFactory, model_board: ModelBoard
+) -> ModelBoard:
+    """A board with a closed season, its blind scenarios, and its scores."""
+    folder = tmp_path_factory.mktemp("season")
+    root = folder / "data"
+    shutil.copytree(model_board.root, root)
+    shutil.copytree(model_board.folder, folder / "board")
+    bench = replace(model_board, folder=folder / "board", root=root)
+    simulate(bench, close_season(bench))
+    run_season(bench.folder, SEASON, root=root)
+    return bench
+
+
+@pytest.fixture
+def own(master: ModelBoard, tmp_path: Path) -> ModelBoard:
+    """A copy of the leaderboard that the test may change; the data are shared."""
+    shutil.copytree(master.folder, tmp_path / "board")
+    return replace(master, folder=tmp_path / "board")
+
+
+def close_season(bench: ModelBoard, name: str = SEASON, source: str = "") -> Season:
+    """Close a season of four blind scenarios."""
+    return close(
+        bench.folder,
+        name,
+        scenarios=4,
+        source=source,
+        root=bench.root,
+        lagbench="0.1.0",
+    )
+
+
+def simulate(bench: ModelBoard, season: Season, root: Path | None = None) -> None:
+    """Simulate the blind scenarios of a season."""
+    generate(
+        "curl-noise",
+        "tiny",
+        root=season_root(season.season, root or bench.root),
+        registry=season_registry(season, load(), {}),
+        workers=2,
+    )
+
+
+def run_again(bench: ModelBoard, *, again: bool = False) -> SeasonResult:
+    """Run the season and compare its scores with those on the board."""
+    return run_season(
+        bench.folder, SEASON, root=bench.root, comparing=True, again=again
+    )
+
+
+def test_the_seed_is_a_hash_that_anybody_can_form() -> None:
+    """Of six kinds of lines; the order of the models means nothing."""
+    models = ["b" * 64, "a" * 64]
+    text = (
+        "lagbench season 1\nseason may\nsplit cavity\nsize mini\nversion 2.1.0\n"
+        f"model {'a' * 64}\nmodel {'b' * 64}\nvalue 17\n"
+    )
+    expected = hashlib.sha256(text.encode()).hexdigest()
+    names = ("may", "cavity", "mini", "2.1.0")
+    assert draw_seed(*names, models=models, value="17") == expected
+    assert draw_seed(*names, models=models[::-1], value="17") == expected
+    others = {
+        draw_seed(*names, models=models),
+        draw_seed(*names, models=models[:1], value="17"),
+        draw_seed("june", *names[1:], models=models, value="17"),
+    }
+    assert len(others - {expected}) == 3
+
+
+def test_the_whole_seed_enters_the_draws() -> None:
+    """A change of its last digit leads to other numbers, and the text to the same."""
+    names = ("cavity", "mini", 2, 1000)
+    seed = 64 * "0"
+    numbers = generator(*names, seed).random(4).tolist()
+    assert numbers != generator(*names, f"{seed[:-1]}1").random(4).tolist()
+    assert numbers != generator(*names).random(4).tolist()
+    words = [int(word) for word in seed_text(*names, seed).split(", ")]
+    again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    assert again.random(4).tolist() == numbers
+
+
+def test_blind_scenarios_are_new(master: ModelBoard) -> None:
+    """They have ids and positions that no public scenario has, and state the seed."""
+    season = read_season(Folder(master.folder), SEASON)
+    (data_set,) = season.data_sets
+    size = load().size("curl-noise", "tiny")
+    assert not set(data_set.ids) & set(size.scenarios)
+    starts = set()
+    for folder in (size.folder(master.root), season_root(SEASON, master.root)):
+        for path in folder.rglob("*.nc"):
+            with read_scenario(path) as file:
+                starts.add(file.read("position", 0).tobytes())
+    assert len(starts) == len(size.scenarios) + len(data_set.ids)
+
+
+def test_a_repeated_season_has_the_same_bytes(
+    master: ModelBoard, tmp_path: Path
+) -> None:
+    """Drawn, simulated, predicted and scored anew, in another folder."""
+    root = tmp_path / "data"
+    shutil.copytree(
+        master.root, root, ignore=shutil.ignore_patterns(f"season.{SEASON}")
+    )
+    folder = tmp_path / "board"
+    ignored = shutil.ignore_patterns("scores.yaml")
+    shutil.copytree(master.folder, folder, ignore=ignored)
+    again = replace(master, folder=folder, root=root)
+    simulate(again, read_season(Folder(folder), SEASON))
+    result = run_season(folder, SEASON, root=root)
+    assert result.predicted == [f"{NAME}, seed 0"]
+    scores = "seasons/trial/scores.yaml"
+    assert (folder / scores).read_bytes() == (master.folder / scores).read_bytes()
+
+
+def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
+    """Unless that is asked for; the scores are the same."""
+    saved = run_again(master)
+    assert (saved.predicted, saved.exit_code) == ([], 0)
+    anew = run_again(master, again=True)
+    assert anew.predicted == [f"{NAME}, seed 0"]
+    assert anew.comparison is not None
+    assert anew.comparison.has_same_bytes
+
+
+def test_the_line_of_a_reproduced_entry_becomes_blind(own: ModelBoard) -> None:
+    """With both skills, and an interval around their gap."""
+    result = run_again(own)
+    (row,) = season_rows(result.season, result.scores)
+    # two public scenarios are too few for an interval, and nothing is recorded
+    assert np.isnan(row.low)
+    assert record_blind(own.folder, result.season, [row]) == ()
+    assert read_verified(Folder(own.folder)) == {}
+
+    rows = [replace(row, low=row.gap - 0.1, high=row.gap + 0.1)]
+    assert record_blind(own.folder, result.season, rows) == ()
+    reproduce(own.folder, [NAME], root=own.root, costs=False)
+    assert record_blind(own.folder, result.season, rows) == (NAME,)
+    line = read_verified(Folder(own.folder))[PATH]
+    assert line.level is Level.BLIND
+    assert line.blind is not None
+    assert line.blind.low < line.blind.gap < line.blind.high
+    assert own.find().findings == ()
+
+
+def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
+    """There are no seeds before, and no second value after."""
+    season = close_season(own, "later", source="lottery of 1 May")
+    assert season.data_sets[0].draw_seed is None
+    with pytest.raises(UsageError):
+        season_registry(season, load(), {})
+    revealed = reveal(own.folder, "later", "17 4 33")
+    assert revealed.data_sets[0].draw_seed == draw_seed(
+        "later",
+        "curl-noise",
+        "tiny",
+        load().size("curl-noise", "tiny").version,
+        models=season.model_hashes,
+        value="17 4 33",
+    )
+    with pytest.raises(UsageError):
+        reveal(own.folder, "later", "1 2 3")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("season.yaml", "draw_seed: ", "draw_seed: 0"),
+        ("season.yaml", "season: trial", "season: other"),
+        ("scores.yaml", "1003:", "1004:"),
+        ("scores.yaml", "seed: 0", "seed: 1"),
+    ],
+)
+def test_an_edited_season_is_found(
+    own: ModelBoard, file: str, old: str, new: str
+) -> None:
+    """Seeds, names, scenarios and models follow from the frozen models."""
+    path = own.folder / "seasons" / SEASON / file
+    text = path.read_text().replace(old, new)
+    if new == "draw_seed: 0":
+        start = text.index(new) + len(new)
+        text = text[: start + 63] + text[start + 64 :]
+    path.write_text(text)
+    assert [issue.check for issue in own.find().findings] == ["season"]
+
+
+def test_other_models_and_other_scenarios_are_refused(
+    own: ModelBoard, tmp_path: Path
+) -> None:
+    """A model that was exchanged, and blind scenarios of another seed."""
+    weights = own.weights.read_bytes()
+    own.weights.write_bytes(weights + b"1")
+    with pytest.raises(ChecksFailedError):
+        run_again(own, again=True)
+    own.weights.write_bytes(weights)
+
+    other = close_season(own, "other")
+    simulate(own, other, tmp_path)
+    root = tmp_path / "data"
+    shutil.copytree(own.root, root)
+    shutil.rmtree(root / f"season.{SEASON}")
+    with pytest.raises(DataError):
+        run_again(replace(own, root=root))
+    shutil.move(tmp_path / "season.other", root / f"season.{SEASON}")
+    with pytest.raises(DataError):
+        run_again(replace(own, root=root))
+
+
+def test_the_commands_say_what_is_wrong(
+    own: ModelBoard, run: Callable[..., Result]
+) -> None:
+    """A closed season, an unknown one, a value without a source."""
+    board = ("--board", own.folder, "--root", own.root)
+    for words in (
+        ("season", "close", SEASON),
+        ("season", "close", "../../x"),
+        ("season", "close", SEASON, "--value", "1"),
+        ("season", "run", "nobody"),
+        ("generate", "--season", "nobody"),
+    ):
+        assert run(*words, *board).exit_code == 2, words
+    shown = run("season", "show", SEASON, "--markdown", "--board", own.folder)
+    assert shown.exit_code == 0
+    assert "gns" in shown.stdout
