@@ -525,12 +525,14 @@ def test_the_interval_of_a_gap_holds_the_truth() -> None:
     held = 0
     trials = 200
     for _ in range(trials):
-        sides = []
+        methods = []
+        bases = []
         for ratio, count in ((0.3, 20), (0.4, 8)):
             base = draw.uniform(1.0, 2.0, count)
             method = ratio * base * draw.uniform(0.5, 1.5, count)
-            sides += [[scored(method.tolist())], scored(base.tolist())]
-        gap = skill_gap(*sides)
+            methods.append([scored(method.tolist())])
+            bases.append(scored(base.tolist()))
+        gap = skill_gap(methods[0], bases[0], methods[1], bases[1])
         held += gap.interval[0] <= 0.1 <= gap.interval[1]
     assert 0.90 <= held / trials <= 1.0
 
