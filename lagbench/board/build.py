@@ -72,8 +72,9 @@ from .model import (
     Value,
 )
 from .page import LINKS, links_in, render, same_page
-from .ranking import CombinedScore, combine, is_current, read_references
+from .ranking import CombinedScore, combine, read_references
 from .sampling import coarsen, spaced
+from .selection import is_current
 from .variants import find_variants
 from .verified import read_verified, verification_of
 

@@ -26,9 +26,10 @@ from .fields import latest_date
 from .folder import SEASONS, VERIFIED, Folder, Place, entry_path
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
-from .ranking import TOLERANCE, combine, dataset_of, is_current, summarise
+from .ranking import TOLERANCE, combine, dataset_of, summarise
 from .season import read_season
-from .season_run import read_scores
+from .season_scores import read_scores
+from .selection import is_current
 from .verified import read_verified, verification_of
 from .weights import check_weights
 

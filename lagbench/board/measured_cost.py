@@ -12,7 +12,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.references.predictor import Given, Kind, ReferencePredictor, given_in
@@ -23,15 +26,30 @@ from lagbench.work.progress import Meter
 from .entry import Entry, MeasuredCost
 from .verified import today
 
-if TYPE_CHECKING:
-    from .reproduce import Runner
-
 REPEATS = 3
 TIMED_FRAMES = 10
 DIGITS = 4  # of a time
 
 TimeSolver = Callable[[str, str], float | None]
 """From a split and size to the solver's processor time of a frame [s]."""
+
+
+class Runner(Protocol):
+    """A model that predicts scenarios one by one."""
+
+    def predict(
+        self, scenario_file: Path, frames: int | None = None
+    ) -> NDArray[np.float32]:
+        """Return positions of the next frames, [frame, particle, axis] [length]."""
+        ...
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Return the processor time of a frame [s]."""
+        ...
+
+    def close(self) -> None:
+        """Free what the model holds."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)

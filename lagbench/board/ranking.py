@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import (
@@ -35,6 +34,7 @@ from lagbench.scoring.score_file_checks import read_score_file
 from .entry import OUTSIDE, DataSet, EntryFlag, ScoredFile, Summary
 from .fields import LONGEST_TEXT
 from .folder import REFERENCES, Folder
+from .selection import is_current
 
 NO_PREDICTIONS = "0" * 64  # hash in score files of reference predictors
 
@@ -122,16 +122,6 @@ def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
             high=digits(high),
         )
     return summaries
-
-
-def is_current(dataset: DataSet, size: Size) -> bool:
-    """Tell whether a data set is that of today.
-
-    It has the same MAJOR version, and the same hash where one is recorded.
-    """
-    if major_of(dataset.version) != size.major:
-        return False
-    return size.measured is None or dataset.sha256 == size.measured.dataset_sha256
 
 
 def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:

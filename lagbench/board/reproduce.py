@@ -12,16 +12,15 @@ how far two processors differ; :data:`TOLERANCE` follows from that.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.checksums import file_sha256, round_digits
+from lagbench.data.checksums import file_sha256
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
@@ -29,11 +28,10 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     check_installed,
-    suggest_name,
 )
-from lagbench.metrics.aggregate import Tally, score
+from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
-from lagbench.metrics.table import METRICS, select
+from lagbench.metrics.table import select
 from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.scenario import measure_rows
 from lagbench.scoring.score_file_checks import read_score_file
@@ -46,40 +44,13 @@ from .entry import (
     MeasuredCost,
     Prediction,
     Reproduction,
-    Status,
     Verification,
 )
-from .entry_file import read_entry
 from .folder import Folder
-from .measured_cost import TimedEntry, TimeSolver, measure_costs
-from .ranking import is_current
+from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
+from .scores_compared import compare
+from .selection import choose_entries
 from .verified import read_verified, record, verification_of
-
-TOLERANCE = 1e-3
-"""Relative difference of the ranking metric, its mean over scenarios, up to which a
-score counts as reproduced.
-"""
-
-DIGITS = 9  # of scores in a record
-DIFFERENCE_DIGITS = 2
-
-
-class Runner(Protocol):
-    """A model that predicts scenarios one by one."""
-
-    def predict(
-        self, scenario_file: Path, frames: int | None = None
-    ) -> NDArray[np.float32]:
-        """Return positions of the next frames, [frame, particle, axis] [length]."""
-        ...
-
-    def time(self, scenario_file: Path, frames: int) -> float:
-        """Return the processor time of a frame [s]."""
-        ...
-
-    def close(self) -> None:
-        """Free what the model holds."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,62 +187,6 @@ def reproduce(
         if line is not None:
             run.result.lines[entry.yaml_path.as_posix()] = line
     return run.result
-
-
-def choose_entries(
-    folder: Folder,
-    names: Sequence[str],
-    registry: Registry,
-    *,
-    split: str | None = None,
-    size: str | None = None,
-) -> list[Entry]:
-    """Return entries by name, or all active ones of the present data with models.
-
-    Raises:
-        UsageError: no such entry, or one that has no model.
-    """
-    known = {}
-    for path in folder.entries():
-        name = "/".join(path.with_suffix("").parts[1:])
-        known[name] = path
-    if names:
-        chosen = []
-        for name in names:
-            key = name.removesuffix(".yaml").rpartition("submissions/")[2]
-            if key not in known:
-                raise UsageError(
-                    "no such entry",
-                    where=str(folder.path),
-                    expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
-                    got=name,
-                    fix=suggest_name(key, known),
-                )
-            entry = read_entry(folder.path / known[key])
-            if not has_models(entry):
-                raise UsageError(
-                    "the entry has no model to run",
-                    where=key,
-                    fix="its submitter may add one: lagbench submit --weights",
-                )
-            chosen.append(entry)
-        return chosen
-
-    chosen = []
-    for path in known.values():
-        _, entry_split, entry_size, _ = path.parts
-        if split not in (None, entry_split) or size not in (None, entry_size):
-            continue
-        entry = read_entry(folder.path / path)
-        is_present = is_current(entry.dataset, registry.size(entry_split, entry_size))
-        if entry.status is Status.ACTIVE and has_models(entry) and is_present:
-            chosen.append(entry)
-    return chosen
-
-
-def has_models(entry: Entry) -> bool:
-    """Return whether a model lies beside an entry."""
-    return any(prediction.weights is not None for prediction in entry.predictions)
 
 
 def sample_scenarios(
@@ -525,43 +440,6 @@ class _Run:
 
 def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
     return line.model_copy(update={"cost": cost})
-
-
-def compare(
-    metric: str,
-    submitted: Mapping[int, Tally],
-    reproduced: Mapping[int, Tally],
-    *,
-    seed: int | None,
-    model: str,
-    of: int,
-) -> Reproduction:
-    """Return how a metric of the same scenarios compares.
-
-    Raises:
-        ChecksFailedError: one side has no value.
-    """
-    before = score(METRICS[metric], submitted)
-    after = score(METRICS[metric], reproduced)
-    if before is None or after is None:
-        raise ChecksFailedError("the ranking metric has no value", where=metric)
-    scale = np.maximum(np.abs(before.values), np.finfo(np.float32).tiny)
-    relative = np.abs(after.values - before.values) / scale
-    difference = abs(after.mean - before.mean) / max(
-        abs(before.mean), float(np.finfo(np.float32).tiny)
-    )
-    return Reproduction(
-        seed=seed,
-        model=model,
-        metric=metric,
-        scenarios=len(reproduced),
-        of=of,
-        submitted=round_digits(before.mean, DIGITS),
-        reproduced=round_digits(after.mean, DIGITS),
-        difference=round_digits(difference, DIFFERENCE_DIGITS),
-        tolerance=TOLERANCE,
-        greatest=round_digits(float(np.max(relative)), DIFFERENCE_DIGITS),
-    )
 
 
 def with_reproduction(

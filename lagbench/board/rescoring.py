@@ -28,7 +28,7 @@ from .entry import Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
 from .issues import REFERENCES_ANEW, make_issue
 from .ranking import TOLERANCE, scored_file
-from .reproduce import compare
+from .scores_compared import compare
 
 # step of packed film positions [length]
 FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS

@@ -49,7 +49,7 @@ from .fields import (
 )
 from .folder import SEASON_FILE, SEASONS, Folder
 from .lock import board_lock
-from .reproduce import choose_entries
+from .selection import choose_entries
 from .verified import today
 
 FIRST_SCENARIO = 1000

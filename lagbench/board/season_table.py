@@ -24,7 +24,7 @@ from .entry import BlindScore, Entry, Level, Verification
 from .entry_file import read_entry_if_valid
 from .folder import Folder, entry_path
 from .season import Season, SeasonDataSet
-from .season_run import DataSetScores, ModelScores, SeasonScores
+from .season_scores import DataSetScores, ModelScores, SeasonScores
 from .verified import record
 
 DIGITS = 6

@@ -126,7 +126,7 @@ def _season_places(
     """
     from lagbench.board.folder import Folder
     from lagbench.board.season import read_season, season_registry, season_root
-    from lagbench.board.season_run import read_scores
+    from lagbench.board.season_scores import read_scores
 
     folder = Folder(board)
     folder.require()

@@ -18,7 +18,8 @@ from lagbench.board.season import (
     reveal,
     season_path,
 )
-from lagbench.board.season_run import SeasonResult, read_scores, run_season
+from lagbench.board.season_run import SeasonResult, run_season
+from lagbench.board.season_scores import read_scores
 from lagbench.board.season_table import (
     SeasonRow,
     describe_gap,

@@ -14,12 +14,8 @@ from typer.testing import Result
 
 from lagbench.board.entry import Level
 from lagbench.board.folder import Folder
-from lagbench.board.reproduce import (
-    TOLERANCE,
-    ReproduceResult,
-    reproduce,
-    sample_scenarios,
-)
+from lagbench.board.reproduce import ReproduceResult, reproduce, sample_scenarios
+from lagbench.board.scores_compared import TOLERANCE
 from lagbench.board.verified import read_verified
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError

@@ -1,0 +1,59 @@
+"""Scores of a model that was run again, beside those that were submitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lagbench.data.checksums import round_digits
+from lagbench.errors import ChecksFailedError
+from lagbench.metrics.aggregate import Tally, score
+from lagbench.metrics.table import METRICS
+
+from .entry import Reproduction
+
+TOLERANCE = 1e-3
+"""Relative difference of the ranking metric, its mean over scenarios, up to which a
+score counts as reproduced.
+"""
+
+DIGITS = 9  # of scores in a record
+DIFFERENCE_DIGITS = 2
+
+
+def compare(
+    metric: str,
+    submitted: Mapping[int, Tally],
+    reproduced: Mapping[int, Tally],
+    *,
+    seed: int | None,
+    model: str,
+    of: int,
+) -> Reproduction:
+    """Return how a metric of the same scenarios compares.
+
+    Raises:
+        ChecksFailedError: one side has no value.
+    """
+    before = score(METRICS[metric], submitted)
+    after = score(METRICS[metric], reproduced)
+    if before is None or after is None:
+        raise ChecksFailedError("the ranking metric has no value", where=metric)
+    scale = np.maximum(np.abs(before.values), np.finfo(np.float32).tiny)
+    relative = np.abs(after.values - before.values) / scale
+    difference = abs(after.mean - before.mean) / max(
+        abs(before.mean), float(np.finfo(np.float32).tiny)
+    )
+    return Reproduction(
+        seed=seed,
+        model=model,
+        metric=metric,
+        scenarios=len(reproduced),
+        of=of,
+        submitted=round_digits(before.mean, DIGITS),
+        reproduced=round_digits(after.mean, DIGITS),
+        difference=round_digits(difference, DIFFERENCE_DIGITS),
+        tolerance=TOLERANCE,
+        greatest=round_digits(float(np.max(relative)), DIFFERENCE_DIGITS),
+    )

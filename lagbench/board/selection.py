@@ -1,0 +1,79 @@
+"""Entries whose models can be run again: by name, or all active ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lagbench.data.layout import major_of
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import UsageError, suggest_name
+
+from .entry import DataSet, Entry, Status
+from .entry_file import read_entry
+from .folder import Folder
+
+
+def choose_entries(
+    folder: Folder,
+    names: Sequence[str],
+    registry: Registry,
+    *,
+    split: str | None = None,
+    size: str | None = None,
+) -> list[Entry]:
+    """Return entries by name, or all active ones of the present data with models.
+
+    Raises:
+        UsageError: no such entry, or one that has no model.
+    """
+    known = {}
+    for path in folder.entries():
+        name = "/".join(path.with_suffix("").parts[1:])
+        known[name] = path
+    if names:
+        chosen = []
+        for name in names:
+            key = name.removesuffix(".yaml").rpartition("submissions/")[2]
+            if key not in known:
+                raise UsageError(
+                    "no such entry",
+                    where=str(folder.path),
+                    expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
+                    got=name,
+                    fix=suggest_name(key, known),
+                )
+            entry = read_entry(folder.path / known[key])
+            if not has_models(entry):
+                raise UsageError(
+                    "the entry has no model to run",
+                    where=key,
+                    fix="its submitter may add one: lagbench submit --weights",
+                )
+            chosen.append(entry)
+        return chosen
+
+    chosen = []
+    for path in known.values():
+        _, entry_split, entry_size, _ = path.parts
+        if split not in (None, entry_split) or size not in (None, entry_size):
+            continue
+        entry = read_entry(folder.path / path)
+        is_present = is_current(entry.dataset, registry.size(entry_split, entry_size))
+        if entry.status is Status.ACTIVE and has_models(entry) and is_present:
+            chosen.append(entry)
+    return chosen
+
+
+def is_current(dataset: DataSet, size: Size) -> bool:
+    """Tell whether a data set is that of today.
+
+    It has the same MAJOR version, and the same hash where one is recorded.
+    """
+    if major_of(dataset.version) != size.major:
+        return False
+    return size.measured is None or dataset.sha256 == size.measured.dataset_sha256
+
+
+def has_models(entry: Entry) -> bool:
+    """Return whether a model lies beside an entry."""
+    return any(prediction.weights is not None for prediction in entry.predictions)
