@@ -33,7 +33,13 @@ from lagbench.data.registry import Size, Task
 from lagbench.data.scenario import read_scenario
 from lagbench.data.writer import ScenarioWriter
 
-from .batch import Report, ScenarioBatch, SimulationJob, substep_count
+from .batch import (
+    Report,
+    ScenarioBatch,
+    SimulationJob,
+    SimulationPace,
+    substep_count,
+)
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
 from .full_box_parameters import FullBoxParameters
@@ -76,15 +82,6 @@ class SimulationDiagnostics:
     cfl: float  # cells that this speed crosses per substep [1]
     jacobian_min: float  # smallest J of any particle at any substep [1]
     jacobian_max: float  # largest J of any particle at any substep [1]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulationPace:
-    """How long a scenario took for how much, once everything was compiled."""
-
-    seconds: float  # processor time [s]
-    particle_substeps: int  # substeps times particles
-    frames: int  # frames that were advanced to, read out and written
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,12 +38,12 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
-from lagbench.scoring.card import Preview
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
     read_score_file,
     reported_frames,
 )
+from lagbench.scoring.score_layout import Preview
 from lagbench.scoring.skill import (
     AgainstClassical,
     Skill,

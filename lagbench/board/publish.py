@@ -21,9 +21,10 @@ from pathlib import Path
 from lagbench.atomic import move_together, refuse_folders, write_atomically
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
-from lagbench.scoring.card import SUBMISSION, ScoreCard
-from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
+from lagbench.scoring.score_file_writer import write_statistics
+from lagbench.scoring.score_layout import SUBMISSION
 
 from .draft import Draft, PredictionsFile, fit
 from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile

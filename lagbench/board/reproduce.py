@@ -32,9 +32,9 @@ from lagbench.errors import (
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
-from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.scenario import measure_rows
 from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.progress import Meter, Progress
 

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.card import SUBMISSION, ScoreCard
-from lagbench.scoring.score_file import FILM_RANGE, LEVELS, write_statistics
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
+from lagbench.scoring.score_file_writer import write_statistics
+from lagbench.scoring.score_layout import FILM_RANGE, LEVELS, SUBMISSION
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 

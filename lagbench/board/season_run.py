@@ -27,9 +27,9 @@ from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.scenario import measure_rows, predict_reference
 from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.progress import Meter, Progress
 

@@ -13,8 +13,9 @@ from pathlib import Path
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ErrorCollector, UsageError, WorkFailedError
-from lagbench.scoring.card import SUBMISSION, ScoreCard
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.checks import outside_share
 from lagbench.submission.format import WRITE
 from lagbench.submission.issues import ValidationResult

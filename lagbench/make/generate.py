@@ -35,10 +35,9 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Registry, Size, Split, format_ids
 from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, suggest_name
-from lagbench.generators.batch import SimulationJob
+from lagbench.generators.batch import SimulationJob, SimulationPace
 from lagbench.generators.simulate import (
     SimulatedScenario,
-    SimulationPace,
     measure_predictability,
     perturbed_substep_count,
     simulate,

@@ -18,24 +18,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import CACHE_VARIABLE, cache_folder
 from lagbench.data.limits import NEEDED, Limit
 from lagbench.data.registry import Size, format_ids, parse_ids
 from lagbench.errors import UsageError, WorkFailedError, suggest_name
-from lagbench.generators.batch import substep_count
+from lagbench.generators.batch import SimulationPace, substep_count
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.split import ClosedBoxParameters
 
-if TYPE_CHECKING:
-    from lagbench.generators.simulate import SimulationPace
-
-    # seconds, particle substeps and frames, as in SimulationPace
-    RateRow = tuple[float, int, int]
-
+RateRow = tuple[float, int, int]
+"""Seconds, particle substeps and frames, as in SimulationPace."""
 
 MOST_BYTES = 1 << 16  # a longer file of rates is not ours [bytes]
 MOST_ROWS = 32  # numbers of particles per kind of solver that are kept, the latest ones

@@ -14,68 +14,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lagbench.data.checksums import round_digits
-from lagbench.errors import UnreadableFileError
 from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
 from lagbench.metrics.table import CHOSEN
-from lagbench.submission.format import MAX_NAME, Header
+from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
+from .score_layout import FORMAT, IDENTITY, SUBMISSION, Preview
 from .skill import AgainstClassical, Skill
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FORMAT = 1
-"""Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
 
 JSON_NAME = "scores.json"
 
 BRIEF_ROWS = 5
 """Metrics that a short table shows."""
 
-IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
-"""Fields that identify the predicted data set and the method."""
-
-SUBMISSION = "submission"
-"""Row of the submission; reference predictors have rows of their names."""
-
 LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
 """Fields that scores.json has where the predictions state them."""
-
-FRAMES = 45
-"""Frames of the particle film, evenly spaced over the horizon."""
-
-PARTICLES = 200
-"""Particles of the film, evenly spaced over the particle numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Preview:
-    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
-
-    scenario: int  # id of the scenario
-    map_frames: tuple[int, ...]  # frames of interest and the last one
-    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y
-    # node]
-    vorticity: NDArray[np.float32]
-    # shares of 64 bins over the truth's range of omega, NaN where there is none [1],
-    # shape [side, map frame, bin]
-    histogram: NDArray[np.float32]
-    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
-    film_frames: tuple[int, ...]
-    particles: tuple[int, ...]  # numbers of the particles in the film
-    material: NDArray[np.int8]  # their materials, shape [film particle]
-    # their positions [length], shape [side, film frame, film particle, axis]
-    film: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -360,14 +322,3 @@ def format_scores(card: ScoreCard) -> bytes:
     """Return the bytes of scores.json."""
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
     return f"{text}\n".encode()
-
-
-def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is no scores.json or scores.nc."""
-    return UnreadableFileError(
-        f"not a scores{path.suffix} of lagbench",
-        where=str(path),
-        expected="what `lagbench score` writes beside the predictions",
-        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
-        fix="score the predictions again: lagbench score predictions.nc",
-    )

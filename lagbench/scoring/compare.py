@@ -35,7 +35,7 @@ from lagbench.references.table import REFERENCES
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
 
-from .card import JSON_NAME, SUBMISSION, digits, number_methods
+from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
 from .score_file import NETCDF_NAME
@@ -44,6 +44,7 @@ from .score_file_checks import (
     find_unreadable,
     read_published_scores,
 )
+from .score_layout import SUBMISSION
 
 SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""

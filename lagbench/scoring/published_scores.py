@@ -18,7 +18,7 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 from lagbench.submission.format import require_name
 
-from .card import FORMAT, IDENTITY, unreadable_scores
+from .score_layout import FORMAT, IDENTITY, unreadable_scores
 
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""

@@ -32,9 +32,9 @@ from lagbench.submission.format import FileInfo
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
-from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .flags import Trace, Tracer
 from .package_metrics import package_metric_errors
+from .score_layout import FRAMES, PARTICLES, SUBMISSION, Preview
 from .task import ScoredTask
 
 POSITION_LIMIT = 1e6

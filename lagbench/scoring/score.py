@@ -27,7 +27,7 @@ from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .card import JSON_NAME, SUBMISSION, ScoreCard, format_scores
+from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, judge_copying, judge_physics, judge_predictability
 from .package_metrics import (
     PackageMetricError,
@@ -39,7 +39,9 @@ from .published_scores import read_scores
 from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
-from .score_file import NETCDF_NAME, write_statistics
+from .score_file import NETCDF_NAME
+from .score_file_writer import write_statistics
+from .score_layout import SUBMISSION
 from .skill import (
     compare_with_solvers,
     compute_skill,

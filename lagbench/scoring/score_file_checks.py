@@ -28,9 +28,16 @@ from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import run_in_child
 
-from .card import FRAMES, PARTICLES, SUBMISSION, Preview, unreadable_scores
 from .published_scores import PublishedScores
-from .score_file import FILM_RANGE, SubmissionStatistics, read_statistics
+from .score_file import SubmissionStatistics, read_statistics
+from .score_layout import (
+    FILM_RANGE,
+    FRAMES,
+    PARTICLES,
+    SUBMISSION,
+    Preview,
+    unreadable_scores,
+)
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB

@@ -11,9 +11,10 @@ from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
 
-from .card import BRIEF_ROWS, SUBMISSION, ScoreCard
+from .card import BRIEF_ROWS, ScoreCard
 from .compare import ComparisonResult, MetricComparison
 from .flags import Flag
+from .score_layout import SUBMISSION
 
 SHOWN_AT_FRAMES = (
     "vorticity_mse",

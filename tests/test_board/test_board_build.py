@@ -43,9 +43,10 @@ from lagbench.errors import (
 )
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
+from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_layout import SUBMISSION
 
 
 @pytest.fixture(scope="module")

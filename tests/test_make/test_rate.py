@@ -16,9 +16,8 @@ from click.testing import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, load
-from lagbench.generators.batch import SimulationJob, substep_count
+from lagbench.generators.batch import SimulationJob, SimulationPace, substep_count
 from lagbench.generators.simulate import (
-    SimulationPace,
     perturbed_substep_count,
     simulate,
 )

@@ -61,8 +61,8 @@ from lagbench.references.train_library import (
     mirrors_of,
     state_library,
 )
-from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.references import measurable
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.skill import best_reference
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,8 @@ from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
 from lagbench.scoring import score as scoring
-from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
+from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
 from lagbench.work.progress import Progress

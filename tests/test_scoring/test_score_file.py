@@ -18,15 +18,11 @@ from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import histograms
-from lagbench.scoring.card import (
-    FRAMES,
-    PARTICLES,
-    SUBMISSION,
-    ScoreCard,
-    digits,
-)
+from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.published_scores import read_scores
-from lagbench.scoring.score_file import read_statistics, write_statistics
+from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.score_file_writer import write_statistics
+from lagbench.scoring.score_layout import FRAMES, PARTICLES, SUBMISSION
 
 MAX_BYTES = 300_000
 SCENARIOS = range(54, 60)

@@ -15,8 +15,8 @@ from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.references.shipped import shipped, shipped_path
-from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.truth import Truth
 from lagbench.submission.writer import PredictionsWriter
 

@@ -26,7 +26,7 @@ from lagbench.references.shipped import (
 from lagbench.references.table import NAIVE
 from lagbench.scoring import references as references_of_scoring
 from lagbench.scoring import score as scoring
-from lagbench.scoring.card import SUBMISSION, ScoreCard
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.measure_references import measure_and_ship
 from lagbench.scoring.references import (
     differences,
@@ -37,6 +37,7 @@ from lagbench.scoring.references import (
     saved_folder,
 )
 from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.skill import (
     best_reference,
     compare_with_solvers,
