@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.onnx import symbolic_helper
 
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
@@ -140,8 +141,6 @@ def _sums_of_index_add() -> Iterator[None]:
         source: Any,  # noqa: ANN401
         _alpha: Any = None,  # noqa: ANN401
     ) -> Any:  # noqa: ANN401
-        from torch.onnx import symbolic_helper
-
         helper: Any = symbolic_helper  # has no types
         number = helper._get_const(axis, "i", "dim")
         rank = helper._get_tensor_rank(source)

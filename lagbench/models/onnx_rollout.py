@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from .onnx_checks import OUTPUT, examine
 
+if sys.platform != "win32":
+    import resource
+
 MOST_DISTANCE = 10.0
 """Farthest that a particle may be from the middle of the box [length], as in a file of
 predictions.
@@ -43,8 +46,6 @@ def unpack(values: dict[str, Any]) -> NDArray[Any]:
 def forbid_files() -> None:
     """Let this process write no byte to any file; pipes stay open."""
     if sys.platform != "win32":
-        import resource
-
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
 

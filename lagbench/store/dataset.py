@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lagbench.data import registry
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
-from lagbench.data.scenario import damage_error
+from lagbench.data.scenario import damage_error, parse_viscosity
 from lagbench.errors import DataError
 
 from .copy import scenario_files, update_working_copy
@@ -158,8 +158,6 @@ def _join_scenarios(
 
 def _read_viscosity(file: xr.Dataset, tier: Size, path: Path) -> float:
     """Return the given viscosity of a scenario [length^2/s], NaN where unknown."""
-    from lagbench.data.scenario import parse_viscosity
-
     stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
     viscosity = tier.viscosity(stated)
     if viscosity is None:
