@@ -51,13 +51,17 @@ def main() -> int:
     kinds = np.array(read_kinds(size, resolve_root(options.root)))
     names, counts = np.unique(kinds, return_counts=True)
     heads = [metric]
-    heads += [f"{name} ({count})" for name, count in zip(names, counts, strict=True)]
+    for name, count in zip(names, counts, strict=True):
+        heads.append(f"{name} ({count})")
     heads.append(f"all ({len(kinds)})")
     lines = []
     for method, values in values_by_method.items():
-        means = [np.mean(values[kinds == name]) for name in names]
-        means.append(np.mean(values))
-        lines.append([method, *(f"{mean:.4f}" for mean in means)])
+        cells = [method]
+        for name in names:
+            mean = np.mean(values[kinds == name])
+            cells.append(f"{mean:.4f}")
+        cells.append(f"{np.mean(values):.4f}")
+        lines.append(cells)
     print(markdown(heads, lines))
     return 0
 

@@ -65,11 +65,14 @@ class Conventional:
         self.inset = (self.low + 0.5 + 1e-3) * self.dx
         n = parameters.particles
         nodes = (parameters.grid + 1, parameters.grid + 1)
-        self.x, self.v = (ti.Vector.field(2, ti.f32, n) for _ in range(2))
+        self.x = ti.Vector.field(2, ti.f32, n)
+        self.v = ti.Vector.field(2, ti.f32, n)
         self.c = ti.Matrix.field(2, 2, ti.f32, n)
         self.j = ti.field(ti.f32, n)
-        self.m, self.q = (ti.field(ti.f32, nodes) for _ in range(2))
-        self.gv, self.ga = (ti.Vector.field(2, ti.f32, nodes) for _ in range(2))
+        self.m = ti.field(ti.f32, nodes)
+        self.q = ti.field(ti.f32, nodes)
+        self.gv = ti.Vector.field(2, ti.f32, nodes)
+        self.ga = ti.Vector.field(2, ti.f32, nodes)
         for target, values in (
             (self.x, state.position),
             (self.v, state.velocity),

@@ -52,18 +52,21 @@ def main() -> int:
 
 
 def _print_fits(name: str, fits: Sequence[ViscosityFit]) -> None:
-    by_frequency = defaultdict(list)
+    # viscosities and shares of energy by frequency
+    viscosities: dict[int, list[float]] = defaultdict(list)
+    energy_shares: dict[int, list[float]] = defaultdict(list)
     for fit in fits:
-        by_frequency[fit.frequency].append(fit)
-    for frequency, group in sorted(by_frequency.items()):
-        viscosity = np.mean([fit.viscosity for fit in group])
-        energy_share = np.mean([fit.energy_share for fit in group])
+        viscosities[fit.frequency].append(fit.viscosity)
+        energy_shares[fit.frequency].append(fit.energy_share)
+    for frequency in sorted(viscosities):
+        viscosity = np.mean(viscosities[frequency])
+        energy_share = np.mean(energy_shares[frequency])
         print(
             f"{name}, frequency {frequency}: nu = {viscosity:.2e} length^2/s, "
             f"{energy_share:.0%} of E left"
         )
-    viscosity = np.median([fit.viscosity for fit in fits])
-    energy_share = np.median([fit.energy_share for fit in fits])
+    viscosity = np.median(np.concatenate(list(viscosities.values())))
+    energy_share = np.median(np.concatenate(list(energy_shares.values())))
     print(f"{name}: median nu = {viscosity:.2e} length^2/s, {energy_share:.0%} left")
 
 

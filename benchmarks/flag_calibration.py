@@ -274,8 +274,9 @@ def main() -> int:
     heads = "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
     print(f"{'prediction':32s} {'split':14s}{heads}  copy_suspect")
     tables = {"honest": HONEST, "made from the truth": DISHONEST}
-    all_numbers: dict[str, list[list[float]]] = {kind: [] for kind in tables}
-    all_numbers["trained"] = []
+    all_numbers: dict[str, list[list[float]]] = {}
+    for kind in (*tables, "trained"):
+        all_numbers[kind] = []
     for split in options.splits.split(","):
         size = load().size(split, options.size)
         tests = read_tests(load_scored_task(size, resolve_root(options.root)))
@@ -311,7 +312,9 @@ def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[list[floa
 def numbers_of(trace: Trace) -> list[float]:
     """Return the numbers of one scenario, in the order of the columns."""
     copy_evidence = analyse_error(trace)
-    numbers = [float(getattr(copy_evidence, column)) for column in COLUMNS]
+    numbers = []
+    for column in COLUMNS:
+        numbers.append(float(getattr(copy_evidence, column)))
     numbers.append(float(np.mean(trace.predicted_motion) / np.mean(trace.motion)))
     numbers.append(float(np.mean(trace.occupancy)))
     return numbers

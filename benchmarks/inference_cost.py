@@ -85,7 +85,9 @@ def make_given_frames(info: DatasetInfo) -> Batch:
     velocity = 2.0 * speed * np.stack([velocity_x, velocity_y], axis=-1)
     low, high = np.transpose(info.bounds)
     first = low + (high - low) * unit_position
-    frames = [first + step * velocity for step in range(info.input_frames)]
+    frames = []
+    for step in range(info.input_frames):
+        frames.append(first + step * velocity)
     return Batch(
         position=torch.tensor(np.stack(frames, axis=1), dtype=torch.float32),
         sample=torch.zeros(count, dtype=torch.int64),
@@ -128,14 +130,16 @@ def main() -> int:
     rows = range(int(first), int(last or first) + 1)
     torch.set_num_threads(1)
 
-    counts = [PARTICLES * q**2 for q in rows]
+    counts = PARTICLES * np.square(rows)
     times = {}
     for name in MODELS:
         times[name] = [measure_milliseconds(name, q) for q in rows]
     lines = []
     for i, q in enumerate(rows):
-        cells = [f"{times[name][i]:.3g}" for name in MODELS]
-        lines.append([str(q), f"{counts[i]:,}", *cells])
+        cells = [str(q), f"{counts[i]:,}"]
+        for name in MODELS:
+            cells.append(f"{times[name][i]:.3g}")
+        lines.append(cells)
     if len(rows) > 1:
         exponents = []
         for name in MODELS:

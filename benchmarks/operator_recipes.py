@@ -75,8 +75,10 @@ def step_seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:
     generator = torch.Generator().manual_seed(0)
     seconds = []
     for step in range(STEPS):
-        indices = [(step + STEPS * place) * stride for place in range(batch)]
-        windows = collate([data[index] for index in indices])
+        samples = []
+        for place in range(batch):
+            samples.append(data[(step + STEPS * place) * stride])
+        windows = collate(samples)
         start = time.process_time()
         with torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16(recipe)):
             raw_terms = model(windows, generator)

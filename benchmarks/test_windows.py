@@ -124,7 +124,9 @@ def write_ours(root: Path, scenarios: int) -> None:
 
 def write_gns_npz(path: Path, scenarios: int) -> None:
     """Write what geoelements/gns loads into memory: one array per trajectory."""
-    arrays = {f"simulation_trajectory_{i}": trajectory(i) for i in range(scenarios)}
+    arrays = {}
+    for i in range(scenarios):
+        arrays[f"simulation_trajectory_{i}"] = trajectory(i)
     np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
 

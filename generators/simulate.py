@@ -256,7 +256,10 @@ def _soundness_recorders(batch: ScenarioBatch) -> list[SoundnessRecorder]:
     parameters = batch.solver.parameters
     if not isinstance(parameters, FreeSurfaceParameters):
         return []
-    return [SoundnessRecorder(parameters, state.material) for state in batch.states]
+    recorders = []
+    for state in batch.states:
+        recorders.append(SoundnessRecorder(parameters, state.material))
+    return recorders
 
 
 def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:
