@@ -19,6 +19,7 @@ Welling 2022, arXiv 2202.03376), the model learns from there to come back:
 from __future__ import annotations
 
 import enum
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
-from lagbench.tensors import Batch
+from lagbench.tensors import Batch, TensorBox
 
 from .baseline import Baseline
 from .graph import Bounds
@@ -42,21 +43,32 @@ class Symmetry(enum.StrEnum):
 
     NONE = "none"
     MIRROR = "mirror"
-    """x -> -x about the middle of the box: any split."""
+    """x -> -x about the middle of the box, in 3-D z -> -z too: any split."""
     SQUARE = "square"
     """All eight images of the square, or 48 of the cube: splits without gravity."""
 
 
 def check_symmetry(symmetry: object, size: Size) -> None:
-    """Refuse mirror images in which gravity points in another direction.
+    """Refuse mirror images in which walls or gravity have another direction.
 
     A split whose description names no gravity, as an imported one may, passes.
 
     Raises:
-        UsageError: all images of the square are asked for where gravity acts.
+        UsageError: all images of the square are asked for where gravity acts, or where
+            only some axes are periodic.
     """
+    if symmetry != Symmetry.SQUARE:
+        return
+    if len(set(size.box.periodic)) > 1:
+        raise UsageError(
+            f"only some axes of {size.split} are periodic: axes cannot change places",
+            where="model.symmetry",
+            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR}",
+            got=str(symmetry),
+            fix="set model.symmetry=mirror",
+        )
     parameter = size.parameters.get("gravity")
-    if symmetry != Symmetry.SQUARE or not parameter or not parameter.value:
+    if not parameter or not parameter.value:
         return
     raise UsageError(
         f"gravity in {size.split} points down, and its images of the square fall "
@@ -69,8 +81,13 @@ def check_symmetry(symmetry: object, size: Size) -> None:
     )
 
 
-def mirror_matrices(symmetry: Symmetry) -> Tensor:
-    """Return the matrices of all mirror images, the identity first, [image, 2, 2]."""
+def mirror_matrices(symmetry: Symmetry, dimension: int = 2) -> Tensor:
+    """Return the matrices of all mirror images, the identity first.
+
+    Their shape is [image, axis, axis].
+    """
+    if dimension == 3:
+        return _solid_matrices(symmetry)
     identity = (1.0, 1.0)
     flip_x = (-1.0, 1.0)
     flip_y = (1.0, -1.0)
@@ -85,22 +102,40 @@ def mirror_matrices(symmetry: Symmetry) -> Tensor:
     return upright[:1]
 
 
+def _solid_matrices(symmetry: Symmetry) -> Tensor:
+    """Return the matrices of all mirror images in three dimensions."""
+    signs = torch.tensor(list(itertools.product((1.0, -1.0), repeat=3)))
+    upright = torch.diag_embed(signs)
+    if symmetry is Symmetry.NONE:
+        return upright[:1]
+    if symmetry is Symmetry.MIRROR:
+        return upright[signs[:, 1] > 0.0]
+    images = []
+    for order in itertools.permutations(range(3)):
+        images.append(upright[:, :, list(order)])
+    return torch.cat(images)
+
+
 def mirror_field(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> Tensor:
     """Return the mirror image of a field in a box of that symmetry.
 
     Args:
-        field: values of nodes, shape [window, channel, x node, y node].
-        matrix: signed permutation of the axes, shape [2, 2].
+        field: values of nodes, shape [window, channel, x node, y node], in three
+            dimensions with z nodes.
+        matrix: signed permutation of the axes, shape [axis, axis].
         channels: blocks of the diagonal matrix by which the image changes the values
             of a node.
     """
     channel_matrix: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
     with torch.autocast(field.device.type, enabled=False):
-        image = torch.einsum("dc,wcxy->wdxy", channel_matrix.to(field), field)
-    swaps_axes = bool(matrix[0, 1] != 0.0)
-    if swaps_axes:
-        image = image.transpose(2, 3)
-    flipped_axes = [axis + 2 for axis in range(2) if float(matrix[axis].sum()) < 0.0]
+        image = torch.einsum("dc,wc...->wd...", channel_matrix.to(field), field)
+    # New axis i is that old axis where row i of the matrix is not 0.
+    order = matrix.abs().argmax(dim=1).tolist()
+    image = image.permute(0, 1, *[axis + 2 for axis in order])
+    flipped_axes = []
+    for axis, sign in enumerate(matrix.sum(dim=1).tolist()):
+        if sign < 0.0:
+            flipped_axes.append(axis + 2)
     return image.flip(flipped_axes)
 
 
@@ -184,6 +219,30 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         walls = _multiply(matrix[:, None, None], walls)
         walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
     return replace(batch, position=position, wall_velocity=walls, origin=origin)
+
+
+def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Batch:
+    """Return each window moved by a random way along the periodic axes of the box.
+
+    Args:
+        batch: windows.
+        box: box that holds the particles.
+        generator: source of the ways, uniform over a period.
+    """
+    dimension = batch.position.shape[2]
+    draws = torch.rand(
+        (batch.windows, dimension), generator=generator, device=generator.device
+    )
+    # The period of an axis with walls is infinite.
+    is_periodic = box.period.isfinite()
+    shift = torch.where(is_periodic, draws.to(box.period) * box.period, 0.0)
+    by_particle = shift.to(batch.position)[batch.sample]
+
+    position = box.wrap(batch.position + by_particle[:, None])
+    origin = batch.origin
+    if origin is not None:
+        origin = box.wrap(origin + by_particle)
+    return replace(batch, position=position, origin=origin)
 
 
 def wall_permutation(matrix: Tensor) -> Tensor:

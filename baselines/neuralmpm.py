@@ -34,6 +34,7 @@ from .augmentation import (
     augment,
     mirror_field,
     mirror_matrices,
+    shift_batch,
     velocity_towards_path,
 )
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
@@ -64,14 +65,19 @@ class NeuralMPM(Baseline):
     options: NeuralMPMOptions
     method = "NeuralMPM"
     any_size = True
+    any_box = True
 
     def __init__(self, options: NeuralMPMOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         check_options(options, info)
+        periodic = info.box.periodic
         self.grid = ParticleGrid(
-            info.bounds, options.cells, multiple=NODES_PER_COARSE_NODE
+            info.bounds,
+            options.cells,
+            multiple=NODES_PER_COARSE_NODE,
+            periodic=periodic,
         )
-        unit = (self.grid.spacing / info.radius) ** 2
+        unit = (self.grid.spacing / info.radius) ** info.box.dimension
         self.speed = _isotropic_std(info, "velocity_std")
         self.change = _isotropic_std(info, "acceleration_std")
         self.encoder = FieldEncoder(
@@ -90,7 +96,7 @@ class NeuralMPM(Baseline):
         self.context: ContextNetwork | None = None
         if options.context:
             self.context = ContextNetwork(
-                self.encoder.field_channels, options.context, options.width
+                self.encoder.field_channels, options.context, options.width, periodic
             )
         inputs = (
             self.encoder.field_channels
@@ -98,7 +104,7 @@ class NeuralMPM(Baseline):
             + options.context
             + options.viscosity
         )
-        self.network = UNet(inputs, self.decoder.channels, options.width)
+        self.network = UNet(inputs, self.decoder.channels, options.width, periodic)
         # Stresses conserve momentum, so a fall needs a weight of its own. Where all
         # images of the square are as good, nothing falls.
         self.fall: nn.Parameter | None = None
@@ -147,6 +153,8 @@ class NeuralMPM(Baseline):
         """
         if generator is not None:
             batch = augment(self, batch, generator)
+            if self.options.shift:
+                batch = shift_batch(batch, self.box, generator)
         state = self.start(batch.part(slice(self.history)), average=False)
         next_frame = self.history  # the first frame whose error counts
         if generator is not None and self.options.pushforward:
@@ -217,8 +225,8 @@ class NeuralMPM(Baseline):
     def _coming_walls(self, given: Batch) -> Tensor:
         """Return the velocities of the walls from the last frame on [length/frame]."""
         if not self.options.wall_velocity or given.wall_velocity is None:
-            wall_count = len(self.encoder.beside_walls)
-            return given.position.new_zeros(given.windows, 1, wall_count, 2)
+            dimension = given.position.shape[2]
+            return given.position.new_zeros(given.windows, 1, 2 * dimension, dimension)
         per_second = given.wall_velocity[:, given.frames - 1 :]
         return per_second * self.info.frame_interval
 
@@ -265,7 +273,7 @@ class NeuralMPM(Baseline):
         images = [fields]
         if average and self.options.average:
             images = []
-            for matrix in mirror_matrices(self.options.symmetry):
+            for matrix in self._mirror_matrices():
                 blocks = self.encoder.mirror_fields(matrix)
                 images.append(mirror_field(fields, matrix, blocks))
         contexts = [network(image) for image in images]
@@ -312,13 +320,18 @@ class NeuralMPM(Baseline):
         falling = falling + FALL_UNIT * self.change * fall_vector
         return falling.unbind(dim=1)
 
+    def _mirror_matrices(self) -> Tensor:
+        """Return the matrices of all mirror images, shape [image, axis, axis]."""
+        return mirror_matrices(self.options.symmetry, self.grid.dimension)
+
     def _network_inputs(self, state: GridState, fields: Tensor) -> Tensor:
         """Return what the U-Net sees, shape [window, channel, x node, y node].
 
         These are fields, context, viscosity and forcing.
         """
         constants = torch.cat([state.context, state.viscosity], dim=1)
-        constant_fields = constants[:, :, None, None].expand(-1, -1, *self.grid.shape)
+        one_node = constants.view(*constants.shape, *[1] * self.grid.dimension)
+        constant_fields = one_node.expand(-1, -1, *self.grid.shape)
         parts = [fields, constant_fields]
         if self.options.wall_velocity:
             parts.append(self.encoder.forcing(state.walls))
@@ -331,7 +344,7 @@ class NeuralMPM(Baseline):
         whole group (Puny et al. 2022, arXiv 2110.03336).
         """
         outputs = []
-        for matrix in mirror_matrices(self.options.symmetry):
+        for matrix in self._mirror_matrices():
             input_blocks = [
                 *self.encoder.mirror_fields(matrix),
                 torch.eye(self.options.context + self.options.viscosity),
@@ -386,10 +399,11 @@ class NeuralMPM(Baseline):
 
 
 def _isotropic_std(info: DatasetInfo, name: str) -> float:
-    """Return one deviation for x and y, the root of their mean square.
+    """Return one deviation for all axes, the root of their mean square.
 
-    A model that is trained on mirror images must not distinguish x and y.
+    A model that is trained on mirror images must not distinguish the axes.
     """
-    std_x, std_y = info.statistics[name]
-    mean_square: float = std_x**2 / 2 + std_y**2 / 2
+    mean_square = 0.0
+    for std in info.statistics[name]:
+        mean_square += std**2 / info.box.dimension
     return float(mean_square**0.5)

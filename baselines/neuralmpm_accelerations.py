@@ -81,8 +81,8 @@ class FieldAccelerations(Accelerations):
 
     @property
     def channels(self) -> int:
-        """Two components of each material in each frame."""
-        return 2 * self.material_count * self.frames
+        """A component along each axis, of each material in each frame."""
+        return self.grid.dimension * self.material_count * self.frames
 
     def mirror(self, matrix: Tensor) -> list[Tensor]:
         """Return the image of each acceleration."""
@@ -92,10 +92,11 @@ class FieldAccelerations(Accelerations):
         self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles."""
-        accelerations = output.reshape(-1, 2 * self.frames, *self.grid.shape)
+        axes = self.grid.dimension
+        accelerations = output.reshape(-1, axes * self.frames, *self.grid.shape)
         # One transfer serves the velocity and all frames.
         field = torch.cat([grid_velocity, accelerations], dim=1)
-        gathered = self.grid.gather(stencil, field).view(len(stencil.weight), -1, 2)
+        gathered = self.grid.gather(stencil, field).view(len(stencil.weight), -1, axes)
         velocity, *particle_accelerations = gathered.unbind(dim=1)
         return velocity, particle_accelerations
 

@@ -92,13 +92,15 @@ class FieldEncoder(nn.Module):
     @property
     def field_channels(self) -> int:
         """Channels of :meth:`encode`."""
-        per_material = 1 + 2 * self.options.velocities + 3 * self.options.strain
+        axes = self.grid.dimension
+        per_material = 1 + axes * self.options.velocities + 3 * self.options.strain
         return self.material_count * per_material + len(self.wall_distance)
 
     @property
     def forcing_channels(self) -> int:
         """Channels of :meth:`forcing`."""
-        return 2 * self.options.bundle * self.options.wall_velocity
+        axes = self.grid.dimension
+        return axes * self.options.bundle * self.options.wall_velocity
 
     def layers(self, material: Tensor, sample: Tensor) -> Tensor:
         """Return the layer of each particle: one for each window and material.
@@ -126,7 +128,8 @@ class FieldEncoder(nn.Module):
         """
         windows = len(state.walls)
         layers = windows * self.material_count
-        velocity_channels = 2 * self.options.velocities
+        axes = self.grid.dimension
+        velocity_channels = axes * self.options.velocities
 
         carried = [torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)]
         if state.rest_shape is not None:
@@ -136,7 +139,7 @@ class FieldEncoder(nn.Module):
         weight = sums[:, :1] / self.unit
         means = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY_WEIGHT)
         velocity = means[:, :velocity_channels]
-        velocity = velocity.reshape(layers, -1, 2, *self.grid.shape)
+        velocity = velocity.reshape(layers, -1, axes, *self.grid.shape)
         changes = velocity.diff(dim=1) / self.acceleration_std
         scaled_velocity = velocity[:, -1] / self.velocity_std
         strain = means[:, velocity_channels:]
@@ -144,7 +147,7 @@ class FieldEncoder(nn.Module):
         per_material = torch.cat(
             [weight, scaled_velocity, changes.flatten(1, 2), strain], dim=1
         )
-        wall_distance = self.wall_distance.expand(windows, -1, -1, -1)
+        wall_distance = self.wall_distance.expand(windows, *self.wall_distance.shape)
         of_window = per_material.reshape(windows, -1, *self.grid.shape)
         fields = torch.cat([of_window, wall_distance], dim=1)
         if self.options.mixture:
@@ -160,7 +163,9 @@ class FieldEncoder(nn.Module):
             -1, self.material_count, sums.shape[1], *self.grid.shape
         )
         total = by_material.sum(dim=1) / self.unit
-        velocity = total[:, -2:] / total[:, :1].clamp(min=EMPTY_WEIGHT)
+        velocity = total[:, -self.grid.dimension :] / total[:, :1].clamp(
+            min=EMPTY_WEIGHT
+        )
         return velocity.repeat_interleave(self.material_count, dim=0)
 
     def forcing(self, walls: Tensor) -> Tensor:
@@ -172,7 +177,9 @@ class FieldEncoder(nn.Module):
         frame = torch.arange(1, self.options.bundle + 1, device=walls.device)
         last_frame = walls.shape[1] - 1
         velocity = walls[:, frame.clamp(max=last_frame)] / self.velocity_std
-        forcing = torch.einsum("fmwc,wxy->fmcxy", velocity, self.beside_walls)
+        forcing = torch.einsum(
+            "fmwc,w...->fmc...", velocity[:, :, self.grid.walls], self.beside_walls
+        )
         return forcing.flatten(1, 2)
 
     def mirror_fields(self, matrix: Tensor) -> list[Tensor]:
@@ -181,7 +188,9 @@ class FieldEncoder(nn.Module):
         per_material += [matrix] * self.options.velocities
         if self.options.strain:
             per_material.append(strain_matrix(matrix))
-        return [*per_material * self.material_count, wall_permutation(matrix)]
+        walls = self.grid.walls
+        permutation = wall_permutation(matrix)[walls][:, walls]
+        return [*per_material * self.material_count, permutation]
 
     def mirror_forcing(self, matrix: Tensor) -> list[Tensor]:
         """Return the blocks by which a mirror image changes the forcing of a node."""

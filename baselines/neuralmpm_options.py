@@ -19,12 +19,12 @@ Grids = Annotated[tuple[GridCells, ...], Field(max_length=8)]
 class NeuralMPMOptions(Options):
     """Options of the grid surrogate."""
 
-    in_training = frozenset({"calls", "pushforward", "recovery", "noise_std"})
+    in_training = frozenset({"calls", "pushforward", "recovery", "noise_std", "shift"})
     # the weights of projections are of these grids, in this order
     of_weights = frozenset({"shape", "density"})
 
     # cells of the network's grid across the box; even, so that walls lie between two
-    # nodes on all sides
+    # nodes on all sides; along a periodic axis the nearest multiple of 4
     cells: int = Field(default=18, ge=4, le=256, multiple_of=2)
     width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
     velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
@@ -64,6 +64,9 @@ class NeuralMPMOptions(Options):
     density: Grids = ()
     # training windows are replaced by random ones of these mirror images
     symmetry: Symmetry = Symmetry.NONE
+    # training windows are moved by random ways along periodic axes, if there are any:
+    # the U-Net itself knows no other shifts than those by a node of its coarsest level
+    shift: bool = False
     # whether calls of rollouts, not of training, are mirror-averaged, at as many times
     # the cost as there are mirror images
     average: bool = False
@@ -74,9 +77,11 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
 
     Raises:
         UsageError: a material is unknown or named twice, there are no mirror images to
-            average over, or no wall moves.
+            average over, no wall moves, or an option knows flat boxes with walls only
+            and the box is none.
     """
     check_moving_walls(options.wall_velocity, info)
+    _check_box(options, info)
     materials = set(options.materials)
     is_repeated = len(materials) < len(options.materials)
     if not materials or is_repeated or not materials <= set(range(MATERIALS)):
@@ -94,3 +99,21 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
             got=str(options.symmetry),
             fix="set model.symmetry=mirror too, or leave model.average out",
         )
+
+
+def _check_box(options: NeuralMPMOptions, info: DatasetInfo) -> None:
+    """Refuse options that the box of the data set does not allow."""
+    box = info.box
+    if box.dimension == 2 and not box.is_periodic:
+        return
+    # They follow bodies over a grid, and know where the walls of a square are.
+    for name in ("conserve", "strain", "shape", "density"):
+        value = getattr(options, name)
+        if value:
+            raise UsageError(
+                f"{name} knows boxes of two dimensions with walls only",
+                where=f"model.{name}",
+                expected="the default",
+                got=value,
+                fix="leave the option out",
+            )

@@ -1,31 +1,35 @@
 """Particles to nodes and back by quadratic B-splines, on the grid of a network.
 
-    spread:  g_ij = sum_p b(x_p - x_i) b(y_p - y_j) v_p        (P2G)
-    gather:  v_p  = sum_ij b(x_p - x_i) b(y_p - y_j) g_ij      (G2P)
+    spread:  g_i = sum_p w_pi v_p        (P2G)
+    gather:  v_p = sum_i w_pi g_i        (G2P)
 
-with the b of :mod:`lagbench.data.grid`. Both take one :class:`Stencil` and have
-gradients to positions and values.
+with w_pi the product over the axes of b(x_p - x_i), and the b of
+:mod:`lagbench.data.grid`. Both take one :class:`Stencil` and have gradients to
+positions and values. A box has two or three axes, between walls or periodic: along a
+periodic axis the last node is a neighbour of the first.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
 
-from lagbench.data.box import Box
+from lagbench.data.box import AXES, Box
 from lagbench.tensors import TensorBox
 
 from .graph import Bounds, wall_distance
-from .torch_grid import number_nine_nodes, spline_slopes, spline_weights
+from .torch_grid import number_nodes, spline_slopes, spline_weights, three_places
 
 __all__ = ["ParticleGrid", "Stencil"]
 
 
 class Stencil(NamedTuple):
-    """The nine nodes around each particle."""
+    """The nodes around each particle: 9 in two dimensions, 27 in three."""
 
     weight: Tensor  # of each node [1], shape [particle, 9]; they sum to 1
     # number of the node among those of all layers, int64, shape [particle * 9]
@@ -33,36 +37,58 @@ class Stencil(NamedTuple):
 
 
 class ParticleGrid(nn.Module):
-    """Square cells, symmetric about the middle of the box; walls lie between two nodes.
+    """Square or cubic cells, symmetric about the middle of the box.
+
+    Walls lie between two nodes. A periodic axis is a whole number of cells long, and
+    its first node lies half a cell from the seam; there cells may be a little longer or
+    shorter than along other axes.
 
     Particles that do not mix, those of several windows or materials, each have a layer
     of nodes.
 
     Args:
-        bounds: box (low, high) along x and y [length]; particles lie in it.
-        cells: cells across the wider side of the box.
+        bounds: box (low, high) along each axis [length]; particles lie in it.
+        cells: cells across the widest side of the box.
         multiple: number that divides the nodes of each axis.
+        periodic: whether each axis repeats itself; by default there are walls only.
     """
 
-    axis_x: Tensor
-    axis_y: Tensor
     low: Tensor
     high: Tensor
+    cell: Tensor  # width of a cell along each axis [length], float64, shape [axis]
 
-    def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
+    def __init__(
+        self,
+        bounds: Bounds,
+        cells: int,
+        *,
+        multiple: int = 1,
+        periodic: Sequence[bool] | None = None,
+    ) -> None:
         super().__init__()
+        box = Box.from_bounds(bounds, periodic)
+        self.box = TensorBox(box)
         self.bounds = bounds
-        self.box = TensorBox(Box.from_bounds(bounds))
         self.spacing = max(high - low for low, high in bounds) / cells
-        axis_x = self._node_places(bounds[0], multiple)
-        axis_y = self._node_places(bounds[1], multiple)
-        self.register_buffer("axis_x", axis_x, persistent=False)
-        self.register_buffer("axis_y", axis_y, persistent=False)
-        self.register_buffer("low", torch.tensor(bounds)[:, 0], persistent=False)
-        self.register_buffer("high", torch.tensor(bounds)[:, 1], persistent=False)
+        widths = []
+        for name, interval, is_periodic in zip(
+            AXES, bounds, box.periodic, strict=False
+        ):
+            if is_periodic:
+                width, places = self._periodic_places(interval, multiple)
+            else:
+                width = self.spacing
+                places = self._node_places(interval, multiple)
+            widths.append(width)
+            self.register_buffer(f"axis_{name}", places, persistent=False)
+        ends = torch.tensor(bounds)
+        cell = torch.tensor(widths, dtype=torch.float64)
+        self.register_buffer("low", ends[:, 0], persistent=False)
+        self.register_buffer("high", ends[:, 1], persistent=False)
+        self.register_buffer("cell", cell, persistent=False)
 
     def _node_places(self, interval: tuple[float, float], multiple: int) -> Tensor:
-        """Return the nodes' places along an axis [length], shape [node]."""
+        """Return the nodes' places between two walls [length], shape [node]."""
         low, high = interval
         nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
         nodes += -nodes % multiple
@@ -70,54 +96,115 @@ class ParticleGrid(nn.Module):
         places = (low + high) / 2 + steps * self.spacing
         return places.to(torch.float32)
 
+    def _periodic_places(
+        self, interval: tuple[float, float], multiple: int
+    ) -> tuple[float, Tensor]:
+        """Return a cell's width and the nodes' places along a periodic axis [length].
+
+        The number of nodes is the multiple whose cells are nearest to the spacing, and
+        no fewer than the three nodes that a particle touches.
+        """
+        low, high = interval
+        multiples = round((high - low) / self.spacing / multiple)
+        nodes = multiple * max(multiples, math.ceil(3 / multiple))
+        width = (high - low) / nodes
+        steps = torch.arange(nodes, dtype=torch.float64) + 0.5
+        places = low + steps * width
+        return width, places.to(torch.float32)
+
     @property
-    def shape(self) -> tuple[int, int]:
-        """Nodes along x and y."""
-        return len(self.axis_x), len(self.axis_y)
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return len(self.bounds)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Whether each axis repeats itself."""
+        return self.box.box.periodic
+
+    @property
+    def axes(self) -> tuple[Tensor, ...]:
+        """Places of the nodes along each axis [length], each of shape [node]."""
+        names = AXES[: self.dimension]
+        return tuple(getattr(self, f"axis_{name}") for name in names)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Nodes along each axis."""
+        return tuple(len(axis) for axis in self.axes)
+
+    @property
+    def walls(self) -> list[int]:
+        """Numbers of the walls that there are, two of each axis."""
+        numbers = []
+        for axis, is_periodic in enumerate(self.periodic):
+            if not is_periodic:
+                numbers += [2 * axis, 2 * axis + 1]
+        return numbers
 
     def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
-        """Return the nine nodes around each particle.
+        """Return the nodes around each particle.
 
         Args:
-            position: positions [length], shape [particle, 2].
+            position: positions [length], shape [particle, axis].
             layer: layer of nodes of each particle, int64, shape [particle].
         """
         corner, offset = self._locate(position)
-        column, row = corner.long().unbind(dim=1)
-        node = number_nine_nodes(layer, column, row, self.shape)
+        places = three_places(corner.long())
+        for axis, is_periodic in enumerate(self.periodic):
+            if is_periodic:
+                places[axis] = places[axis] % self.shape[axis]
+        node = number_nodes(layer, places, self.shape)
         return Stencil(spline_weights(offset).flatten(1), node.flatten())
 
     def _locate(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first node around each particle, and the way from it [cell]."""
-        columns, rows = self.shape
-        origin = torch.stack([self.axis_x[0], self.axis_y[0]])
-        s = (position - origin) / self.spacing
+        """Return the first node around each particle, and the way from it [cell].
+
+        Along a periodic axis the first node may have a number below 0.
+        """
+        origin = torch.stack([axis[0] for axis in self.axes])
+        s = (position - origin) / self.cell.to(position)
         # On the far wall the third node has weight 0 and may not exist; NaN must not
         # become an index.
-        last_corner = s.new_tensor([columns - 3, rows - 3])
         corner = torch.floor(s.detach() - 0.5).nan_to_num(0.0)
-        corner = corner.clamp(min=0.0).minimum(last_corner)
+        first = [-math.inf if is_periodic else 0.0 for is_periodic in self.periodic]
+        last = [
+            math.inf if is_periodic else nodes - 3.0
+            for is_periodic, nodes in zip(self.periodic, self.shape, strict=True)
+        ]
+        corner = corner.clamp(s.new_tensor(first), s.new_tensor(last))
         return corner, s - corner
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
         """Return sums at the nodes, shape [layer, channel, x node, y node].
 
-        ``value`` has shape [particle, channel].
+        ``value`` has shape [particle, channel]. In three dimensions the last axis is
+        that of the z nodes.
         """
-        columns, rows = self.shape
         contributions = stencil.weight[:, :, None] * value[:, None]
-        sums = value.new_zeros(layers * columns * rows, value.shape[1])
+        node_count = layers * math.prod(self.shape)
+        sums = value.new_zeros(node_count, value.shape[1])
         sums = sums.index_add(0, stencil.node, contributions.flatten(0, 1))
-        return sums.view(layers, columns, rows, -1).permute(0, 3, 1, 2)
+        return sums.view(layers, *self.shape, -1).movedim(-1, 1)
 
     def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
         """Return a field at the particles, shape [particle, channel].
 
-        ``field`` has shape [layer, channel, x node, y node].
+        ``field`` has shape [layer, channel, x node, y node], or with z nodes.
         """
         channels = field.shape[1]
-        by_node = field.permute(0, 2, 3, 1).reshape(-1, channels)
-        nearby = by_node.index_select(0, stencil.node).view(-1, 9, channels)
+        nodes_around = stencil.weight.shape[1]
+        by_node = field.movedim(1, -1).reshape(-1, channels)
+        if self.dimension == 3:
+            # Products with 27 nodes would fill the memory: this sums at once.
+            return embedding_bag(
+                stencil.node.view(-1, nodes_around),
+                by_node,
+                per_sample_weights=stencil.weight,
+                mode="sum",
+            )
+        nearby = by_node.index_select(0, stencil.node)
+        nearby = nearby.view(-1, nodes_around, channels)
         return (stencil.weight[:, :, None] * nearby).sum(dim=1)
 
     def accelerate(
@@ -131,6 +218,8 @@ class ParticleGrid(nn.Module):
         1994), with grad per cell; a is 0 where there is no matter. As the b_i sum to 1
         and the s_p are symmetric, momentum and angular momentum of the nodes are
         conserved. The result has shape [layer, 2 frame, x node, y node].
+
+        The box has two dimensions and walls.
 
         Args:
             stencil: nodes around ``position``.
@@ -156,28 +245,37 @@ class ParticleGrid(nn.Module):
         return acceleration.view(len(mass), columns, rows, -1).permute(0, 3, 1, 2)
 
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
-        """Return the way from each particle to its nodes [length], [particle, 9, 2]."""
+        """Return the way from each particle to its nodes [length], [particle, 9, 2].
+
+        The box has two dimensions and walls.
+        """
         columns, rows = self.shape
         node = stencil.node.view(-1, 9) % (columns * rows)
-        x = self.axis_x[node // rows]
-        y = self.axis_y[node % rows]
+        axis_x, axis_y = self.axes
+        x = axis_x[node // rows]
+        y = axis_y[node % rows]
         return torch.stack([x, y], dim=2) - position[:, None]
 
     def wall_distance(self, reach: float) -> Tensor:
         """Return the nodes' distances to the walls, shape [wall, x node, y node].
 
-        They are those of :func:`~lagbench.baselines.graph.wall_distance`.
+        They are those of :func:`~lagbench.baselines.graph.wall_distance`. Periodic axes
+        have no walls.
         """
-        x, y = torch.meshgrid(self.axis_x, self.axis_y, indexing="ij")
-        distance = wall_distance(torch.stack([x, y], dim=-1), self.bounds, reach)
-        return distance.permute(2, 0, 1).contiguous()
+        node = torch.stack(torch.meshgrid(*self.axes, indexing="ij"), dim=-1)
+        distance = wall_distance(node, self.bounds, reach, self.periodic)
+        return distance.movedim(-1, 0)[self.walls].contiguous()
 
     def share_inside(self) -> Tensor:
-        """Return the shares of the nodes' splines in the box [1], [x node, y node]."""
+        """Return the shares of the nodes' splines in the box [1], [x node, y node].
+
+        The box has two dimensions and walls.
+        """
         low_x, low_y = self.low
         high_x, high_y = self.high
-        share_x = self._axis_share_inside(self.axis_x, low_x, high_x)
-        share_y = self._axis_share_inside(self.axis_y, low_y, high_y)
+        axis_x, axis_y = self.axes
+        share_x = self._axis_share_inside(axis_x, low_x, high_x)
+        share_y = self._axis_share_inside(axis_y, low_y, high_y)
         return share_x[:, None] * share_y
 
     def _axis_share_inside(self, axis: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -206,6 +206,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "density": [],
         "neighbours": None,
         "viscosity": False,
+        "shift": False,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

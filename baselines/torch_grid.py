@@ -11,6 +11,7 @@ node].
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -158,8 +159,9 @@ def transfer(
     s = x * grid.cells - grid.origin  # position in cells, counted from node 0
     base = torch.floor(s.detach() - 0.5)
     side = grid.nodes + _ROWS_BELOW + _ROWS_ABOVE
-    column, row = (base.long() + _ROWS_BELOW).unbind(dim=-1)
-    node = number_nine_nodes(sample, column, row, (side, side))
+    corner = base.long() + _ROWS_BELOW
+    places = three_places(corner)
+    node = number_nodes(sample, places, (side, side))
     weight = spline_weights(s - base) * is_inside[..., None]  # [particle, 3, 3]
 
     carried = torch.cat([torch.ones_like(u[:, :1]), u], dim=-1)  # (1, u, v)
@@ -200,12 +202,16 @@ def _count_windows(sample: Tensor) -> int:
 
 
 def spline_weights(s: Tensor) -> Tensor:
-    """Return the weights of the nine nodes around particles, shape [particle, 3, 3].
+    """Return the weights of the nodes around particles, 3 along each axis.
 
+    The shape is [particle, 3, 3] in two dimensions, [particle, 3, 3, 3] in three.
     ``s`` is where particles lie from the first of their nodes on [cell].
     """
-    b = _spline_values(s)
-    return b[:, :, None, 0] * b[:, None, :, 1]
+    b = spline_values(s)
+    weight = b[:, :, None, 0] * b[:, None, :, 1]
+    if b.shape[2] == 3:
+        weight = weight[..., None] * b[:, None, None, :, 2]
+    return weight
 
 
 def spline_slopes(s: Tensor) -> Tensor:
@@ -213,29 +219,47 @@ def spline_slopes(s: Tensor) -> Tensor:
 
     The shape is [particle, 2, 3, 3]; ``s`` is that of :func:`spline_weights`.
     """
-    b = _spline_values(s)
+    b = spline_values(s)
     slope = torch.stack([s - 1.5, 2.0 - 2.0 * s, s - 0.5], dim=1)
     along_x = slope[:, :, None, 0] * b[:, None, :, 1]
     along_y = b[:, :, None, 0] * slope[:, None, :, 1]
     return torch.stack([along_x, along_y], dim=1)
 
 
-def _spline_values(s: Tensor) -> Tensor:
-    """Return the spline at three nodes along each axis, shape [particle, 3, 2]."""
+def spline_values(s: Tensor) -> Tensor:
+    """Return the spline at three nodes along each axis, shape [particle, 3, axis]."""
     first = 0.5 * (1.5 - s) ** 2
     second = 0.75 - (s - 1.0) ** 2
     third = 0.5 * (s - 0.5) ** 2
     return torch.stack([first, second, third], dim=1)
 
 
-def number_nine_nodes(
-    layer: Tensor, column: Tensor, row: Tensor, shape: tuple[int, int]
-) -> Tensor:
-    """Return the numbers of the nine nodes from a corner on, shape [particle, 3, 3].
+def three_places(corner: Tensor) -> list[Tensor]:
+    """Return the numbers of three nodes along each axis, each [particle, 3].
 
-    Nodes are numbered through all layers of ``shape`` (columns, rows).
+    ``corner`` holds the first of them, int64, shape [particle, axis].
     """
-    columns, rows = shape
-    offset = torch.arange(3, device=row.device)
-    corner = (layer * columns + column) * rows + row
-    return corner[:, None, None] + (offset[:, None] * rows + offset)
+    offset = torch.arange(3, device=corner.device)
+    return [first[:, None] + offset for first in corner.unbind(dim=1)]
+
+
+def number_nodes(
+    layer: Tensor, places: Sequence[Tensor], shape: Sequence[int]
+) -> Tensor:
+    """Return the numbers of the nodes around particles, shape [particle, 3, ...].
+
+    Nodes are numbered through all layers, the last axis fastest.
+
+    Args:
+        layer: layer of each particle, int64, shape [particle].
+        places: numbers of three nodes along each axis, int64, each of shape
+            [particle, 3].
+        shape: nodes along each axis.
+    """
+    dimension = len(shape)
+    node = layer.view(-1, *[1] * dimension)
+    for axis, (place, node_count) in enumerate(zip(places, shape, strict=True)):
+        along_axis = [1] * dimension
+        along_axis[axis] = 3
+        node = node * node_count + place.view(-1, *along_axis)
+    return node

@@ -1,30 +1,76 @@
 """Convolutions on the nodes of a grid: a U-Net, and an encoder to a few numbers.
 
+Grids have two or three axes. Beyond the ends of a periodic axis lie the nodes of its
+other end, beyond walls there are zeros.
+
 The U-Net (Ronneberger et al. 2015) maps fields to fields. The context network maps the
 fields of the given frames to a few numbers that describe the whole scenario.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import gelu
+from torch.nn.functional import gelu, pad
 
 # nodes of the finest level to one node of the coarsest level, along each axis
 NODES_PER_COARSE_NODE = 4
 
 
+# by the number of axes
+CONVOLUTIONS: dict[int, type[nn.Conv2d] | type[nn.Conv3d]] = {
+    2: nn.Conv2d,
+    3: nn.Conv3d,
+}
+TRANSPOSED: dict[int, type[nn.ConvTranspose2d] | type[nn.ConvTranspose3d]] = {
+    2: nn.ConvTranspose2d,
+    3: nn.ConvTranspose3d,
+}
+
+
+class Frame(nn.Module):
+    """One more node on each side: that of the other end, or 0 beyond a wall."""
+
+    def __init__(self, periodic: Sequence[bool]) -> None:
+        super().__init__()
+        wrapped: list[int] = []
+        walled: list[int] = []
+        for is_periodic in reversed(periodic):  # the last axis comes first
+            wrapped += [int(is_periodic)] * 2
+            walled += [int(not is_periodic)] * 2
+        self.wrapped = wrapped
+        self.walled = walled
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return the field with its frame."""
+        return pad(pad(field, self.wrapped, mode="circular"), self.walled)
+
+
+def convolve_three(
+    inputs: int, outputs: int, periodic: Sequence[bool], *, stride: int = 1
+) -> nn.Module:
+    """Return a convolution over three nodes along each axis of a grid."""
+    convolution = CONVOLUTIONS[len(periodic)]
+    if not any(periodic):
+        return convolution(inputs, outputs, 3, stride=stride, padding=1)
+    return nn.Sequential(
+        Frame(periodic), convolution(inputs, outputs, 3, stride=stride)
+    )
+
+
 class Block(nn.Module):
     """Two convolutions beside a shortcut."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, periodic: Sequence[bool]) -> None:
         super().__init__()
-        self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.first = convolve_three(inputs, outputs, periodic)
         self.norm = nn.GroupNorm(4, outputs)
-        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.second = convolve_three(outputs, outputs, periodic)
         self.shortcut: nn.Module = nn.Identity()
         if inputs != outputs:
-            self.shortcut = nn.Conv2d(inputs, outputs, 1)
+            self.shortcut = CONVOLUTIONS[len(periodic)](inputs, outputs, 1)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the field after the block, shape [window, outputs, x node, y node]."""
@@ -35,32 +81,50 @@ class Block(nn.Module):
 
 
 class UNet(nn.Module):
-    """Three levels of resolution; the weights of the last layer start at zero."""
+    """Three levels of resolution; the weights of the last layer start at zero.
 
-    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+    Args:
+        inputs: channels of the input.
+        outputs: channels of the output.
+        width: channels of the finest level.
+        periodic: whether each axis of the grid repeats itself.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        width: int,
+        periodic: Sequence[bool] = (False, False),
+    ) -> None:
         super().__init__()
+        convolution = CONVOLUTIONS[len(periodic)]
+        transposed = TRANSPOSED[len(periodic)]
         fine = width
         middle = 2 * width
         coarse = 4 * width
 
-        self.begin = nn.Conv2d(inputs, fine, 3, padding=1)
-        self.down_fine = Block(fine, fine)
-        self.down_middle = Block(middle, middle)
-        self.halve_fine = nn.Conv2d(fine, middle, 2, stride=2)
-        self.halve_middle = nn.Conv2d(middle, coarse, 2, stride=2)
-        self.bottom = nn.Sequential(Block(coarse, coarse), Block(coarse, coarse))
-        self.double_coarse = nn.ConvTranspose2d(coarse, middle, 2, stride=2)
-        self.double_middle = nn.ConvTranspose2d(middle, fine, 2, stride=2)
-        self.up_middle = Block(2 * middle, middle)
-        self.up_fine = Block(2 * fine, fine)
-        self.end = nn.Conv2d(fine, outputs, 3, padding=1)
+        self.begin = convolve_three(inputs, fine, periodic)
+        self.down_fine = Block(fine, fine, periodic)
+        self.down_middle = Block(middle, middle, periodic)
+        self.halve_fine = convolution(fine, middle, 2, stride=2)
+        self.halve_middle = convolution(middle, coarse, 2, stride=2)
+        self.bottom = nn.Sequential(
+            Block(coarse, coarse, periodic), Block(coarse, coarse, periodic)
+        )
+        self.double_coarse = transposed(coarse, middle, 2, stride=2)
+        self.double_middle = transposed(middle, fine, 2, stride=2)
+        self.up_middle = Block(2 * middle, middle, periodic)
+        self.up_fine = Block(2 * fine, fine, periodic)
+        self.end = convolve_three(fine, outputs, periodic)
         for parameter in self.end.parameters():
             nn.init.zeros_(parameter)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the output in float32, shape [window, outputs, x node, y node].
 
-        The number of nodes along each axis is a multiple of 4.
+        In three dimensions there is an axis of z nodes too. The number of nodes along
+        each axis is a multiple of 4.
         """
         fine = self.down_fine(self.begin(field))
         middle = self.down_middle(self.halve_fine(fine))
@@ -81,14 +145,20 @@ class UNet(nn.Module):
 class ContextNetwork(nn.Module):
     """Encode the fields of the given frames to a few numbers about the scenario."""
 
-    def __init__(self, inputs: int, outputs: int, width: int) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        width: int,
+        periodic: Sequence[bool] = (False, False),
+    ) -> None:
         super().__init__()
         self.fields = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, padding=1),
+            convolve_three(inputs, width, periodic),
             nn.GELU(),
-            nn.Conv2d(width, width, 3, stride=2, padding=1),
+            convolve_three(width, width, periodic, stride=2),
             nn.GELU(),
-            nn.Conv2d(width, width, 3, padding=1),
+            convolve_three(width, width, periodic),
             nn.GELU(),
         )
         self.numbers = nn.Sequential(
@@ -98,6 +168,6 @@ class ContextNetwork(nn.Module):
     def forward(self, field: Tensor) -> Tensor:
         """Return the numbers, shape [window, outputs]."""
         encoded = self.fields(field)
-        box_mean = encoded.mean(dim=(2, 3))
+        box_mean = encoded.flatten(2).mean(dim=2)
         numbers: Tensor = self.numbers(box_mean)
         return numbers.to(field.dtype)

@@ -88,6 +88,7 @@ def test_operators_share_their_recipes() -> None:
 
 
 OTHER = {
+    "shift": True,
     **{
         "calls": 3,
         "pushforward": 2,

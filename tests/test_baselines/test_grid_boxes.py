@@ -1,0 +1,334 @@
+"""Grids and NeuralMPM in three dimensions and in boxes with periodic axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from simple_models import info, rolled
+from torch import Tensor, nn
+
+from lagbench.baselines.augmentation import (
+    Symmetry,
+    check_symmetry,
+    mirror_batch,
+    mirror_matrices,
+    shift_batch,
+)
+from lagbench.baselines.neuralmpm import NeuralMPM
+from lagbench.baselines.particle_grid import ParticleGrid
+from lagbench.data.box import Box
+from lagbench.data.grid import Grid, transfer
+from lagbench.data.registry import load
+from lagbench.errors import UsageError
+from lagbench.tensors import Batch, TensorBox
+
+Positions = NDArray[np.float64]
+
+BOXES = {
+    "square": Box.from_bounds([(0.0, 1.0)] * 2, [True] * 2),
+    "channel": Box.from_bounds([(0.0, 1.0), (0.0, 0.75)], [True, False]),
+    "oblong": Box.from_bounds([(0.25, 1.25), (0.0, 0.45)], [True] * 2),
+    "room": Box.from_bounds([(0.0, 1.0)] * 3),
+    "cube": Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3),
+    "duct": Box.from_bounds([(0.0, 1.0), (0.0, 0.75), (0.0, 1.0)], [True, False, True]),
+}
+
+SMALL: dict[str, object] = {
+    "cells": 8,
+    "width": 4,
+    "velocities": 2,
+    "bundle": 2,
+    "calls": 2,
+    "noise_std": 0.0,
+}
+
+
+def make_grid(name: str, cells: int = 8) -> ParticleGrid:
+    """Return a grid of one of the boxes."""
+    box = BOXES[name]
+    return ParticleGrid(box.bounds, cells, multiple=4, periodic=box.periodic)
+
+
+def draw_places(name: str, count: int, seed: int = 0) -> Positions:
+    """Return random points in one of the boxes, shape [particle, axis]."""
+    box = BOXES[name]
+    rng = np.random.default_rng(seed)
+    return rng.uniform(box.low, box.high, (count, box.dimension))
+
+
+def surrogate(name: str, *, awake: float = 0.0, **options: Any) -> Any:
+    """Return a small model; `awake` is the deviation of its last layer's weights."""
+    box = BOXES[name]
+    axes = []
+    for axis, is_wrapped in zip("xyz", box.periodic, strict=False):
+        if is_wrapped:
+            axes.append(axis)
+    statistics: dict[str, tuple[float, ...]] = {}
+    for kind, value in (
+        ("position_mean", 0.5),
+        ("position_std", 0.3),
+        ("velocity_mean", 0.0),
+        ("velocity_std", 0.004),
+        ("acceleration_mean", 0.0),
+        ("acceleration_std", 0.0002),
+    ):
+        statistics[kind] = (value,) * box.dimension
+    torch.manual_seed(0)
+    model = NeuralMPM.build(
+        SMALL | options,
+        info(bounds=box.bounds, periodic=tuple(axes), statistics=statistics),
+    )
+    if awake:
+        for parameter in model.network.end.parameters():
+            nn.init.normal_(parameter, std=awake)
+    return model
+
+
+def window_of(frames: Positions, walls: Tensor | None = None) -> Batch:
+    """Return one window from positions of shape [frame, particle, axis]."""
+    particles = frames.shape[1]
+    return Batch(
+        position=torch.from_numpy(frames.swapaxes(0, 1).astype(np.float32)),
+        sample=torch.zeros(particles, dtype=torch.int64),
+        material=torch.zeros(particles, dtype=torch.int64),
+        wall_velocity=walls,
+        scenario=torch.zeros(1, dtype=torch.int64),
+        frame=torch.zeros(1, dtype=torch.int64),
+    )
+
+
+def drift(name: str, frames: int, velocity: Sequence[float]) -> Positions:
+    """Return a cloud that fills the box and moves as one through its seams."""
+    box = BOXES[name]
+    time = np.arange(frames)[:, None, None]
+    return box.wrap(draw_places(name, 300) + time * np.array(velocity))
+
+
+@pytest.mark.parametrize("cells", [7, 8])
+@pytest.mark.parametrize("name", BOXES)
+def test_constant_fields_stay_constant(name: str, cells: int) -> None:
+    """Both ways: a constant at the nodes, and particles that fill the box evenly."""
+    box = BOXES[name]
+    grid = make_grid(name, cells)
+    assert all(count % 4 == 0 for count in grid.shape)
+    place = torch.from_numpy(draw_places(name, 200)).float()
+    layer = torch.zeros(200, dtype=torch.int64)
+    stencil = grid.stencil(place, layer)
+    ones = torch.ones(1, 1, *grid.shape)
+    torch.testing.assert_close(grid.gather(stencil, ones), torch.ones(200, 1))
+
+    # Two particles a cell along each axis: B-splines sum to a constant over them.
+    axes = []
+    for axis, width in zip(grid.axes, grid.cell.tolist(), strict=True):
+        offsets = torch.tensor([-0.25, 0.25]) * width
+        axes.append((axis[:, None] + offsets).flatten())
+    lattice = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    lattice = lattice.reshape(-1, box.dimension)
+    is_inside = torch.from_numpy(box.contains(lattice.numpy(), tolerance=1e-6))
+    lattice = lattice[is_inside]
+    evenly = grid.stencil(lattice, torch.zeros(len(lattice), dtype=torch.int64))
+    density = grid.spread(evenly, torch.ones(len(lattice), 1), 1)[0, 0]
+    for number, places in enumerate(grid.axes):
+        if not box.periodic[number]:  # beside walls there is less
+            reach = 1.501 * grid.spacing
+            is_inner = (places > box.low[number] + reach) & (
+                places < box.high[number] - reach
+            )
+            density = density.index_select(number, is_inner.nonzero()[:, 0])
+    assert density.numel()
+    expected = torch.full_like(density, 2.0**box.dimension)
+    torch.testing.assert_close(density, expected)
+
+
+@pytest.mark.parametrize("name", ["square", "cube"])
+def test_spread_is_the_scorers_transfer(name: str) -> None:
+    box = BOXES[name]
+    grid = make_grid(name)
+    place = draw_places(name, 400)
+    velocity = np.random.default_rng(1).normal(size=place.shape)
+    stencil = grid.stencil(
+        torch.from_numpy(place).float(), torch.zeros(400, dtype=torch.int64)
+    )
+    sums = grid.spread(stencil, torch.from_numpy(velocity).float(), 1)[0]
+    expected = transfer(place, velocity, Grid(8, box=box))
+    momentum = np.moveaxis(expected.momentum, -1, 0)
+    np.testing.assert_allclose(sums.numpy(), momentum, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["square", "cube", "duct"])
+def test_gather_is_the_adjoint_of_spread(name: str) -> None:
+    """<spread(v), g> = <v, gather(g)>, and so for gradients to positions."""
+    grid = make_grid(name)
+    generator = torch.Generator().manual_seed(0)
+    place = torch.from_numpy(draw_places(name, 100)).requires_grad_()
+    layer = torch.arange(100) % 2
+    value = torch.randn(100, 3, generator=generator).double()
+    field = torch.randn(2, 3, *grid.shape, generator=generator).double()
+    gradients = []
+    products = []
+    for direction in ("spread", "gather"):
+        stencil = grid.stencil(place, layer)
+        if direction == "spread":
+            product = (grid.spread(stencil, value, 2) * field).sum()
+        else:
+            product = (value * grid.gather(stencil, field)).sum()
+        products.append(float(product.detach()))
+        gradients.append(torch.autograd.grad(product, place)[0])
+    assert products[0] == pytest.approx(products[1], rel=1e-9)
+    torch.testing.assert_close(gradients[0], gradients[1])
+
+
+@pytest.mark.parametrize("name", ["square", "oblong", "cube"])
+def test_a_shift_by_a_cell_shifts_the_fields(name: str) -> None:
+    """Over the seam too."""
+    box = BOXES[name]
+    grid = make_grid(name)
+    place = draw_places(name, 300)
+    layer = torch.zeros(300, dtype=torch.int64)
+
+    def density(position: Positions) -> Tensor:
+        wrapped = torch.from_numpy(box.wrap(position)).float()
+        return grid.spread(grid.stencil(wrapped, layer), torch.ones(300, 1), 1)[0, 0]
+
+    steps = (1, -2, 3)[: box.dimension]
+    moved = density(place + np.array(steps) * grid.cell.numpy())
+    expected = density(place).roll(steps, tuple(range(box.dimension)))
+    torch.testing.assert_close(moved, expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["square", "oblong", "cube", "channel"])
+def test_a_shift_along_periodic_axes_shifts_the_prediction(name: str) -> None:
+    """By a node of the U-Net's coarsest level, with any weights."""
+    box = BOXES[name]
+    model = surrogate(name, awake=0.1, context=2, smoothing=0.3)
+    frames = drift(name, 3, (0.03, -0.01, 0.02)[: box.dimension])
+    shift = np.where(box.periodic, 4 * model.grid.cell.numpy(), 0.0)
+    path = rolled(model, window_of(frames), 4)
+    shifted = rolled(model, window_of(box.wrap(frames + shift)), 4)
+    expected = path + torch.from_numpy(shift).float()
+    difference = model.box.displacement(expected, shifted)
+    assert float(difference.abs().max()) < 1e-5
+    # Weights that do nothing would pass as well.
+    still = rolled(surrogate(name, smoothing=0.3), window_of(frames), 4)
+    assert float(model.box.displacement(still, path).abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize("name", ["square", "cube"])
+def test_the_seam_is_not_seen(name: str) -> None:
+    """A uniform flow through it costs nothing, and goes on for ever."""
+    velocity = (0.03, -0.02, 0.01)[: BOXES[name].dimension]
+    frames = drift(name, 12, velocity)
+    model = surrogate(name, pushforward=1, recovery=4)
+    count = model.history + model.options.bundle * model.options.calls
+    loss = model(window_of(frames[:count]))["velocity"]
+    assert float(loss.detach()) < 1e-4
+
+    path = rolled(model, window_of(frames[:3]), 9)
+    truth = torch.from_numpy(frames[3:].swapaxes(0, 1)).float()
+    assert float(model.box.displacement(truth, path).abs().max()) < 1e-5
+    assert float(path.min()) >= 0.0
+    assert float(path.max()) < 1.0
+
+
+def test_images_of_the_cube_are_a_group() -> None:
+    """48 signed permutations; four leave the direction of gravity as it is."""
+    images = mirror_matrices(Symmetry.SQUARE, 3)
+    numbers = {tuple(image.flatten().tolist()) for image in images}
+    assert len(images) == len(numbers) == 48
+    products = torch.einsum("aij,bjk->abik", images, images).flatten(0, 1)
+    assert {tuple(product.flatten().tolist()) for product in products} == numbers
+    torch.testing.assert_close(images[0], torch.eye(3))
+    mirrors = mirror_matrices(Symmetry.MIRROR, 3)
+    assert len(mirrors) == 4
+    assert bool((mirrors[:, 1] == torch.tensor([0.0, 1.0, 0.0])).all())
+
+
+@pytest.mark.parametrize(("name", "number"), [("cube", 19), ("room", 30)])
+def test_the_mirror_average_has_the_symmetry_of_the_cube(
+    name: str, number: int
+) -> None:
+    """The rollout of an image is the image of the rollout, with moving walls too."""
+    matrix = mirror_matrices(Symmetry.SQUARE, 3)[number]
+    frames = drift(name, 3, (0.0, 0.0, 0.0))
+    swirl = np.sin(2 * np.pi * np.roll(frames[0], 1, axis=1)) * 0.01
+    frames = BOXES[name].inside(frames + np.arange(3)[:, None, None] * swirl)
+    is_walled = name == "room"
+    walls = None
+    if is_walled:
+        walls = 0.01 * torch.arange(18.0).view(1, 1, 6, 3).expand(1, 3, 6, 3)
+    window = window_of(frames, walls)
+    image = mirror_batch(window, matrix[None], BOXES[name].bounds)
+    model = surrogate(
+        name,
+        awake=0.1,
+        symmetry="square",
+        average=True,
+        context=2,
+        wall_velocity=is_walled,
+    )
+    path = rolled(model, window, 2)
+    image_path = rolled(model, image, 2)
+    expected = (path - 0.5) @ matrix.T + 0.5
+    difference = model.box.displacement(expected, image_path)
+    assert float(difference.abs().max()) < 3e-6
+    turned = model.box.displacement(path, image_path)
+    assert float(turned.abs().max()) > 1e-3
+
+
+def test_windows_are_shifted_along_periodic_axes_only() -> None:
+    """Each by its own way, all frames alike, the first one of the scenario too."""
+    name = "channel"
+    box = TensorBox(BOXES[name])
+    frames = drift(name, 3, (0.03, 0.0))
+    one = window_of(frames)
+    both = replace(
+        one,
+        position=one.position.repeat(2, 1, 1),
+        sample=torch.arange(2).repeat_interleave(300),
+        scenario=torch.zeros(2, dtype=torch.int64),
+        origin=one.position[:, 0].repeat(2, 1),
+    )
+    moved = shift_batch(both, box, torch.Generator().manual_seed(0))
+    way = box.displacement(both.position, moved.position)
+    assert moved.origin is not None
+    torch.testing.assert_close(moved.origin, moved.position[:, 0])
+    assert float(way[..., 1].abs().max()) == 0.0
+    first = way[:300, :, 0]
+    second = way[300:, :, 0]
+    for ways in (first, second):
+        assert float((ways - ways[0, 0]).abs().max()) < 1e-6
+    assert abs(float(first[0, 0] - second[0, 0])) > 1e-3
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"conserve": True},
+        {"strain": True},
+        {"shape": [4]},
+        {"density": [4]},
+    ],
+)
+def test_options_for_flat_boxes_with_walls_are_refused(
+    options: dict[str, Any],
+) -> None:
+    for name in ("square", "room"):
+        with pytest.raises(UsageError) as caught:
+            surrogate(name, **options)
+        assert caught.value.where == f"model.{next(iter(options))}"
+
+
+def test_axes_with_other_ends_do_not_change_places() -> None:
+    size = load().size("decaying-vortices", "tiny")
+    check_symmetry("square", size)
+    half = size.model_copy(update={"periodic": ("x",)})
+    with pytest.raises(UsageError) as caught:
+        check_symmetry("square", half)
+    assert caught.value.where == "model.symmetry"
+    check_symmetry("mirror", half)
