@@ -9,7 +9,7 @@ from typing import Any
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
-from lagbench.references.table import CLASSICAL, NAIVE
+from lagbench.references.predictor import Kind
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
@@ -35,35 +35,47 @@ def summary_table(all_results: Sequence[SplitResults]) -> str:
         "best learned",
         "skill",
         "against_classical",
+        "best hybrid",
+        "skill",
+        "against_classical",
     )
     rows = []
     for results in all_results:
-        model = _first(results, results.models)
-        solver = _first(results, sorted(CLASSICAL))
-        skill = None
-        if model is not None:
-            skill = results.skill(model)
+        solver = results.best(Kind.CLASSICAL)
         rows.append(
             (
                 results.where,
                 results.ranking,
                 _name_and_score(results, results.best_naive),
                 _name_score_and_cost(results, solver),
-                _name_score_and_cost(results, model),
-                number(skill),
-                _format_against(results, model),
+                *_model_cells(results, results.best(Kind.LEARNED)),
+                *_model_cells(results, results.best(Kind.HYBRID)),
             )
         )
     return markdown(heads, rows)
 
 
+def _model_cells(results: SplitResults, model: str | None) -> tuple[str, str, str]:
+    """Return name with score and cost, skill, and ``against_classical`` of a model."""
+    if model is None:
+        return "-", "-", "-"
+    return (
+        _name_score_and_cost(results, model),
+        number(results.skill(model)),
+        _format_against(results, model),
+    )
+
+
 def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
-    """Return in one sentence each where learned models beat a solver of their cost."""
+    """Return in one sentence each where models beat a solver of their cost.
+
+    The model is the best learned or hybrid one of a data set.
+    """
     pays = []
     open_sets = []
     does_not_pay = []
     for results in all_results:
-        model = _first(results, results.models)
+        model = results.best(Kind.LEARNED, Kind.HYBRID)
         against = None if model is None else results.against_classical(model)
         if against is None:
             continue
@@ -77,15 +89,15 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     sentences = []
     if pays:
         sentences.append(
-            f"Learning pays on {_join(pays)}: the best learned model is more accurate"
-            " than every classical solver here that costs no more per frame."
+            f"Learning pays on {_join(pays)}: the best learned or hybrid model is more"
+            " accurate than every classical solver here that costs no more per frame."
         )
     if open_sets:
         sentences.append(f"On {_join(open_sets)} the interval contains 1: it is open.")
     if does_not_pay:
         sentences.append(
             f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"
-            " costs no more is more accurate than the best learned model."
+            " costs no more is more accurate than the best learned or hybrid model."
         )
     return " ".join(sentences)
 
@@ -96,9 +108,7 @@ def _join(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _format_against(results: SplitResults, model: str | None) -> str:
-    if model is None:
-        return "-"
+def _format_against(results: SplitResults, model: str) -> str:
     against = results.against_classical(model)
     if against is None:
         return "-"
@@ -117,14 +127,6 @@ def _name_score_and_cost(results: SplitResults, name: str | None) -> str:
     if seconds is None:
         return text
     return f"{text} ({number(1000.0 * seconds)} ms)"
-
-
-def _first(
-    results: SplitResults, names: Sequence[str] | Mapping[str, Method]
-) -> str | None:
-    """Return the best of some methods; None where none of them is ranked."""
-    ranked = results.order(tuple(names))
-    return ranked[0] if ranked else None
 
 
 def _name_and_score(results: SplitResults, name: str | None) -> str:
@@ -255,9 +257,9 @@ def _shown_metrics(results: SplitResults) -> list[Metric]:
 
 def _seeds_cell(method: Method) -> str:
     """Return the number of seeds, or the kind of a reference predictor."""
-    if method.name in NAIVE:
+    if method.kind is Kind.NAIVE:
         return "naive baseline"
-    if method.name in CLASSICAL:
+    if method.kind is Kind.CLASSICAL:
         return "classical solver"
     return str(len(method.trainings))
 

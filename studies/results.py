@@ -62,7 +62,7 @@ Scores: less is better. In brackets stands what a frame costs on one core; the t
 the learned models are brought to that machine by the time of our solver on both.
 `skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
 score of the best classical solver that costs no more per frame, with its 95 % interval:
-below 1 learning pays."""
+below 1 learning pays. A hybrid is a solver with a learned part."""
 
 HOW_TO_READ = """\
 ## How to read this page

@@ -187,6 +187,7 @@ _MODELS = (
         variant_of="lstm-mlp",
         recipe="change",
     ),
+    RosterModel("hybrid-projection", "hybrid projection solver"),
     RosterModel("var", "VAR(1)", "#7f7f7f"),
     RosterModel("var-stable", "stable VAR", "#b0569a"),
 )

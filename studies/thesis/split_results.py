@@ -27,6 +27,7 @@ from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, mean_over_seeds
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
+from lagbench.references.predictor import Kind
 from lagbench.references.shipped import shipped, shipped_path, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
@@ -86,6 +87,7 @@ class Method:
     # of a predicted frame; None where it was not measured
     cost: EntryCost | None = None
     parameters: int | None = None  # trained numbers; None where unknown
+    kind: Kind = Kind.LEARNED
 
     @cached_property
     def scores(self) -> Mapping[str, Score]:
@@ -268,6 +270,7 @@ class SplitResults:
                     record=record,
                     cost=entry.cost,
                     parameters=entry.parameters,
+                    kind=entry.kind,
                 )
 
     def _read_runs(self) -> None:
@@ -296,7 +299,8 @@ class SplitResults:
                 record={},
                 path=shipped_path(self.size),
             )
-            method = Method(name=reference.name, trainings=(training,))
+            kind = REFERENCES[reference.name].kind
+            method = Method(name=reference.name, trainings=(training,), kind=kind)
             self.methods.setdefault(reference.name, method)
 
     def _record(self, name: str, seed: int | None) -> Mapping[str, Any]:
@@ -313,6 +317,7 @@ class SplitResults:
         record: Mapping[str, Any],
         cost: EntryCost | None,
         parameters: int | None = None,
+        kind: Kind = Kind.LEARNED,
     ) -> None:
         """Add one training to a method, unless its scores are of other data."""
         stored = read_statistics(path)
@@ -330,6 +335,7 @@ class SplitResults:
             trainings=(*earlier.trainings, training),
             cost=earlier.cost or cost,
             parameters=earlier.parameters or record.get("parameters") or parameters,
+            kind=kind,
         )
 
     @property
@@ -351,12 +357,18 @@ class SplitResults:
 
     @property
     def models(self) -> dict[str, Method]:
-        """The learned models, in the order of their names."""
+        """The learned and hybrid models, in the order of their names."""
         return {
             name: method
             for name, method in sorted(self.methods.items())
             if name not in REFERENCES
         }
+
+    def best(self, *kinds: Kind) -> str | None:
+        """Return the best method of some kinds; None where none of them is ranked."""
+        names = [name for name, method in self.methods.items() if method.kind in kinds]
+        ranked = self.order(names)
+        return ranked[0] if ranked else None
 
     def order(self, names: Collection[str] | None = None) -> list[str]:
         """Return the ranked ones of some methods, of all by default, best first."""
