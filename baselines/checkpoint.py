@@ -416,9 +416,11 @@ def _check_other_size(
 def _versions_of_training(
     trained: DatasetInfo, target: DatasetInfo, registry: Registry
 ) -> tuple[str, str]:
-    """Return the version of the training's data, and its version today.
+    """Return two versions to compare when a model runs at another size than its own.
 
-    They are hashes where datasets.yaml has one of that size, else major versions.
+    The first is that of the data it was trained on. Where datasets.yaml records a hash
+    for the size of the training, both are hashes, and the second is the recorded one.
+    Else both are major versions, and the second is that of ``target``.
     """
     measured = registry.size(trained.split, trained.size).measured
     if measured is not None:

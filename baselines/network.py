@@ -222,7 +222,10 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 
 def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Return whether oneDNN can and should multiply: rows of float32 on a CPU."""
+    """Return whether oneDNN can and should multiply x by the weight.
+
+    It does for a matrix of float32 on a CPU, outside autocast and torch.compile.
+    """
     is_cpu_matrix = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
     is_float32 = x.dtype == weight.dtype == torch.float32
     if not is_cpu_matrix or not is_float32 or torch.is_autocast_enabled("cpu"):

@@ -158,15 +158,17 @@ class ParticleGrid(nn.Module):
         return Stencil(spline_weights(offset).flatten(1), node.flatten())
 
     def _locate(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first node around each particle, and the way from it [cell].
+        """Return the lowest node of each particle's stencil, and the distance from it.
 
-        Along a periodic axis the first node may have a number below 0.
+        The stencil has three nodes along each axis. The distance is in cells. Along a
+        periodic axis the lowest node may have a number below 0.
         """
         origin = torch.stack([axis[0] for axis in self.axes])
         s = (position - origin) / self.cell.to(position)
-        # On the far wall the third node has weight 0 and may not exist; NaN must not
-        # become an index.
+        # NaN must not become an index.
         corner = torch.floor(s.detach() - 0.5).nan_to_num(0.0)
+        # On the far wall the third node has weight 0 and may not exist: the stencil
+        # stays inside.
         first = [-math.inf if is_periodic else 0.0 for is_periodic in self.periodic]
         last = [
             math.inf if is_periodic else nodes - 3.0

@@ -337,7 +337,7 @@ class Projection(nn.Module):
 
 
 def _count_shared(first: Sequence[int], second: Sequence[int]) -> int:
-    """Return how many numbers at the start of two sequences are the same."""
+    """Return the length of the common start of two lists of grid sizes [cells]."""
     count = 0
     for one_cells, other_cells in zip(first, second, strict=False):
         if one_cells != other_cells:

@@ -202,12 +202,12 @@ class RunFolder:
         return False
 
     def clear(self) -> None:
-        """Remove the files of an earlier training, and nothing else."""
+        """Remove the files of an earlier training; files of others stay."""
         logs = self.tensorboard.glob("events.out.tfevents.*")
         parameters = self.tensorboard / "hparams.yaml"
         for file in (self.checkpoint, self.weights, self.log, *logs, parameters):
             file.unlink(missing_ok=True)
-        with suppress(OSError):  # files of others stay, and their folder with them
+        with suppress(OSError):  # a folder that holds other files is not removed
             self.tensorboard.rmdir()
 
     def write_log(self, log: Mapping[str, Any]) -> None:

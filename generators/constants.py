@@ -259,10 +259,10 @@ def split_module(size: Size) -> SplitGenerator:
 
 
 def solver_constants(size: Size) -> SolverParameters:
-    """Return the constants of the solver of a size.
+    """Return the solver's constants of a size, which its generator derives.
 
     Raises:
-        UnreadableFileError: a parameter of the size is impossible.
+        UnreadableFileError: a parameter of the size in datasets.yaml is impossible.
     """
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):

@@ -168,7 +168,7 @@ class NodalStress:
 
     @ti.func
     def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
-        """Set a node's sums to zero."""
+        """Set the sums of a node of scenario s to zero, before P2G adds to them."""
         self.sums[s, self.at(i, j)] = ti.Vector([0, 0, 0, 0], ti.i64)
 
     @ti.func

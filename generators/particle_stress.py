@@ -252,7 +252,7 @@ class ParticleStress:
 
     @ti.func
     def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
-        """Empty the sums of a node."""
+        """Set the sums of a node of scenario s to zero, before P2G adds to them."""
         self.sums[s, self.at(i, j)] = ti.Vector.zero(ti.i64, 4)
 
     @ti.func

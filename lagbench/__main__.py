@@ -22,7 +22,7 @@ from .errors import (
     UsageError,
     WorkFailedError,
     escape_unprintable,
-    find_faulty_package,
+    find_place_in_extension,
 )
 
 INTERRUPTED = 130
@@ -210,7 +210,7 @@ def _interruption_message(command: str | None) -> str:
 
 def _unexpected_error_message(error: Exception) -> str:
     debug_command = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
-    place = find_faulty_package(error)
+    place = find_place_in_extension(error)
     if place is None:
         advice = "this is a fault of lagbench; please report it with the output of"
         place = f"the repository's address is {describe(REPOSITORY)}"

@@ -432,6 +432,7 @@ def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
 
 
 def _metric_column(metric: Metric) -> Column:
+    """Return the column of a metric; the unit 1 is not shown."""
     unit = ""
     if metric.unit != "1":
         unit = metric.unit.replace("^2", "²")

@@ -186,6 +186,11 @@ def _fill_from_entry(meta: Meta, entry: Entry) -> Meta:
 
 
 def _date_of(meta: Meta) -> datetime.date:
+    """Return the date of a description, or today.
+
+    Raises:
+        UsageError: the date lies in the future.
+    """
     date = meta.date or datetime.datetime.now(datetime.UTC).date()
     latest = latest_date()
     if date > latest:

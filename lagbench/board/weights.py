@@ -282,7 +282,10 @@ def _sound_weights(
 
 
 def _owners_of_weights(entries: Mapping[Path, Entry]) -> dict[str, str]:
-    """Return the entries that have weights, by the SHA-256 of these."""
+    """Return which entry holds each file of weights.
+
+    The path of the entry is found by the SHA-256 of the weights.
+    """
     owners = {}
     for path, entry in entries.items():
         for prediction in entry.predictions:

@@ -183,16 +183,17 @@ def check_particle_counts(
     subsets: Mapping[str, Sequence[int]],
     particles: Value | None,
 ) -> None:
-    """Refuse impossible numbers of particles, and scenarios that no subset has.
+    """Refuse impossible numbers of particles, and a table that is no partition of ids.
 
     Args:
         size: name of the size.
-        counts: ids of the scenarios by their number of particles.
+        counts: ids of the scenarios that have each number of particles, by number.
         subsets: scenario ids of each subset.
         particles: the parameter of that name, which is the largest of the numbers.
 
     Raises:
-        ValueError: a number is impossible, or a scenario is unknown or stands twice.
+        ValueError: a number is impossible, a scenario is unknown, missing or there
+            twice, or the largest number is not the parameter ``particles``.
     """
     if not counts:
         return

@@ -138,7 +138,16 @@ class ScenarioFile:
         return tuple(sorted(self._variables))
 
     def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
-        """Return a variable, or some of its entries along the first dimension."""
+        """Return the values of a variable, of all frames or of some.
+
+        Args:
+            name: name of the variable in the file.
+            frames: entries along the first dimension; a variable without dimensions is
+                read whole.
+
+        Raises:
+            DataError: the file is damaged.
+        """
         with _damage_errors(self.path, name):
             variable = self._variables[name]
             selection = frames if variable.ndim else ()

@@ -191,16 +191,16 @@ def _parse_material(
     array: Any,  # noqa: ANN401 (arrays, also netCDF's)
     particle_count: int,
 ) -> NDArray[np.int8]:
-    """Return the material of each particle, shape [particle]; liquid without any."""
+    """Return the material of each particle, shape [particle]; all liquid if None."""
     if array is None:
         return np.zeros(particle_count, np.int8)
     where = f"{name}, {MATERIAL}"
     numbers = [f"{number} {material}" for number, material in enumerate(MATERIALS)]
-    kind = f"materials: {', '.join(numbers)}"
-    _check_numbers(array, kind, (particle_count,), where=where, kinds=INTEGER_KINDS)
+    meaning = f"materials: {', '.join(numbers)}"
+    _check_numbers(array, meaning, (particle_count,), where=where, kinds=INTEGER_KINDS)
     material = np.asarray(array[...])
     if not np.isin(material, range(len(MATERIALS))).all():
-        raise DataError(f"these are no {kind}", where=where)
+        raise DataError(f"these are no {meaning}", where=where)
     return material.astype(np.int8)
 
 

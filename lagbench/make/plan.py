@@ -77,6 +77,7 @@ def select(
         choices = []
         for name in names:
             choices.append(f"{name} {format_ids(size.subsets[name])}")
+        # Without any id the message reads "no scenario at all in test".
         missing = format_ids(unknown) or "at all"
         raise UsageError(
             f"no scenario {missing} in {', '.join(names)}",

@@ -268,6 +268,7 @@ def _frame_as_json(score: Score, frame: int, row: str) -> dict[str, Any]:
 
 
 def _metric_as_json(metric: Metric) -> dict[str, Any]:
+    """Return what a metric is, without any value: unit, direction, source."""
     return {
         "family": metric.family,
         "unit": metric.unit,

@@ -196,6 +196,7 @@ class ComparisonResult:
 
 
 def _metric_as_json(comparison: MetricComparison) -> dict[str, Any]:
+    """Return one metric of two methods as plain values; undefined ones are None."""
     test = comparison.test
     return {
         "unit": comparison.metric.unit,
@@ -235,17 +236,20 @@ def compare(
     """Compare two methods on the same split, size and data set.
 
     Args:
-        first: a scores.json, a folder that holds one, a folder whose folders hold those
-            of the seeds of a method; a scores.nc, or a leaderboard's score file, of
-            several seeds without their numbers, as in
-            ``leaderboard/scores/cavity/full/neuralmpm.nc``; an entry of the
-            leaderboard, as in ``cavity/full/neuralmpm``; or a predictions.nc, which
-            is then scored.
-        second: another; the name of a reference in the first's scores (in a scores.nc
-            the best one, in the ranking metric); or the name of an entry that the
-            leaderboard has for the first's data set. A reference goes before an entry
-            of its name.
-        metrics: metrics to compare; by default all that judge.
+        first: one of these:
+
+            - a scores.json, or a folder that holds one;
+            - a folder whose folders hold the scores.json of each seed of a method;
+            - a scores.nc, or a score file of a leaderboard. The files of several seeds
+              go by their common name without ``_<seed>``, as in
+              ``leaderboard/scores/cavity/full/neuralmpm.nc``;
+            - an entry of the leaderboard, as in ``cavity/full/neuralmpm``;
+            - a predictions.nc, which is scored first.
+        second: one of the same. Or a bare name: of a reference in the scores of the
+            first (a scores.nc holds only the best one), or of an entry for the same
+            data set. If both have that name, the reference is meant.
+        metrics: metrics that are compared beside the ranking metric, which always is;
+            all that judge by default.
         board: folder of the leaderboard; ``leaderboard`` in the working folder when
             None, else that of the clone.
         root: folder of all data sets, where predictions are to be scored.

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from lagbench.errors import WorkFailedError, find_faulty_package
+from lagbench.errors import WorkFailedError, find_place_in_extension
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import Severity, ValidationIssue, quote
@@ -50,7 +50,7 @@ def package_metric_errors() -> Iterator[None]:
             raise
         notes = ", ".join(getattr(error, "__notes__", ()))
         places = [
-            find_faulty_package(error),
+            find_place_in_extension(error),
             getattr(error, "where", None),
             notes or None,
         ]

@@ -200,7 +200,11 @@ def _attribute_std(
 def _predictability_limit(
     manifest: Manifest | None, scenarios: Sequence[int]
 ) -> tuple[float, ...]:
-    """Return the mean limit over the test scenarios, empty unless all have one."""
+    """Return the predictability limit (``twin_floor``) per frame.
+
+    It is the mean over scenarios. Empty unless every scenario has one and all have the
+    same number of frames.
+    """
     if manifest is None:
         return ()
     limits = []

@@ -132,7 +132,7 @@ def validate(
     splits = load_rooted_registry(folder, registry)
     try:
         check_file(file, fix=WRITE)
-        with _open_reader(file, isolated=isolated) as reader:
+        with _open_caller(file, isolated=isolated) as reader:
             size, answer = _examine(
                 reader, file, folder, splits, require_truth=require_truth
             )
@@ -154,8 +154,8 @@ Reader = Callable[[Callable[[Request], Answer], Request], Answer]
 
 
 @contextmanager
-def _open_reader(path: Path, *, isolated: bool) -> Iterator[Reader]:
-    """Yield a reader; if isolated, one that calls in a child process with limits.
+def _open_caller(path: Path, *, isolated: bool) -> Iterator[Reader]:
+    """Yield what calls a reading function: here or, if isolated, in a limited child.
 
     Raises:
         UnreadableFileError: the child had to be stopped.

@@ -30,7 +30,7 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     WorkFailedError,
-    find_faulty_package,
+    find_place_in_extension,
 )
 
 from .machine import available_cores
@@ -271,7 +271,7 @@ class Pool:
 
 def crash_error(error: Exception) -> WorkFailedError:
     """Return an unexpected exception of an item as an error of ours."""
-    place = find_faulty_package(error)
+    place = find_place_in_extension(error)
     if place is not None:
         messages = [repr(error), *getattr(error, "__notes__", ())]
         return WorkFailedError(

@@ -184,7 +184,7 @@ def _score(plan: Plan, folder: Path) -> None:
 def make_training(
     plan: Plan, split: str, *, model: RosterModel, seed: int, folder: Path
 ) -> None:
-    """Train a model unless its training is complete."""
+    """Train a model into a folder, unless its training there is complete."""
     if _is_complete(folder):
         return
     from lagbench.baselines.train import train  # loads torch
