@@ -145,7 +145,7 @@ def main() -> int:
         for name in MODELS:
             slope, _ = np.polyfit(np.log(counts), np.log(times[name]), 1)
             exponents.append(f"{slope:.2f}")
-        lines.append(["", "exponent", *exponents])
+        lines.append(["", "exponent of the time in particles", *exponents])
     caption = (
         "Processor time of a frame [ms] on one core; untrained models, recipes of "
         f"{SPLIT} {SIZE}."

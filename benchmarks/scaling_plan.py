@@ -206,7 +206,8 @@ def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs per particle."""
     lines = [
         "| q | particles | draw [ns] | substep [ns] | write a frame [ns] "
-        "| hash it again [ns] | statistics [ns] | bytes of a frame |",
+        "| hash it again [ns] | statistics [ns] "
+        "| bytes in the file, per particle and frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row, parts, _ in measured:
@@ -226,7 +227,8 @@ def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
 def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs of whole generations, beside the sum of the parts."""
     lines = [
-        "| q | frames | core seconds | sum of the parts | one frame [MB] "
+        "| q | frames | whole generation [core s] "
+        "| expected from the parts above [core s] | one frame [MB] "
         "| parent, peak [MB] | worker, peak [MB] |",
         "|--:|--:|--:|--:|--:|--:|--:|",
     ]
@@ -255,13 +257,14 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     file = frames * n * p.bytes
     simulating = hours * (p.draw + (frames - 1) * row.substeps * p.substep)
     twins = TESTS * hours * (p.draw + HORIZON * row.substeps * p.substep)
+    perturbed_runs = f"perturbed runs of the {100 * TESTS:.0f} % test scenarios"
     rows = {
         "bytes before compression": f"{SCENARIOS * frames * n * 16 / 1e12:.2f} TB",
         "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} "
         f"GB each)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{hours * frames * p.write:,.0f} core hours",
-        f"twins of {TESTS:.0%} test scenarios": f"{twins:,.0f} core hours",
+        perturbed_runs: f"{twins:,.0f} core hours",
         "statistics of 80 % train "
         "scenarios": f"{0.8 * hours * frames * p.statistics:,.0f} core hours",
         "one `lagbench verify`": f"{hours * frames * p.check:,.0f} core hours",

@@ -202,7 +202,7 @@ def markdown(measurements: Sequence[Measurement], device: str) -> str:
         f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
         "",
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
-        "| thesis t/substep | thesis t/frame | thesis / ours |",
+        "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for m in measurements:
@@ -215,6 +215,9 @@ def markdown(measurements: Sequence[Measurement], device: str) -> str:
             f"| {r.frame_ms / m.frame_ms:.3g} |"
         )
     lines += [
+        "",
+        "Exponents of least-squares lines through the logarithms: a time grows as the "
+        "given number to this power.",
         "",
         "| exponent of | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
