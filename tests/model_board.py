@@ -23,8 +23,9 @@ from lagbench.board.submit import submit
 from lagbench.data.registry import load
 from lagbench.submission import open_predictions, write
 
-NAME = "curl-noise/tiny/gns"
-PATH = "submissions/curl-noise/tiny/gns.yaml"
+SPLIT = "curl-noise"
+NAME = f"{SPLIT}/tiny/gns"
+PATH = f"submissions/{NAME}.yaml"
 
 
 @dataclass(frozen=True)
@@ -34,15 +35,16 @@ class ModelBoard:
     folder: Path
     root: Path
     predictions: Path
+    split: str = SPLIT
 
     @property
     def weights(self) -> Path:
         """The weights on the board."""
-        return self.folder / "weights/curl-noise/tiny/gns_0.pt"
+        return self.folder / f"weights/{self.split}/tiny/gns_0.pt"
 
     def shifted(self, distance: float) -> Path:
         """Write the predictions with every particle shifted a little."""
-        size = load().size("curl-noise", "tiny")
+        size = load().size(self.split, "tiny")
         positions = {}
         with open_predictions(self.predictions) as opened:
             for scenario in size.subsets["test"]:
@@ -53,7 +55,7 @@ class ModelBoard:
             self.folder.parent / f"shifted-{distance}.nc",
             positions,
             method="gns",
-            split="curl-noise",
+            split=self.split,
             size="tiny",
             seed=0,
             parameters=7,
@@ -77,22 +79,22 @@ class ModelBoard:
         return check_board(self.folder, root=self.root, isolated=False, **options)
 
 
-def make_bench(folder: Path, root: Path) -> ModelBoard:
+def make_bench(folder: Path, root: Path, split: str = SPLIT) -> ModelBoard:
     """Return a board with a network that moves particles at random.
 
     A board that another process has made is taken as it is.
     """
-    bench = ModelBoard(folder / "board", root, folder / "predictions.nc")
-    if (bench.folder / PATH).exists():
+    bench = ModelBoard(folder / "board", root, folder / "predictions.nc", split)
+    if bench.weights.exists():
         return bench
     folder.mkdir(parents=True, exist_ok=True)
-    info = read_dataset_info("curl-noise", "tiny", root=root)
+    info = read_dataset_info(split, "tiny", root=root)
     torch.manual_seed(3)
     model = GraphNetwork.with_operator(GNS).build(SMALL, info)
     last_layer = model.network.decoder[-1]
     assert isinstance(last_layer, torch.nn.Linear)
     torch.nn.init.normal_(last_layer.weight, std=0.1)
-    recipe = {"name": "curl-noise/tiny", "training": {"seed": 0}}
+    recipe = {"name": f"{split}/tiny", "training": {"seed": 0}}
     checkpoint = Checkpoint(
         baseline="gns",
         options=SMALL,

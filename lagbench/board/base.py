@@ -21,16 +21,21 @@ from .folder import (
     REFERENCES,
     SCORES,
     SEASONS,
+    SHIFT,
     SUBMISSIONS,
     VERIFIED,
     WEIGHTS,
     Folder,
 )
 from .issues import make_issue
+from .shift import MOST_SHIFT_BYTES
 from .verified import MOST_LIST_BYTES
 
 STATUS_KEYS = ("status", "superseded_by")
 """Keys of an entry that decide whether and how it stands on the board."""
+
+LONGEST_LISTS = {VERIFIED: MOST_LIST_BYTES, SHIFT: MOST_SHIFT_BYTES}
+"""Longest lists of entries by name [bytes]; lines of others may not change."""
 
 MOST_KEYS = 8  # keys that an issue names
 
@@ -64,8 +69,8 @@ def check_base(
     paths_at_start = _paths_at(folder, start)
     for path, letter in sorted(_changes_since(folder, start).items()):
         verb = VERBS.get(letter, "changed")
-        if path == Path(VERIFIED):
-            if not _lost_own_lines_only(folder, start, own_methods):
+        if str(path) in LONGEST_LISTS:
+            if not _lost_own_lines_only(folder, path, start, own_methods):
                 yield _maintained_issue(path, verb)
         elif path.parts[0] == SEASONS:
             yield _maintained_issue(path, verb)
@@ -125,16 +130,16 @@ def _changes_since(folder: Folder, revision: str) -> dict[Path, str]:
 
 
 def _lost_own_lines_only(
-    folder: Folder, start: str, own_methods: Collection[str]
+    folder: Folder, path: Path, start: str, own_methods: Collection[str]
 ) -> bool:
-    """Tell whether verified.yaml only lost lines of the submitter's own entries."""
+    """Tell whether a list of entries only lost lines of the submitter's own ones."""
     try:
-        before = _parse(_git(folder, "show", f"{start}:./{VERIFIED}"))
+        before = _parse(_git(folder, "show", f"{start}:./{path}"))
     except UsageError:  # it was not there
         return False
     now = None
-    if folder.link_in(Path(VERIFIED)) is None:
-        now = _read_small(folder.path / VERIFIED, longest=MOST_LIST_BYTES)
+    if folder.link_in(path) is None:
+        now = _read_small(folder.path / path, longest=LONGEST_LISTS[path.name])
     if not isinstance(before, dict) or not isinstance(now, dict):
         return False
 

@@ -26,7 +26,7 @@ from lagbench.errors import (
     UsageError,
 )
 from lagbench.figures.solid import View
-from lagbench.metrics.aggregate import Score
+from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
     FEWEST_SCENARIOS,
@@ -36,7 +36,7 @@ from lagbench.metrics.significance import (
     standings,
 )
 from lagbench.metrics.table import METRICS
-from lagbench.references.shipped import ReferenceScores, solver_seconds
+from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
@@ -66,6 +66,7 @@ from .model import (
     Curve,
     Floats,
     Histogram,
+    OnShift,
     Pictures,
     ReferenceRow,
     Tab,
@@ -75,6 +76,13 @@ from .page import LINKS, links_in, render, same_page
 from .ranking import CombinedScore, combine, read_references
 from .sampling import coarsen, spaced
 from .selection import is_current
+from .shift import (
+    SUBSET,
+    ShiftScores,
+    read_shift,
+    scores_of_seeds,
+    shift_of,
+)
 from .variants import find_variants
 from .verified import read_verified, verification_of
 
@@ -242,6 +250,7 @@ def collect(
 
     verified = read_verified(board)
     failed_gates = read_failed_gates(board)
+    shift = read_shift(board)
     tabs = []
     empty = []
     for split, description in described.splits.items():
@@ -260,6 +269,7 @@ def collect(
                     references=read_references(board, size),
                     verified=verified,
                     failed_gates=failed_gates,
+                    shift=shift,
                 )
                 tabs.append(tab)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
@@ -420,8 +430,10 @@ def _make_tab(
     references: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
     failed_gates: Mapping[str, tuple[str, ...]],
+    shift: Mapping[str, ShiftScores],
 ) -> Tab:
     ranking = methods[0].ranking
+    shift_references = _references_on_shift(size, ranking)
     variants = _find_variants(methods)
     ranked = {}
     for method in methods:
@@ -445,7 +457,8 @@ def _make_tab(
             references=references,
         )
         failed = gates_failed_by(method.entry, failed_gates)
-        rows.append(replace(row, failed_gates=failed))
+        on_shift = _method_on_shift(method, size, shift, shift_references)
+        rows.append(replace(row, failed_gates=failed, on_shift=on_shift))
 
     columns = []
     for name in dict.fromkeys((ranking, *COLUMNS)):
@@ -458,7 +471,12 @@ def _make_tab(
     scenarios = tuple(sorted(size.subsets["test"]))
     reference_rows = []
     for reference in references:
-        reference_rows.append(_make_reference(reference, size, ranking, scope))
+        reference_row = _make_reference(reference, size, ranking, scope)
+        shift_score = shift_references.get(reference.name)
+        if shift_score is not None:
+            on_shift = _on_shift([shift_score], shift_references)
+            reference_row = replace(reference_row, on_shift=on_shift)
+        reference_rows.append(reference_row)
     return Tab(
         size=size,
         title=title,
@@ -577,6 +595,54 @@ def _against_classical(
     return compute_against_classical(
         method.seeds, timed_solvers, seconds=costs, seconds_per_frame=seconds
     )
+
+
+def _references_on_shift(size: Size, ranking: str) -> Mapping[str, Score]:
+    """Return the ranking metric of the references on ``shift``, where it was scored."""
+    if SUBSET not in size.subsets:
+        return {}
+    scores = {}
+    for name, reference in (shipped(size.scored_on(SUBSET)) or {}).items():
+        if name in REFERENCES and ranking in reference.scores:
+            scores[name] = reference.scores[ranking]
+    return scores
+
+
+def _method_on_shift(
+    method: ScoredMethod,
+    size: Size,
+    shift: Mapping[str, ShiftScores],
+    references: Mapping[str, Score],
+) -> OnShift | None:
+    """Return the seeds of a method that were scored on ``shift``; None without any."""
+    scores = shift_of(method.entry, size, shift)
+    if scores is None:
+        return None
+    return _on_shift(scores_of_seeds(scores), references)
+
+
+def _on_shift(seeds: Sequence[Score], references: Mapping[str, Score]) -> OnShift:
+    """Return the values of some seeds, and their skill over the naive baselines."""
+    baselines = {}
+    for name, reference in references.items():
+        if name in NAIVE:
+            baselines[name] = reference
+    means = np.array([seed.mean for seed in seeds])
+    std = math.nan
+    if len(means) > 1:
+        std = float(np.std(means, ddof=1))
+    values = np.stack([seed.values for seed in seeds])  # shape [seed, scenario]
+    low, high = bootstrap_interval(values)
+    value = Value(
+        mean=mean(means),
+        std=std,
+        low=low,
+        high=high,
+        per_scenario=tuple(np.mean(values, axis=0).tolist()),
+        at={},
+        undefined=0,
+    )
+    return OnShift(score=value, skill=_value_of_ratio(compute_skill(seeds, baselines)))
 
 
 def _value_of_ratio(ratio: Skill | AgainstClassical | None) -> Value | None:

@@ -272,6 +272,22 @@ AGAINST_CLASSICAL = Column(
     " solver costs more.",
 )
 
+SKILL_ON_SHIFT = Column(
+    key="skill_on_shift",
+    label="skill on shift",
+    direction=Direction.HIGHER,
+    perfect=1.0,
+    meaning="Skill on the subset shift, which lies outside train on purpose; it does "
+    "not rank.",
+)
+
+SCORE_ON_SHIFT = Column(
+    key="score_on_shift",
+    label="score on shift",
+    direction=Direction.LOWER,
+    meaning="The ranking metric on the subset shift, which lies outside train.",
+)
+
 ENTRY_COLUMNS = (
     Column(
         key="kind",
@@ -423,6 +439,9 @@ def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
         columns[SKILL.key] = SKILL
     if any(row.against_classical for row in tab.rows):
         columns[AGAINST_CLASSICAL.key] = AGAINST_CLASSICAL
+    if any(row.on_shift for row in tab.rows):
+        columns[SKILL_ON_SHIFT.key] = SKILL_ON_SHIFT
+        columns[SCORE_ON_SHIFT.key] = SCORE_ON_SHIFT
     for name in dict.fromkeys((*tab.columns, *metrics)):
         if any(name in row.values for row in tab.lines):
             columns[name] = _metric_column(metrics[name])
@@ -451,11 +470,14 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     last.
     """
     metric_count = MAIN_METRICS
+    # main fits into 1280 pixels
     if AGAINST_CLASSICAL.key in columns:
-        # main fits into 1280 pixels
+        metric_count -= 1
+    if SKILL_ON_SHIFT.key in columns:
         metric_count -= 1
     main = (
         "against_classical",
+        "skill_on_shift",
         *tab.columns[:metric_count],
         "kind",
         "seconds_per_frame",
@@ -512,6 +534,11 @@ def loss_of(row: TableRow, column: Column) -> float:
 
 def metric_value(row: TableRow, key: str) -> Value | None:
     """Return the value of a metric, or the skill; None where a row has none."""
+    if row.on_shift is not None:
+        if key == SKILL_ON_SHIFT.key:
+            return row.on_shift.skill
+        if key == SCORE_ON_SHIFT.key:
+            return row.on_shift.score
     if isinstance(row, BoardRow):
         if key == SKILL.key:
             return row.skill

@@ -35,6 +35,7 @@ PAGE = "index.html"
 SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
 GATES = "gates.json"  # what weights do in single steps (python -m studies.gates)
+SHIFT = "shift.yaml"  # scores on the subset shift (lagbench leaderboard shift)
 README = "README.md"
 LOCK = ".lock"  # held while the folder is written
 STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
@@ -95,7 +96,7 @@ def is_place_of_file(path: Path) -> bool:
     >>> is_place_of_file(Path("scores/../../gns.nc"))
     False
     """
-    if path == Path(VERIFIED):
+    if path in (Path(VERIFIED), Path(SHIFT)):
         return True
     if len(path.parts) != DEPTH or not all(map(PART.fullmatch, path.parts)):
         return False
@@ -220,7 +221,7 @@ class Folder:
         self, expected_paths: Collection[Path]
     ) -> Iterator[tuple[Path, str]]:
         """Yield the files that should not lie in the folder, and why."""
-        names = (PAGE, SCHEMA, VERIFIED, GATES, README)
+        names = (PAGE, SCHEMA, VERIFIED, GATES, SHIFT, README)
         known_paths = {Path(name) for name in names} | set(expected_paths)
         known_paths.update(self.season_files())
         for path in self._files(""):

@@ -30,6 +30,7 @@ from .ranking import TOLERANCE, combine, dataset_of, summarise
 from .season import read_season
 from .season_scores import read_scores
 from .selection import is_current
+from .shift import check_shift
 from .verified import read_verified, verification_of
 from .weights import check_weights
 
@@ -70,6 +71,7 @@ class FolderChecks:
         self._check_names()
         self._check_stray_score_files()
         self._check_verified()
+        self.issues += check_shift(self.folder, self.entries, self.registry)
         self._check_seasons()
 
     def _add(

@@ -157,6 +157,13 @@ CHECKS: Mapping[str, BoardCheck] = {
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
+    "shift": BoardCheck(
+        "a line of shift.yaml about an entry that is not there, or about other models, "
+        "data or scenarios",
+        "shift.yaml has scores that belong to no entry",
+        "scores of the entry's own models on the present data",
+        "remove the line, and score anew: lagbench leaderboard shift ENTRY",
+    ),
     "season": BoardCheck(
         "a file of a blind season that cannot be read, or whose seeds, scenarios or "
         "models are not those that were frozen",

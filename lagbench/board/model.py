@@ -73,6 +73,15 @@ class Pictures:
     film: NDArray[np.float32]
 
 
+@dataclass(frozen=True, kw_only=True)
+class OnShift:
+    """A row on the subset ``shift``, which lies outside train on purpose."""
+
+    score: Value  # ranking metric
+    # 1 - score / score of the best naive baseline there; None without one
+    skill: Value | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceRow:
     """A reference predictor: it learns nothing and is never ranked."""
@@ -85,6 +94,7 @@ class ReferenceRow:
     kind: Kind  # naive or classical
     # cost of a frame, and that of the solver, on the machine that measured
     cost: EntryCost | None = None
+    on_shift: OnShift | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,6 +125,7 @@ class BoardRow:
     rank_range: tuple[int, int] | None = None
     variant_of: str | None = None  # id of the method that the row is a variant of
     failed_gates: tuple[str, ...] = ()  # of its weights; such a row is under-trained
+    on_shift: OnShift | None = None  # of the seeds whose models lie on the board
     # ranking metric, NaN where undefined, shape [seed, scenario]
     losses: Floats | None = None
 

@@ -31,6 +31,7 @@ from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
 from .entry_file import entry_bytes, read_entry_if_valid
 from .folder import (
     REFERENCES,
+    SHIFT,
     STAGING,
     SUBMISSIONS,
     VERIFIED,
@@ -40,6 +41,7 @@ from .folder import (
     score_paths,
 )
 from .ranking import combine, scored_file, summarise, write_references
+from .shift import shift_without_stale_line
 from .verified import list_without_stale_line
 from .weights import copy_weights, name_weights
 
@@ -335,13 +337,17 @@ def _stage_weights(draft: Draft, entry: Entry, staging: Path) -> dict[Path, Path
 
 
 def _stage_texts(entry: Entry, folder: Folder, staging: Path) -> dict[Path, Path]:
-    """Write verified.yaml, where it loses a line, and the entry, which comes last."""
+    """Write the lists that lose a line, and the entry, which comes last."""
     # a method may be called verified, so copies have names of their own
     copies = {}
     verified = list_without_stale_line(folder, entry)
     if verified is not None:
         copies[Path(VERIFIED)] = staging / "0.yaml"
         copies[Path(VERIFIED)].write_bytes(verified)
+    shift = shift_without_stale_line(folder, entry)
+    if shift is not None:
+        copies[Path(SHIFT)] = staging / "2.yaml"
+        copies[Path(SHIFT)].write_bytes(shift)
     copies[entry.yaml_path] = staging / "1.yaml"
     copies[entry.yaml_path].write_bytes(entry_bytes(entry))
     return copies

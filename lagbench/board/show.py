@@ -24,7 +24,7 @@ from .columns import (
     source_of_cost,
 )
 from .entry import EntryCost, Level
-from .model import Board, BoardRow, ReferenceRow, Tab, Value
+from .model import Board, BoardRow, OnShift, ReferenceRow, Tab, Value
 
 NOTHING = "-"
 REMARK_WIDTH = 16  # the whole table fits a terminal of 80 characters
@@ -108,7 +108,7 @@ def tables(
         )
 
 
-HEADINGS = {"against_classical": "÷class."}
+HEADINGS = {"against_classical": "÷class.", "skill_on_shift": "shift"}
 """Headings of columns that have other names than their keys."""
 
 
@@ -116,6 +116,8 @@ def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
     names = [tab.ranking]
     if any(row.against_classical for row in tab.rows):
         names.append("against_classical")
+    if any(row.on_shift for row in tab.rows):
+        names.append("skill_on_shift")
     names += metrics
     if any(row.skill for row in tab.rows):
         names.insert(0, "skill")
@@ -147,7 +149,12 @@ def _plain_tab(tab: Tab) -> dict[str, Any]:
         for name, value in values.items():
             metrics[name] = _plain_value(value)
         references.append(
-            {"id": reference.name, "kind": str(reference.kind), "metrics": metrics}
+            {
+                "id": reference.name,
+                "kind": str(reference.kind),
+                "metrics": metrics,
+                **_plain_shift(reference.on_shift),
+            }
         )
     return {
         "split": tab.size.split,
@@ -199,7 +206,19 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "against_classical": against_classical,
         "classical_solver": row.solver,
         "metrics": metrics,
+        **_plain_shift(row.on_shift),
     }
+
+
+def _plain_shift(on_shift: OnShift | None) -> dict[str, dict[str, float | None] | None]:
+    """Return score and skill on ``shift``, None where there is none."""
+    score = None
+    skill = None
+    if on_shift is not None:
+        score = _plain_value(on_shift.score)
+        if on_shift.skill is not None:
+            skill = _plain_value(on_shift.skill)
+    return {"score_on_shift": score, "skill_on_shift": skill}
 
 
 def _plain_value(value: Value) -> dict[str, float | None]:

@@ -186,6 +186,12 @@ LEADERBOARD_COMMANDS = (
         example="leaderboard reproduce cavity/mini/gns --scenarios 2",
     ),
     CommandEntry(
+        name="shift",
+        target="leaderboard:shift_command",
+        summary="Score the models of entries on shift, which lies outside train.",
+        example="leaderboard shift cavity/mini/gns",
+    ),
+    CommandEntry(
         name="show",
         target="leaderboard:show_command",
         summary="Print the tables of the leaderboard.",

@@ -1,4 +1,7 @@
-"""The commands of the group leaderboard: build, check, picture, reproduce, show."""
+"""The commands of the group leaderboard.
+
+They are build, check, picture, reproduce, shift and show.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import ReproduceResult, reproduce
+from lagbench.board.shift import scores_of_seeds
+from lagbench.board.shift_run import ShiftResult, score_on_shift
 from lagbench.board.show import (
     SCOPE_OF_JSON,
     choose_data_sets,
@@ -345,6 +350,83 @@ def _describe_reproduced(result: ReproduceResult) -> Iterator[str]:
     )
 
 
+def shift_command(
+    entries: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENTRY]...", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
+        ),
+    ] = None,
+    every: Annotated[
+        bool, option("--all", "Score every entry that has a model.")
+    ] = False,
+    split: Annotated[
+        str | None, option("--split NAME", "With --all: of this split only.")
+    ] = None,
+    size: Annotated[
+        str | None, option("--size NAME", "With --all: of this size only.")
+    ] = None,
+    again: Annotated[
+        bool, option("--again", "Predict again what is recorded already.")
+    ] = False,
+    threads: Annotated[
+        int, option("--threads N", "Threads of a model on the CPU.", min=1)
+    ] = 1,
+    board: BoardOption = DEFAULT_BOARD,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Predict the subset shift with the models of entries; write shift.yaml.
+
+    Exit code 0: all models ran; 2: no such entry, or one without a model; 3: a model
+    cannot be read; 4: data are missing; 5: out of memory or disk.
+    """
+    if bool(entries) == every:
+        raise UsageError(
+            "name entries, or ask for all",
+            where="ENTRY or --all",
+            expected="one of the two",
+            got="both" if every else "neither",
+            fix="lagbench leaderboard shift cavity/mini/gns",
+        )
+    with progress_bar(quiet=quiet or as_json) as progress:
+        result = score_on_shift(
+            board,
+            entries or (),
+            split=split,
+            size=size,
+            again=again,
+            threads=threads,
+            root=root,
+            progress=progress,
+        )
+    if not as_json:
+        for failure in result.failures:
+            typer.echo(f"{failure.entry}: {failure.error}", err=True)
+    print_result(
+        result.to_plain(), _describe_shift(result), as_json=as_json, quiet=quiet
+    )
+    raise typer.Exit(result.exit_code)
+
+
+def _describe_shift(result: ShiftResult) -> Iterator[str]:
+    for path, scores in result.entries.items():
+        name = path.removeprefix("submissions/").removesuffix(".yaml")
+        for one, seed_score in zip(scores.models, scores_of_seeds(scores), strict=True):
+            seed = ""
+            if one.seed is not None:
+                seed = f", seed {one.seed}"
+            yield (
+                f"{name}{seed}: {scores.metric} {seed_score.mean:.6g} on shift, "
+                f"{len(one.values)} scenarios"
+            )
+    yield (
+        f"{result.folder}: {format_count(len(result.entries), 'entry')}, "
+        f"{format_count(len(result.failures), 'failure')}"
+    )
+
+
 def show_command(
     split_argument: SplitArgument = None,
     split_option: SplitOption = None,
@@ -377,7 +459,7 @@ def show_command(
         print_json(to_plain(model))
         return
 
-    print_tables(tables(model, metric or (), wide=wide))
+    print_tables(tables(model, metric or (), wide=wide), is_narrow=True)
     if model.tabs:
         return
     if data_sets:

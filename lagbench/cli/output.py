@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
 PIPE_WIDTH = 120  # width of the output where it is no terminal [characters]
 GAP = 3  # characters between two columns
+NARROW_GAP = 2  # in narrow tables
 LAST_COLUMN = 24  # characters to which the last column, which wraps, may shrink
 
 
@@ -102,8 +103,10 @@ def print_errors(result: ValidationResult) -> None:
         typer.echo("\n".join(lines), err=True)
 
 
-def split_table(table: Table, width: int = WIDTH) -> Iterator[Table]:
+def split_table(table: Table, width: int = WIDTH, *, gap: int = GAP) -> Iterator[Table]:
     """Yield a table in blocks that are no wider than a width.
+
+    Columns have so many spaces between them as ``gap`` says.
 
     Each block begins with the key columns, which say what a row is. The first block has
     the title.
@@ -111,7 +114,7 @@ def split_table(table: Table, width: int = WIDTH) -> Iterator[Table]:
     columns = list(zip(table.columns, *table.rows, strict=True))
     column_widths = [_column_width(column) for column in columns]
     column_widths[-1] = min(column_widths[-1], LAST_COLUMN)
-    key_width = sum(column_widths[: table.keys]) + GAP * table.keys
+    key_width = sum(column_widths[: table.keys]) + gap * table.keys
 
     # numbers of the columns of each block, without the key columns
     column_groups: list[list[int]] = [[]]
@@ -122,7 +125,7 @@ def split_table(table: Table, width: int = WIDTH) -> Iterator[Table]:
             column_groups.append([])
             block_width = key_width
         column_groups[-1].append(number)
-        block_width += column_width + GAP
+        block_width += column_width + gap
 
     title = table.title
     for column_group in column_groups:
@@ -141,11 +144,12 @@ def _column_width(cells: Iterable[str]) -> int:
     return max(len(line) for line in lines)
 
 
-def print_tables(tables: Iterable[Table]) -> None:
+def print_tables(tables: Iterable[Table], *, is_narrow: bool = False) -> None:
     """Print tables, each in blocks that fit."""
+    gap = NARROW_GAP if is_narrow else GAP
     for table in tables:
-        for block in split_table(table):
-            print_table(block.title, block.columns, block.rows)
+        for block in split_table(table, gap=gap):
+            print_table(block.title, block.columns, block.rows, is_narrow=is_narrow)
 
 
 def print_table(

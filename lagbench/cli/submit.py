@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from lagbench.board.entry_file import read_meta
-from lagbench.board.folder import VERIFIED
+from lagbench.board.folder import SHIFT, VERIFIED
 from lagbench.board.publish import SubmitResult
 from lagbench.board.submit import submit
 
@@ -127,6 +127,11 @@ def _describe(result: SubmitResult) -> Iterator[str]:
         yield (
             "the entry lost its line in verified.yaml: "
             "maintainers score it again to verify it"
+        )
+    if result.board / SHIFT in result.files:
+        yield (
+            "the entry lost its line in shift.yaml: lagbench leaderboard shift "
+            "scores its models there"
         )
     board_option = ""
     if not is_default_board:

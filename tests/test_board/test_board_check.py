@@ -283,7 +283,7 @@ def test_all_checks_have_damage() -> None:
     """
     tested = set().union(*map(checks_of, DAMAGE))
     elsewhere = {"page", "rescored", "base", "measured", "weights", "budget"}
-    elsewhere.add("season")
+    elsewhere.update({"season", "shift"})
     assert not tested & elsewhere
     assert tested | elsewhere == set(CHECKS)
 

@@ -1,0 +1,196 @@
+"""Scores of entries on shift: models are run there, the board shows and checks them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from model_board import ModelBoard, make_bench
+from typer.testing import Result
+
+import lagbench
+from lagbench.baselines.predict import predict
+from lagbench.board.build import build, collect
+from lagbench.board.folder import Folder
+from lagbench.board.shift import read_shift
+from lagbench.board.shift_run import score_on_shift
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import load
+from lagbench.errors import DataError, UsageError
+from lagbench.make.generate import GenerationResult
+from lagbench.references.shipped import shipped
+from lagbench.scoring.score_layout import SUBMISSION
+
+SPLIT = "multimaterial"
+NAME = f"{SPLIT}/tiny/gns"
+PATH = f"submissions/{NAME}.yaml"
+
+
+@pytest.fixture(scope="module")
+def run_board(
+    tmp_path_factory: pytest.TempPathFactory,
+    tiny_split: Callable[..., GenerationResult],
+) -> ModelBoard:
+    """A leaderboard of a set with shift, whose only model was run there."""
+    folder = tmp_path_factory.mktemp("shift-board")
+    bench = make_bench(folder, tiny_split(SPLIT).root, SPLIT)
+    result = score_on_shift(bench.folder, [NAME], root=bench.root)
+    assert result.predicted == [f"{NAME}, seed 0"]
+    return bench
+
+
+@pytest.fixture
+def own(run_board: ModelBoard, tmp_path: Path) -> ModelBoard:
+    """A copy of the leaderboard that the test may change."""
+    shutil.copytree(run_board.folder, tmp_path / "board")
+    return replace(run_board, folder=tmp_path / "board")
+
+
+def test_the_values_are_those_of_predict_and_score(
+    run_board: ModelBoard, tmp_path: Path
+) -> None:
+    """A prediction of shift with the same weights, scored as a file, has them too."""
+    path = tmp_path / "shift.nc"
+    predict(
+        run_board.weights,
+        path,
+        subset="shift",
+        root=run_board.root,
+        device="cpu",
+        threads=1,
+    )
+    card = lagbench.score(path, root=run_board.root, workers=1)
+    expected = card.scores[SUBMISSION][card.ranking]
+    (one,) = read_shift(Folder(run_board.folder))[PATH].models
+    assert one.model == file_sha256(run_board.weights)
+    assert tuple(one.values) == expected.scenarios
+    assert list(one.values.values()) == pytest.approx(expected.values, rel=1e-6)
+
+
+def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:
+    """It is 1 - score / score of the best naive baseline there, whose own skill is
+    0.
+    """
+    (tab,) = collect(run_board.folder).tabs
+    references = shipped(load().size(SPLIT, "tiny").scored_on("shift"))
+    assert references is not None
+    best = None
+    for row in tab.references:
+        assert row.on_shift is not None
+        mean = references[row.name].scores[tab.ranking].mean
+        assert row.on_shift.score.mean == pytest.approx(mean)
+        if row.kind == "naive" and (best is None or mean < best):
+            best = mean
+    assert best is not None
+    (row,) = tab.rows
+    assert row.on_shift is not None
+    assert row.on_shift.skill is not None
+    expected = 1.0 - row.on_shift.score.mean / best
+    assert row.on_shift.skill.mean == pytest.approx(expected)
+    naive_skills = []
+    for reference in tab.references:
+        if reference.kind == "naive" and reference.on_shift is not None:
+            assert reference.on_shift.skill is not None
+            naive_skills.append(reference.on_shift.skill.mean)
+    assert max(naive_skills) == pytest.approx(0.0)
+
+
+def test_the_command_runs_no_model_twice(own: ModelBoard) -> None:
+    """What is recorded stays as it is, unless it is asked for again."""
+    before = (own.folder / "shift.yaml").read_bytes()
+    assert score_on_shift(own.folder, root=own.root).predicted == []
+    assert (own.folder / "shift.yaml").read_bytes() == before
+    again = score_on_shift(own.folder, [NAME], root=own.root, again=True)
+    assert again.predicted == [f"{NAME}, seed 0"]
+    assert (own.folder / "shift.yaml").read_bytes() == before
+    build(own.folder)
+    assert own.find(page=True).findings == ()
+
+
+def change_model(line: dict[str, Any]) -> None:
+    line["models"][0]["model"] = "0" * 64
+
+
+def change_data(line: dict[str, Any]) -> None:
+    line["subset_sha256"] = "0" * 64
+
+
+def change_metric(line: dict[str, Any]) -> None:
+    line["metric"] = "position_rmse"
+
+
+def drop_scenario(line: dict[str, Any]) -> None:
+    line["models"][0]["values"].popitem()
+
+
+def repeat_seed(line: dict[str, Any]) -> None:
+    line["models"].append(line["models"][0])
+
+
+def add_key(line: dict[str, Any]) -> None:
+    line["comment"] = "better"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [change_model, change_data, change_metric, drop_scenario, repeat_seed, add_key],
+)
+def test_a_line_holds_for_its_models_and_data_only(
+    own: ModelBoard, change: Callable[[dict[str, Any]], None]
+) -> None:
+    """The check reports each other line."""
+    own.edit(own.folder / "shift.yaml", lambda content: change(content[PATH]))
+    assert [issue.check for issue in own.find().findings] == ["shift"]
+
+
+def test_a_line_of_no_entry_is_reported(own: ModelBoard) -> None:
+    """An entry that is not there has no scores."""
+    own.edit(
+        own.folder / "shift.yaml",
+        lambda content: content.update({PATH.replace("gns", "gone"): content[PATH]}),
+    )
+    assert [issue.check for issue in own.find().findings] == ["shift"]
+
+
+def test_an_entry_that_is_replaced_loses_its_line(own: ModelBoard) -> None:
+    """Predictions without the model have no scores on shift; the check is silent."""
+    own.submit(own.shifted(0.01), replace=True)
+    assert read_shift(Folder(own.folder)) == {}
+    assert own.find().findings == ()
+
+
+def test_what_cannot_be_run_is_refused(
+    own: ModelBoard, model_board: ModelBoard, tmp_path: Path
+) -> None:
+    """An unknown entry, a set without shift, and data that are not there."""
+    with pytest.raises(UsageError):
+        score_on_shift(own.folder, [f"{SPLIT}/tiny/nobody"], root=own.root)
+    with pytest.raises(UsageError):
+        score_on_shift(
+            model_board.folder, ["curl-noise/tiny/gns"], root=model_board.root
+        )
+    (own.folder / "shift.yaml").unlink()
+    with pytest.raises(DataError):
+        score_on_shift(own.folder, [NAME], root=tmp_path / "nowhere")
+    result = score_on_shift(own.folder, root=tmp_path / "nowhere")
+    assert [failure.entry for failure in result.failures] == [PATH]
+    assert result.exit_code == DataError.exit_code
+
+
+def test_the_command_writes_the_file(
+    own: ModelBoard, run: Callable[..., Result]
+) -> None:
+    """Without a choice of entries it is refused."""
+    (own.folder / "shift.yaml").unlink()
+    words = ("leaderboard", "shift", "--board", own.folder, "--root", own.root)
+    assert run(*words).exit_code == 2
+    assert run(*words, NAME, "--all").exit_code == 2
+    result = run(*words, NAME)
+    assert result.exit_code == 0, result.output
+    content = yaml.safe_load((own.folder / "shift.yaml").read_text())
+    assert list(content) == [PATH]
