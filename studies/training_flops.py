@@ -1,0 +1,154 @@
+"""Estimate the floating-point operations of every committed training.
+
+    python -m studies.training_flops --root FOLDER [--size mini] [--board leaderboard]
+
+PyTorch's counter (``torch.utils.flop_counter``) counts the matrix products and
+convolutions of one training window, a multiplication and an addition as two
+operations. It knows no other operation, so this is an estimate from below. Backward
+costs about twice as much as forward: a training costs three times forward per window,
+times the windows that it saw. Beside it stand the operations of one predicted frame,
+the mean over the first sixteen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.checkpoint import load, restore
+from lagbench.baselines.rollout import scenario_batch, scenario_paths
+from lagbench.board.entry import Entry, Prediction, Status
+from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import Folder
+from lagbench.data.local import resolve_root
+from lagbench.data.registry import load as load_registry
+from lagbench.errors import LagbenchError
+from lagbench.figures.tables import markdown
+
+FORWARD_SHARE = 3  # forward and backward cost so many times forward
+PREDICTED_FRAMES = 16  # predicted frames whose operations are counted
+START = 5  # frame at which the counted window begins
+
+
+@dataclass(frozen=True, kw_only=True)
+class Operations:
+    """Counted operations of a model."""
+
+    window: int  # of the loss of one training window, forward only
+    frame: float  # of one predicted frame
+
+
+def count(model: Baseline, path: Path, viscosity: float | None) -> Operations:
+    """Return the operations of a model on a scenario of its data set."""
+    length = model.history + model.future
+    window = scenario_batch(path, slice(START, START + length), viscosity=viscosity)
+    if model.origin:
+        window = scenario_batch(path, slice(length), viscosity=viscosity)
+    generator = torch.Generator().manual_seed(0)
+    model.train()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model(window, generator)
+    window_operations = counter.get_total_flops()
+
+    model.eval()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        state = model.start(window.part(slice(max(2, model.history))))
+        for _ in range(PREDICTED_FRAMES):
+            state, _ = model.advance(state)
+    frame_operations = counter.get_total_flops() / PREDICTED_FRAMES
+    return Operations(window=window_operations, frame=frame_operations)
+
+
+def count_entry(folder: Folder, entry: Entry, root: Path) -> Operations | None:
+    """Return the operations of the first weights of an entry; None without any."""
+    for prediction in entry.predictions:
+        weights = prediction.weights
+        if weights is None or not weights.path.endswith(".pt"):
+            continue
+        path = folder.path / weights.path
+        model = restore(load(path), where=str(path))
+        size = load_registry().size(entry.split, entry.size)
+        scenarios = scenario_paths(
+            entry.split, subset="valid", size=entry.size, root=root
+        )
+        return count(model, next(iter(scenarios.values())), size.viscosity())
+    return None
+
+
+def _mean_windows(predictions: Sequence[Prediction]) -> float | None:
+    """Return the windows that a training of an entry saw, mean over its seeds."""
+    windows = []
+    for prediction in predictions:
+        if prediction.budget is not None and prediction.budget.windows:
+            windows.append(prediction.budget.windows)
+    if not windows:
+        return None
+    return sum(windows) / len(windows)
+
+
+def row_of(entry: Entry, operations: Operations) -> tuple[str, ...]:
+    """Return the row of an entry."""
+    windows = _mean_windows(entry.predictions)
+    training = "-"
+    windows_text = "-"
+    if windows is not None:
+        total = FORWARD_SHARE * operations.window * windows
+        training = f"{total / 1e12:.3g}"
+        windows_text = f"{windows:.0f}"
+    return (
+        f"{entry.split} {entry.size}",
+        entry.name,
+        windows_text,
+        f"{operations.window / 1e9:.3g}",
+        training,
+        f"{operations.frame / 1e6:.3g}",
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.training_flops",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--root", type=Path)
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--board", type=Path, default=Path("leaderboard"))
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    folder = Folder(options.board)
+    root = resolve_root(options.root)
+    rows = []
+    for path in folder.entries():
+        entry = read_entry(folder.path / path)
+        if entry.size != options.size or entry.status is not Status.ACTIVE:
+            continue
+        try:
+            operations = count_entry(folder, entry, root)
+        except LagbenchError as error:
+            sys.stderr.write(f"{path}: {error}\n")
+            continue
+        if operations is not None:
+            rows.append(row_of(entry, operations))
+    heads = (
+        "data set",
+        "model",
+        "windows",
+        "forward per window [GFLOP]",
+        "training [TFLOP]",
+        "predicted frame [MFLOP]",
+    )
+    sys.stdout.write(f"{markdown(heads, rows)}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
