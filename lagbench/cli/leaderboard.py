@@ -377,7 +377,9 @@ def shift_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Predict the subset shift with the models of entries; write shift.yaml.
+    """Score the models of entries on shift, which lies outside train.
+
+    The subset is predicted anew; the result is written to shift.yaml.
 
     Exit code 0: all models ran; 2: no such entry, or one without a model; 3: a model
     cannot be read; 4: data are missing; 5: out of memory or disk.
