@@ -190,9 +190,8 @@ def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
 
 def png_bytes(drawn: Figure) -> bytes:
     """Return the figure as a PNG file in 256 colours, without date or software."""
-    from PIL import Image
-
-    image = reduce_colours(Image.fromarray(pixels_of(drawn)))
+    images = require("PIL.Image", extra="plots")
+    image = reduce_colours(images.fromarray(pixels_of(drawn)))
     with io.BytesIO() as buffer:
         image.save(buffer, format="PNG", optimize=True)
         return buffer.getvalue()
@@ -226,14 +225,13 @@ def save(drawn: Figure, output: str | Path) -> Path:
 
 def _vector_bytes(drawn: Figure, ending: str) -> bytes:
     """Return the figure as a PDF or SVG file without date or software."""
-    import matplotlib as mpl
-
+    matplotlib = require("matplotlib", extra="plots")
     if ending == ".svg":
         fields = ["Date"]
     else:
         fields = ["CreationDate", "Producer", "Creator"]
     no_metadata = dict.fromkeys(fields)
     # identifiers in SVG files follow from the salt
-    with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
+    with matplotlib.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
         drawn.savefig(buffer, format=ending[1:], metadata=no_metadata)
         return buffer.getvalue()

@@ -139,13 +139,32 @@ def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats
             yield wall, velocity
 
 
+def _rectangle(place: tuple[float, float, float, float]) -> Rectangle:
+    """Return a rectangle from its left end, bottom, width and height."""
+    from matplotlib.patches import Rectangle
+
+    left, bottom, width, height = place
+    return Rectangle((left, bottom), width, height)
+
+
+def _fill_rectangle(
+    axes: Axes,
+    place: tuple[float, float, float, float],
+    colour: str,
+    *,
+    order: float,
+) -> None:
+    """Fill a rectangle from its left end, bottom, width and height; no outline."""
+    rectangle = _rectangle(place)
+    rectangle.set(color=colour, linewidth=0, zorder=order)
+    axes.add_patch(rectangle)
+
+
 def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
     """Draw the walls as bands around the box.
 
     Arrowheads on a moving wall show which way it slides.
     """
-    from matplotlib.patches import Rectangle
-
     axes.set(
         xlim=(0, 1),
         ylim=(0, 1),
@@ -157,10 +176,8 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
     left, right, bottom, top = box_of(recording)
     width = right - left
     height = top - bottom
-    outside = Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0)
-    inside = Rectangle((left, bottom), width, height, color=PAPER, lw=0, zorder=0.5)
-    axes.add_patch(outside)
-    axes.add_patch(inside)
+    _fill_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
+    _fill_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
 
     # x, y, width and height of the walls left, right, bottom, top
     bands = [
@@ -177,8 +194,6 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
 
 def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
     """Draw the edges of a box of three dimensions, and fill the walls that move."""
-    from matplotlib.patches import Polygon
-
     axes.set(
         xlim=(0, 1),
         ylim=(0, 1),
@@ -190,10 +205,9 @@ def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
     view = View(recording.size.box)
     for wall, _ in moving_walls(recording, frame):
         corners = view.wall(wall)
-        face = Polygon(
-            corners, closed=True, facecolor=MOVING, alpha=0.18, lw=0, zorder=0.5
+        axes.fill(
+            *np.transpose(corners), facecolor=MOVING, alpha=0.18, lw=0, zorder=0.5
         )
-        axes.add_patch(face)
     for ends, is_front in view.edges():
         x, y = ends.T
         order = 3.0 if is_front else 1.0
@@ -204,11 +218,8 @@ def _draw_moving_wall(
     axes: Axes, band: tuple[float, float, float, float], velocity: Floats
 ) -> None:
     """Draw a band with arrowheads that point along its velocity."""
-    from matplotlib.patches import Polygon, Rectangle
-
     x, y, width, height = band
-    wall = Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6)
-    axes.add_patch(wall)
+    _fill_rectangle(axes, band, MOVING, order=0.6)
 
     along = velocity / np.abs(velocity).max()
     across = np.array([-along[1], along[0]])
@@ -221,8 +232,7 @@ def _draw_moving_wall(
         tip = middle + size * along
         tail = middle - 0.7 * size * along
         corners = [tip, tail + half_base, tail - half_base]
-        arrowhead = Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7)
-        axes.add_patch(arrowhead)
+        axes.fill(*np.transpose(corners), color=PAPER, lw=0, zorder=0.7)
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
@@ -260,12 +270,11 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
 
 def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
     """Return the inside of the box, to cut drawings off at the walls."""
-    from matplotlib.patches import Rectangle
-
     left, right, bottom, top = box_of(recording)
-    width = right - left
-    height = top - bottom
-    return Rectangle((left, bottom), width, height, transform=axes.transData)
+    place = (left, bottom, right - left, top - bottom)
+    rectangle = _rectangle(place)
+    rectangle.set_transform(axes.transData)
+    return rectangle
 
 
 def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) -> None:

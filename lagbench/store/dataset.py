@@ -8,6 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import xarray as xr
+
 from lagbench.data import registry
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
@@ -17,8 +19,6 @@ from lagbench.errors import DataError
 from .copy import scenario_files, update_working_copy
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from lagbench.data.layout import ScenarioKey
     from lagbench.data.manifest import Manifest
     from lagbench.data.registry import Size
@@ -118,8 +118,6 @@ def _join_scenarios(
     scenarios: Sequence[xr.Dataset], numbers: Sequence[int]
 ) -> xr.Dataset:
     """Return scenarios along a new first dimension, padded to equal lengths."""
-    import xarray as xr
-
     ids = xr.Variable(
         "scenario", list(numbers), {"long_name": "scenario id", "units": "1"}
     )
@@ -167,8 +165,6 @@ def _read_viscosity(file: xr.Dataset, tier: Size, path: Path) -> float:
 
 def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
-    import xarray as xr
-
     with ExitStack() as stack:
         try:
             file = stack.enter_context(

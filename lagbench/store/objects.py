@@ -318,9 +318,7 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         # and no permission comes with time.
         may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
         if may_pass and url.startswith(S3):
-            from botocore import exceptions  # type: ignore[import-untyped]
-
-            may_pass = not isinstance(error, exceptions.HTTPClientError)
+            may_pass = not isinstance(error, _botocore_errors().HTTPClientError)
         if may_pass and isinstance(store_error, WorkFailedError):
             raise BrokenError(store_error) from error
         raise store_error from error
@@ -512,8 +510,7 @@ def _is_permission_error(error: Exception, url: str) -> bool:
         return True
     if not url.startswith(S3):
         return False
-    from botocore import exceptions
-
+    exceptions = _botocore_errors()
     credential_errors = (
         exceptions.NoCredentialsError,
         exceptions.PartialCredentialsError,
@@ -521,3 +518,10 @@ def _is_permission_error(error: Exception, url: str) -> bool:
         exceptions.TokenRetrievalError,
     )
     return isinstance(error, credential_errors)
+
+
+def _botocore_errors() -> Any:  # noqa: ANN401
+    """Return the module with the errors of S3; an error of it has loaded it before."""
+    from botocore import exceptions  # type: ignore[import-untyped]
+
+    return exceptions

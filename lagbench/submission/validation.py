@@ -56,7 +56,7 @@ from .task_checks import (
     check_scenarios,
     check_split,
 )
-from .truth import Truth
+from .truth import Truth, fetch_truth
 
 CPU_SECONDS = 5.0
 """Computing time for a small file, the start of the child aside [s].
@@ -198,7 +198,7 @@ def _examine(
     size, hint = _find_size(names, registry)
     size_json = None
     if size is not None:
-        _fetch_truth(size, root)
+        fetch_truth(size, root, size.scored_scenarios)
         size_json = size.model_dump_json()
     request = {
         "path": str(path),
@@ -239,13 +239,6 @@ def _find_size(names: Answer, registry: Registry) -> tuple[Size | None, str]:
     except (UsageError, UnreadableFileError) as error:
         hint = error.fix or error.what
         return None, hint.splitlines()[0]
-
-
-def _fetch_truth(size: Size, root: Path) -> None:
-    # Validating without a store needs no network library.
-    from lagbench.store.copy import update_working_copy
-
-    update_working_copy(size, root, size.scored_scenarios)
 
 
 def run_checks(request: Request) -> Answer:

@@ -39,7 +39,7 @@ from .task_checks import (
     frames_to_predict,
     max_test_particles,
 )
-from .truth import Truth
+from .truth import Truth, fetch_truth
 
 CHUNK_CACHE_BYTES = 1 << 20
 """Memory for the chunks of a variable while it is written [bytes]."""
@@ -422,7 +422,7 @@ def _recorded_hash(size: Size, root: Path) -> str:
     Raises:
         DataError: none is recorded.
     """
-    _fetch(size, root)
+    fetch_truth(size, root)
     recorded = dataset_hash_of(size, root)
     if recorded is None:
         raise DataError(
@@ -457,13 +457,6 @@ def _no_positions(where: str, got: str) -> UsageError:
         fix="convert it to one NumPy array of float32; of a tensor: "
         "tensor.detach().cpu().numpy()",
     )
-
-
-def _fetch(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
-    # Writing without a store needs no network library.
-    from lagbench.store.copy import update_working_copy
-
-    update_working_copy(size, root, scenarios)
 
 
 def write(
@@ -615,7 +608,7 @@ def template(
     """
     _check_output(Path(output), overwrite=overwrite)
     entry, folder, splits = locate(split, size, root=root, registry=registry)
-    _fetch(entry, folder, entry.subsets["test"])
+    fetch_truth(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
