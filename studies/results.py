@@ -35,7 +35,14 @@ from .thesis.claims import CLAIMS, claim_rows, comparison_table, leading_referen
 from .thesis.items import table_markdown
 from .thesis.plan import TABLES, read_studies, study_name, study_rows
 from .thesis.published import TABLE_4_8
-from .thesis.roster import EXPECTED, ROSTER, SIZES, RosterModel, label
+from .thesis.roster import (
+    EXPECTED,
+    NEWER_SPLITS,
+    ROSTER,
+    SIZES,
+    RosterModel,
+    label,
+)
 from .thesis.split_results import (
     BOARD,
     COMMITTED_STUDIES,
@@ -133,19 +140,26 @@ Variants change an option or two:"""
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     """Return the page."""
-    all_results = []
+    thesis_results = []
+    newer_results = []
     for size in sizes:
         for split in EXPECTED:
-            all_results.append(SplitResults(sources, split, size))
-    scored = [results for results in all_results if results.methods]
+            thesis_results.append(SplitResults(sources, split, size))
+        for split in NEWER_SPLITS:
+            if sources.has_size(split, size):
+                newer_results.append(SplitResults(sources, split, size))
+    scored = [results for results in thesis_results if results.methods]
     learned = [results for results in scored if results.models]
+    newer_learned = [results for results in newer_results if results.models]
 
     parts = [INTRODUCTION]
-    if learned:
-        parts += [summary_table(learned), SUMMARY_NOTE, verdict_on_learning(learned)]
+    summarised = [*learned, *newer_learned]
+    if summarised:
+        parts += [summary_table(summarised), SUMMARY_NOTE]
+        parts.append(verdict_on_learning(summarised))
     parts.append(HOW_TO_READ)
     parts += _claims(learned)
-    for results in scored:
+    for results in [*scored, *newer_learned]:
         parts += _chapter(results)
 
     protocols = list(_protocols(sources, sizes))
@@ -156,7 +170,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
         parts += ["## MLPs from frame to frame", *studies]
 
     variants = [_variant_line(model) for model in ROSTER.values() if model.variant_of]
-    missing = [line for results in all_results for line in _missing_lines(results)]
+    missing = [line for results in thesis_results for line in _missing_lines(results)]
     parts += [
         COMMANDS,
         "\n".join(variants),
@@ -225,7 +239,7 @@ def _chapter(results: SplitResults) -> Iterator[str]:
     if size.split in TABLE_4_8:
         yield "Table 4.8: errors of a rollout by scene. A cell is ours / the thesis's."
         yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
-    else:
+    elif size.split in EXPECTED:
         yield _vorticity_note(results)
         yield vorticity_table(results)
         tau = order_agreement(results)

@@ -194,6 +194,11 @@ class Sources:
         registry = self.registry or load()
         return registry.size(split, size)
 
+    def has_size(self, split: str, size: str) -> bool:
+        """Return whether a split has a size."""
+        registry = self.registry or load()
+        return split in registry.splits and size in registry.splits[split].sizes
+
     def entries(self, split: str, size: str) -> dict[str, Path]:
         """Return the entries of the board by name."""
         if self.board is None:
