@@ -58,6 +58,9 @@ ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
 }
 
+MEMORY_SIGNS = (b"MemoryError", b"allocate memory", b"failed to map segment")
+"""What a child prints that had too little memory to start."""
+
 CHILD = "from lagbench.work.machine import serve; serve()"
 """The child's program.
 
@@ -110,16 +113,38 @@ def available_cores() -> int:
 def limit_process(*, memory: int, seconds: int) -> None:
     """Limit this process, as far as the system can.
 
+    A hard limit that it has already stays where it is lower.
+
     Args:
         memory: address space [bytes].
         seconds: processor time [s].
     """
     if not LIMITS:
         return
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    _lower_limit(resource.RLIMIT_CORE, 0, 0)
+    _lower_limit(resource.RLIMIT_CPU, seconds, seconds + 1)
     if sys.platform != "darwin":
-        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+        _lower_limit(resource.RLIMIT_AS, memory, memory)
+
+
+def _lower_limit(kind: int, soft: int, hard: int) -> None:
+    """Set a limit of this process, but raise no hard limit: the system forbids it."""
+    _, present_hard = resource.getrlimit(kind)
+    if present_hard != resource.RLIM_INFINITY:
+        soft = min(soft, present_hard)
+        hard = min(hard, present_hard)
+    resource.setrlimit(kind, (soft, hard))
+
+
+def address_space_limit() -> int | None:
+    """Return how much memory a process of this one may map [bytes]; None if any.
+
+    It is the limit that ``ulimit -v`` or a batch system has set.
+    """
+    if not LIMITS:
+        return None
+    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if soft == resource.RLIM_INFINITY else soft
 
 
 class ChildStopped(Exception):
@@ -210,6 +235,17 @@ class LimitedChild:
             return ChildStopped(f"no end after {self._wall:.0f} s")
         self._stderr.seek(0)
         text = self._stderr.read()
+        limit = address_space_limit()
+        is_memory = code == OUT_OF_MEMORY or any(word in text for word in MEMORY_SIGNS)
+        if limit is not None and limit < self._memory and is_memory:
+            return WorkFailedError(
+                "there is not enough memory",
+                where=self._arguments[0],
+                expected=f"{self._memory >> 20} MiB for a child process",
+                got=f"a limit of {limit >> 20} MiB",
+                fix="raise the limit (`ulimit -v unlimited`, or that of the batch "
+                "system)",
+            )
         if b"Traceback" in text and code > 0 and code != OUT_OF_MEMORY:
             lines = text.decode("utf-8", "replace").strip().rsplit("\n", 1)
             return WorkFailedError(

@@ -4,6 +4,8 @@ reasons.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -88,6 +90,36 @@ def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> No
     )
     assert values == ["", ""]
     assert said in str(stopped)
+
+
+UNDER_A_HARD_LIMIT = """
+import resource, sys
+from lagbench.errors import WorkFailedError
+from lagbench.work.machine import run_in_child
+limit = 500 << 20
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+print(run_in_child("jobs.behave", [1, 2], seconds=5, wall=600).values)
+try:
+    run_in_child("jobs.behave", ["fill"], seconds=5, wall=600)
+except WorkFailedError as error:
+    print(error.expected, "|", error.got)
+"""
+
+
+@pytest.mark.usefixtures("jobs")
+def test_a_hard_limit_of_memory_is_kept_and_named() -> None:
+    """A child works below it; one that needs more fails for the machine's reason, and
+    not for a fault of the file.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", UNDER_A_HARD_LIMIT],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    answers, failure = done.stdout.splitlines()
+    assert answers == "[1, 2]"
+    assert failure == "768 MiB for a child process | a limit of 500 MiB"
 
 
 @pytest.mark.usefixtures("jobs")
