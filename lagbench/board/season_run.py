@@ -347,7 +347,8 @@ class _Run:
                 expected=data_set.metric,
             )
         wanted = dict(list(hashes.items())[: frozen.scenarios])
-        key = f"{data_set.draw_seed} {model.sha256}"
+        # entries may share a model and still predict otherwise
+        key = f"{data_set.draw_seed} {frozen.method} {model.seed} {model.sha256}"
         if self._is_saved(key, wanted):
             blind = self._saved_values(key, wanted)
         else:
@@ -407,12 +408,14 @@ class _Run:
         if entry is not None:
             for index, prediction in enumerate(entry.predictions):
                 weights = prediction.weights
-                if weights is not None and weights.sha256 == model.sha256:
+                if weights is None or prediction.seed != model.seed:
+                    continue
+                if weights.sha256 == model.sha256:
                     return entry, index
         raise ChecksFailedError(
             "the frozen model is no longer on the board",
             where=str(path),
-            expected=f"a model with SHA-256 {model.sha256[:16]}",
+            expected=f"seed {model.seed}, a model with SHA-256 {model.sha256[:16]}",
             fix="check out the commit that closed the season",
         )
 

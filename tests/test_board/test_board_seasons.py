@@ -163,6 +163,26 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
+def test_each_of_two_entries_with_one_model_is_predicted(
+    own: ModelBoard, tmp_path: Path
+) -> None:
+    """Entries may run the same model in different ways, as means over mirror images."""
+    for path in (Path(PATH), Path(f"scores/{NAME}.nc")):
+        target = own.folder / path
+        shutil.copy(target, target.with_stem("twin"))
+    twin = own.folder / Path(PATH).with_stem("twin")
+    own.edit(twin, lambda content: content.update(method="twin"))
+    season = close_season(own, "twins")
+    root = tmp_path / "data"
+    shutil.copytree(own.root, root)
+    simulate(own, season, root)
+    result = run_season(own.folder, "twins", root=root)
+    assert sorted(result.predicted) == [
+        "curl-noise/tiny/gns, seed 0",
+        "curl-noise/tiny/twin, seed 0",
+    ]
+
+
 def test_the_line_of_a_reproduced_entry_becomes_blind(own: ModelBoard) -> None:
     """With both skills, and an interval around their gap."""
     result = run_again(own)
