@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,12 +145,28 @@ def frames_of_flight(given: Given) -> int:
     return len(given.predicted_frames)
 
 
+Division = Callable[[Floats, int], list[NDArray[np.intp]]]
+"""From the distances of the analogs and the number of particles to the particles that
+follow each analog.
+"""
+
+
+def divide_evenly(distances: Floats, particle_count: int) -> list[NDArray[np.intp]]:
+    """Return the followers of each analog: all have as many."""
+    analog_count = len(distances)
+    followers = []
+    for number in range(analog_count):
+        followers.append(np.arange(number, particle_count, analog_count))
+    return followers
+
+
 def predict_positions(
     given: Given,
     choice: Choice,
     *,
     library: StateLibrary | None,
     without: int | None = None,
+    divide: Division = divide_evenly,
 ) -> Iterator[Floats]:
     """Yield positions of the predicted frames [length], each [particle, axis].
 
@@ -159,6 +175,7 @@ def predict_positions(
         choice: how long after contact, and how many analogs.
         library: states of train; without any the flight goes on.
         without: a scenario of train that may not be looked at.
+        divide: which particles follow which analog.
     """
     horizon = len(given.predicted_frames)
     flown = min(horizon, frames_of_flight(given) + choice.lag)
@@ -166,7 +183,9 @@ def predict_positions(
         yield ballistic_positions(given, frames_on)
     if flown == horizon:
         return
-    analogs = _analogs_of(given, flown, choice, library=library, without=without)
+    analogs = _analogs_of(
+        given, flown, choice, library=library, without=without, divide=divide
+    )
     for frames_on in range(1, horizon - flown + 1):
         if not analogs:
             yield ballistic_positions(given, flown + frames_on)
@@ -200,6 +219,7 @@ def _analogs_of(
     *,
     library: StateLibrary | None,
     without: int | None,
+    divide: Division,
 ) -> list[FollowedAnalog]:
     """Return the analogs of the state after so many frames of flight."""
     if library is None:
@@ -213,9 +233,11 @@ def _analogs_of(
     velocity = given.box.displacement(previous, position)  # [length/frame]
     feature = describe_state(position, velocity, given.material)
     states = library.nearest(feature, count=choice.analogs, without=without)
+    if not states:
+        return []
+    distances = np.linalg.norm(library.features[states] - feature, axis=1)
     followed = []
-    for number, state in enumerate(states):
-        members = np.arange(number, len(position), len(states))
+    for state, members in zip(states, divide(distances, len(position)), strict=True):
         scenario = int(library.scenarios[state])
         frame = int(library.frames[state])
         motion = read_train_scenario(given.size.path(given.root, scenario))

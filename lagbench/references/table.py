@@ -15,6 +15,7 @@ from . import (
     extrapolation,
     frozen_field,
     projection,
+    weighted_analogs,
 )
 from .predictor import Kind, ReferencePredictor
 
@@ -28,6 +29,7 @@ _PREDICTORS = (
     ballistic_analog.PREDICTOR,
     *projection.PREDICTORS,
     *coarse_solver.PREDICTORS,
+    weighted_analogs.PREDICTOR,
 )
 
 REFERENCES: Mapping[str, ReferencePredictor] = MappingProxyType(
