@@ -142,7 +142,7 @@ FULL_BOX = (
         ("cavity", "mini", FULL_BOX),
         ("curl-noise", "full", FULL_BOX),
         ("fluid", "full", f"{SURFACE} coarse-solver coarse-solver-4x"),
-        ("fluid", "mini", f"{SURFACE} coarse-solver"),
+        ("fluid", "mini", f"{SURFACE} coarse-solver weighted-analogs"),
         ("multimaterial", "full", f"{SURFACE} coarse-solver coarse-solver-4x"),
         ("multimaterial", "mini", f"{SURFACE} coarse-solver"),
         ("fluid", "tiny", SURFACE),
