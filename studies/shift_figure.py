@@ -100,6 +100,7 @@ def best_of_kinds(rows: Sequence[ShiftedRow]) -> list[ShiftedRow]:
 
 def draw(tab: Tab, rows: Sequence[ShiftedRow]) -> Markup:
     """Return the chart of a data set."""
+    name = f"{tab.size.split} {tab.size.name}"
     values = []
     for row in rows:
         values += [row.test, row.shift]
@@ -107,7 +108,7 @@ def draw(tab: Tab, rows: Sequence[ShiftedRow]) -> Markup:
         SIDES,
         close_logarithmic(min(values), max(values)),
         x_label="",
-        y_label=words(tab.ranking),
+        y_label=f"{name}: {words(tab.ranking)}",
         height=HEIGHT,
     )
     best = best_of_kinds(rows)
@@ -133,7 +134,6 @@ def draw(tab: Tab, rows: Sequence[ShiftedRow]) -> Markup:
             )
         )
     plot.spots(spots)
-    name = f"{tab.size.split} {tab.size.name}"
     return plot.svg(name, f"{name}: scores of {len(rows)} methods on test and shift.")
 
 

@@ -151,6 +151,7 @@ def _validations_of(
 
 def draw(data_set: tuple[str, str], curves: Sequence[Curve]) -> Markup:
     """Return the chart of a data set."""
+    where = " ".join(data_set)
     all_windows: list[float] = []
     all_errors: list[float] = []
     for curve in curves:
@@ -160,7 +161,7 @@ def draw(data_set: tuple[str, str], curves: Sequence[Curve]) -> Markup:
         close_logarithmic(min(all_windows), NAME_ROOM * max(all_windows)),
         close_logarithmic(min(all_errors), max(all_errors)),
         x_label="windows seen",
-        y_label=f"{words(curves[0].metric)} on valid",
+        y_label=f"{where}: {words(curves[0].metric)} on valid",
         height=HEIGHT,
     )
     spots = []
@@ -183,8 +184,7 @@ def draw(data_set: tuple[str, str], curves: Sequence[Curve]) -> Markup:
         )
         spots.append(spot)
     plot.spots(spots)
-    name = " ".join(data_set)
-    return plot.svg(name, f"{name}: validation errors of {len(curves)} trainings.")
+    return plot.svg(where, f"{where}: validation errors of {len(curves)} trainings.")
 
 
 def table(curves: dict[tuple[str, str], list[Curve]]) -> str:
