@@ -111,7 +111,9 @@ def _join(names: Sequence[str]) -> str:
 def _format_against(results: SplitResults, model: str) -> str:
     against = results.against_classical(model)
     if against is None:
-        return "-"
+        if results.seconds_per_frame(model) is None:
+            return "-"
+        return "no solver is as cheap"
     low, high = against.interval
     return (
         f"{number(against.value)} ({number(low)} to {number(high)}),"
