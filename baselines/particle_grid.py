@@ -185,9 +185,12 @@ class ParticleGrid(nn.Module):
         """
         contributions = stencil.weight[:, :, None] * value[:, None]
         node_count = layers * math.prod(self.shape)
-        sums = value.new_zeros(node_count, value.shape[1])
+        channels = value.shape[1]
+        sums = value.new_zeros(node_count, channels)
         sums = sums.index_add(0, stencil.node, contributions.flatten(0, 1))
-        return sums.view(layers, *self.shape, -1).movedim(-1, 1)
+        # The exporter to ONNX understands no axis below 0 here.
+        last_axis = self.dimension + 1
+        return sums.view(layers, *self.shape, channels).movedim(last_axis, 1)
 
     def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
         """Return a field at the particles, shape [particle, channel].
@@ -196,7 +199,7 @@ class ParticleGrid(nn.Module):
         """
         channels = field.shape[1]
         nodes_around = stencil.weight.shape[1]
-        by_node = field.movedim(1, -1).reshape(-1, channels)
+        by_node = field.movedim(1, self.dimension + 1).reshape(-1, channels)
         if self.dimension == 3:
             # Products with 27 nodes would fill the memory: this sums at once.
             return embedding_bag(

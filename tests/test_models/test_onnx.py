@@ -14,6 +14,7 @@ import pytest
 import torch
 from hostile_onnx import REFUSED, STOPPED, pickle_as_onnx, straight_on
 
+from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
 from lagbench.board.entry import Level, Meta
 from lagbench.board.reproduce import reproduce
@@ -167,6 +168,41 @@ def test_an_exported_step_predicts_what_it_did(
     )
     model = open_onnx(path, size=SIZE, root=generated.root)
     assert model.parameters >= 6
+    scenario, expected = next(
+        iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
+    )
+    position = model.predict(SIZE.path(generated.root, scenario))
+    np.testing.assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_a_step_over_a_grid_of_particles_is_exported(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """As in the model of the README: sums at the nodes, a convolution, and back."""
+    grid = ParticleGrid(SIZE.bounds, cells=8)
+    net = torch.nn.Conv2d(3, 2, 3, padding=1)
+
+    def step(window: Batch) -> torch.Tensor:
+        before, now = window.position.unbind(1)
+        velocity = now - before
+        nodes = grid.stencil(now, window.sample)
+        mass = torch.ones_like(now[:, :1])
+        carried = torch.cat([velocity, mass], 1)
+        sums = grid.spread(nodes, carried, window.windows)
+        mean = sums / sums[:, 2:].clamp(min=1e-3)
+        flow = grid.gather(nodes, mean[:, :2] + 1e-4 * net(mean))
+        return (now + flow).clamp(grid.low, grid.high)
+
+    path = export_onnx(
+        step,
+        tmp_path / "model.onnx",
+        split=SIZE.split,
+        size=SIZE.name,
+        modules=[net, grid],
+        history=2,
+        root=generated.root,
+    )
+    model = open_onnx(path, size=SIZE, root=generated.root)
     scenario, expected = next(
         iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
     )
