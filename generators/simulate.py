@@ -152,15 +152,8 @@ def scenario_writer(
         generator=size.generator,
         dimension=size.box.dimension,
         periodic=size.periodic,
-        has_velocity=stores_velocity(size),
+        has_velocity=size.stores_velocity,
     )
-
-
-def stores_velocity(size: Size) -> bool:
-    """Tell whether files hold the solver's velocities: those in three dimensions do
-    not, they would be half of the bytes.
-    """
-    return size.box.dimension == 2
 
 
 def _has_driving_walls(parameters: SolverParameters) -> bool:
@@ -210,7 +203,7 @@ def simulate(
         recorders = _soundness_recorders(batch)
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
-            stored_velocity = velocity if stores_velocity(size) else None
+            stored_velocity = velocity if size.stores_velocity else None
             writers[index].append(position, stored_velocity)
             energies[index].append(_kinetic_energy(velocity, masses[index]))
             if recorders:

@@ -252,7 +252,7 @@ def _draw_permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]
 Step = Callable[[Batch], Tensor]
 """A model: windows of given frames in, positions of the next frame out.
 
-The positions [length] have shape [particle, 2]. The slice
+The positions [length] have shape [particle, axis]. The slice
 ``batch.wall_velocity[:, batch.frames]`` is the forcing on the way to the next frame.
 """
 
@@ -267,11 +267,11 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         frames: frames to predict.
 
     Returns:
-        Positions of the predicted frames [length], shape [particle, frame, 2].
+        Positions of the predicted frames [length], shape [particle, frame, axis].
 
     Raises:
         UsageError: frames below 1 or beyond the known forcing, or the model returns no
-            [particle, 2].
+            [particle, axis].
     """
     # Beyond the known forcing a model would take the last known one.
     if given.wall_velocity is None:
@@ -303,7 +303,7 @@ def _check_step_result(position: object, shape: torch.Size) -> None:
         raise UsageError(
             "a model returned no positions of the next frame",
             where="roll_out, step",
-            expected=f"a tensor of shape {list(shape)}: [particle, 2]",
+            expected=f"a tensor of shape {list(shape)}: [particle, axis]",
             got=getattr(position, "shape", None) or type(position).__name__,
         )
 
@@ -337,7 +337,7 @@ def predict(
 
     Yields:
         Scenario id, and positions of the frames to predict [length], float32, shape
-        [frame, particle, 2].
+        [frame, particle, axis].
 
     Raises:
         UsageError: unknown split, size or subset, history beyond the given frames, a
@@ -380,7 +380,7 @@ def predict(
         given = collate([window]).part(visible_frames).to(device)
         with torch.no_grad():
             positions = roll_out(step, given, task.horizon)
-        # from [particle, frame, 2] to [frame, particle, 2]
+        # from [particle, frame, axis] to [frame, particle, axis]
         by_frame = positions.transpose(0, 1).float().cpu().numpy()
         _check_finite(by_frame, scenario, first_frame=task.input_frames)
         yield scenario, by_frame

@@ -95,6 +95,9 @@ Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
+HEADER_BYTES = 64 * 1024
+"""The most bytes of a file's header, constants and index of chunks."""
+
 NO_GENERATOR = "none"
 """Generator of splits that were not simulated here; see ``lagbench.data.local``."""
 
@@ -374,19 +377,32 @@ class Size(BaseModel):
             f"no scenario {scenario}", where=f"{self.split} {self.name}, frames"
         )
 
+    @property
+    def stores_velocity(self) -> bool:
+        """Whether generated files hold the solver's velocities.
+
+        Those in three dimensions do not: velocities would be half of the bytes.
+        """
+        return self.dimension == 2
+
     def file_bytes(self, scenario: int) -> int:
         """Return the most bytes of a scenario's file, on average over a data set."""
-        # Position and velocity are float32; header, constants and chunk index take
-        # 64 KiB at most.
-        particle_bytes = 8 * self.dimension
-        particles = self.particle_count(scenario)
-        value_bytes = self.frame_count(scenario) * particles * particle_bytes
-        return value_bytes + 64 * 1024
+        moving_variables = 2 if self.stores_velocity else 1
+        return self._value_bytes(scenario, moving_variables) + HEADER_BYTES
 
     def longest_file(self, scenario: int) -> int:
-        """Return the most bytes of a scenario's file; a store may claim more."""
+        """Return the most bytes of a scenario's file; a store may claim more.
+
+        It may hold velocities whether or not the generator stores them.
+        """
+        file_bytes = self._value_bytes(scenario, moving_variables=2) + HEADER_BYTES
         # zlib makes values longer that it cannot pack.
-        return round(1.25 * self.file_bytes(scenario)) + (1 << 20)
+        return round(1.25 * file_bytes) + (1 << 20)
+
+    def _value_bytes(self, scenario: int, moving_variables: int) -> int:
+        """Return the bytes of so many float32 vectors of each particle and frame."""
+        vectors = self.frame_count(scenario) * self.particle_count(scenario)
+        return moving_variables * vectors * 4 * self.dimension
 
     def frames_behind(self, scenario: int) -> int:
         """Return how many of a scenario's frames lie behind the horizon of the task."""

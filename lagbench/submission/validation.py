@@ -132,9 +132,9 @@ def validate(
     splits = load_rooted_registry(folder, registry)
     try:
         check_file(file, fix=WRITE)
-        with _open_caller(file, isolated=isolated) as reader:
+        with _open_caller(file, isolated=isolated) as caller:
             size, answer = _examine(
-                reader, file, folder, splits, require_truth=require_truth
+                caller, file, folder, splits, require_truth=require_truth
             )
     except UnreadableFileError as error:
         return _unreadable(file, error)
@@ -149,12 +149,12 @@ def validate(
     return result
 
 
-Reader = Callable[[Callable[[Request], Answer], Request], Answer]
+Caller = Callable[[Callable[[Request], Answer], Request], Answer]
 """Calls a function that reads a file of a stranger."""
 
 
 @contextmanager
-def _open_caller(path: Path, *, isolated: bool) -> Iterator[Reader]:
+def _open_caller(path: Path, *, isolated: bool) -> Iterator[Caller]:
     """Yield what calls a reading function: here or, if isolated, in a limited child.
 
     Raises:
@@ -182,7 +182,7 @@ def _open_caller(path: Path, *, isolated: bool) -> Iterator[Reader]:
 
 
 def _examine(
-    reader: Reader,
+    caller: Caller,
     path: Path,
     root: Path,
     registry: Registry,
@@ -191,10 +191,10 @@ def _examine(
 ) -> tuple[Size | None, Answer]:
     """Return the size that a file names, None if there is none, and its checks.
 
-    The reader opens the file twice: the test subset, which the checks need, may have to
+    The file is opened twice: the test subset, which the checks need, may have to
     be fetched, and that is no work for a child that reads what a stranger wrote.
     """
-    names = reader(read_names, {"path": str(path)})
+    names = caller(read_names, {"path": str(path)})
     size, hint = _find_size(names, registry)
     size_json = None
     if size is not None:
@@ -207,7 +207,7 @@ def _examine(
         "hint": hint,
         "require_truth": require_truth,
     }
-    return size, reader(run_checks, request)
+    return size, caller(run_checks, request)
 
 
 def read_names(request: Request) -> Answer:

@@ -400,6 +400,17 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert set(select(size)) == everything
 
 
+def test_files_in_three_dimensions_are_estimated_without_velocities(
+    unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """The estimate is an upper bound of the files that are generated, not by much."""
+    size = unmeasured.size("curl-noise-3d", "tiny")
+    root = tiny_split("curl-noise-3d").root
+    for scenario in size.scenarios:
+        file_bytes = size.path(root, scenario).stat().st_size
+        assert file_bytes < size.file_bytes(scenario) < 1.5 * file_bytes
+
+
 def test_estimates_add_up(unmeasured: Registry) -> None:
     """Bytes follow from frames and particles; time from substeps, never below the
     longest scenario's.
