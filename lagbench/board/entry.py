@@ -299,6 +299,11 @@ class MeasuredCost(Strict):
             return None
         return self.solver / self.seconds_per_frame
 
+    def is_of_same_run(self, other: MeasuredCost) -> bool:
+        """Return whether both were measured in one run, and so can be compared."""
+        own_time = {"seconds_per_frame": other.seconds_per_frame}
+        return self.model_copy(update=own_time) == other
+
 
 class BlindScore(Strict):
     """The skill of an entry on a season's data, beside that on the public data."""

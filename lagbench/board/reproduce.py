@@ -70,6 +70,8 @@ class ReproduceResult:
     lines: dict[str, Verification] = field(default_factory=dict)
     # predicted in this run, as in "cavity/mini/gns, seed 0"
     predicted: list[str] = field(default_factory=list)
+    # whose costs were measured in this run, as in "cavity/mini/gns"
+    measured: list[str] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
 
     @property
@@ -93,6 +95,7 @@ class ReproduceResult:
             "folder": str(self.folder),
             "entries": lines,
             "predicted": self.predicted,
+            "measured": self.measured,
             "differing": self.differing,
             "failures": failures,
         }
@@ -127,7 +130,8 @@ def reproduce(
     """Run the models of entries, compare their scores, measure their costs.
 
     Entries that are recorded for the same models and scores, with as many scenarios,
-    are not run again.
+    are not run again. Costs are compared inside a data set, so they are measured for
+    all its entries, unless all of them have costs of one run.
 
     Args:
         board: the leaderboard's folder.
@@ -384,15 +388,28 @@ class _Run:
     def measure_costs(
         self, entries: Sequence[Entry], time_solver: TimeSolver | None
     ) -> None:
-        """Measure the costs of entries, all of a data set in one run."""
+        """Measure the costs of the data sets of entries."""
         by_data_set: dict[tuple[str, str], list[Entry]] = {}
         for entry in entries:
+            by_data_set.setdefault((entry.split, entry.size), []).append(entry)
+        for (split, size), named in by_data_set.items():
+            group = choose_entries(
+                self.folder, (), self.registry, split=split, size=size
+            )
+            for entry in named:
+                if entry not in group:
+                    group.append(entry)
+            if self.again or not self._have_costs_of_one_run(group):
+                self._measure_costs_of_data_set(group, time_solver)
+
+    def _have_costs_of_one_run(self, entries: Sequence[Entry]) -> bool:
+        costs = []
+        for entry in entries:
             line = self.line_of(entry)
-            has_cost = line is not None and line.cost is not None
-            if self.again or not has_cost:
-                by_data_set.setdefault((entry.split, entry.size), []).append(entry)
-        for group in by_data_set.values():
-            self._measure_costs_of_data_set(group, time_solver)
+            if line is None or line.cost is None:
+                return False
+            costs.append(line.cost)
+        return all(cost.is_of_same_run(costs[0]) for cost in costs)
 
     def _measure_costs_of_data_set(
         self, entries: Sequence[Entry], time_solver: TimeSolver | None
@@ -416,6 +433,7 @@ class _Run:
                 runner.close()
         for entry, cost in costs:
             self._change(entry, partial(_with_cost, cost=cost))
+            self.result.measured.append("/".join(entry.place))
 
     def _open_first_model(self, entry: Entry) -> Runner | None:
         """Return the model of the first seed that has one; None where it fails."""

@@ -62,6 +62,35 @@ def test_a_model_gives_the_scores_of_its_entry(own: ModelBoard) -> None:
     assert own.find().findings == ()
 
 
+def test_costs_of_a_data_set_are_of_one_run(own: ModelBoard) -> None:
+    """An entry without a cost has all rows of its data set measured again."""
+    options: dict[str, Any] = {"scores": False, "costs": True}
+    first = run_again(own, NAME, **options, time_solver=lambda *_: 0.5)
+    assert first.measured == [NAME]
+    assert run_again(own, NAME, **options).measured == []
+
+    other = PATH.replace("gns", "other")
+    shutil.copy(own.folder / PATH, own.folder / other)
+    own.edit(
+        own.folder / other,
+        lambda content: content.update(method="other", name="Another one"),
+    )
+    other_name = NAME.replace("gns", "other")
+    second = run_again(own, other_name, **options, time_solver=lambda *_: 0.25)
+    assert second.measured == [NAME, other_name]
+    lines = read_verified(Folder(own.folder))
+    assert [lines[path].cost is not None for path in (PATH, other)] == [True, True]
+    assert {line.cost and line.cost.solver for line in lines.values()} == {0.25}
+    assert run_again(own, **options).measured == []
+
+    own.edit(
+        own.folder / "verified.yaml",
+        lambda content: content[other]["cost"].update(solver=0.5),
+    )
+    third = run_again(own, **options, time_solver=lambda *_: 0.25)
+    assert third.measured == [NAME, other_name]
+
+
 def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
     """An entry whose score file belongs to other predictions is not reproduced."""
     weights = own.weights.read_bytes()
