@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Sampler
 
 from lagbench.atomic import check_writable
+from lagbench.data.contents import check_contents
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -333,6 +334,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         history=model.history,
         future=model.future,
         origin=model.origin,
+        verify=True,
     )
     steps = options.total_steps(len(data), processes=job.processes)
     log = job.start_log()
@@ -452,7 +454,8 @@ def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
 
 def _read_scenarios(job: TrainingJob) -> Iterator[Batch]:
     """Yield each training scenario as a batch of one window."""
-    viscosity = job.registry.size(job.info.split, job.info.size).viscosity()
+    size = job.registry.size(job.info.split, job.info.size)
+    viscosity = size.viscosity()
     paths: list[Path] = []
     for subset in job.recipe.training.windows:
         files = scenario_paths(
@@ -462,6 +465,7 @@ def _read_scenarios(job: TrainingJob) -> Iterator[Batch]:
             root=job.root,
             registry=job.registry,
         )
+        check_contents(size, job.root, files)
         paths += files.values()
     job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
     for path in paths:

@@ -88,10 +88,13 @@ class WindowDataset(WindowReader, Dataset[TensorWindow]):
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower,
             never different.
         origin: whether windows hold the positions in the scenario's first frame too.
+        verify: whether the values of all files are hashed first and compared with the
+            recorded content hashes, as `lagbench train` does.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
         DataError: scenarios are missing; the message has the command that makes them.
+            Or a file is damaged, and `verify` is true.
     """
 
     def __getitem__(self, index: int) -> TensorWindow:

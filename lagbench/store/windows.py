@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.contents import check_contents, registered_hash
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
@@ -218,9 +219,7 @@ class FrameStore:
             frames=size.frame_count(scenario),
         )
         content_hash = _read_text(file, "content_sha256")
-        recorded_hash = ""
-        if size.measured is not None:
-            recorded_hash = size.measured.scenario_sha256.get(scenario, "")
+        recorded_hash = registered_hash(size, scenario)
         if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
                 "a scenario file is not that of the registry",
@@ -303,6 +302,9 @@ class WindowReader:
     Files are opened by the process that reads from them, at most 128 at a time;
     decompressed frames are kept up to `cache_bytes` in each process. Stored data are
     never changed: every window is a copy. See `windows` for the arguments.
+
+    Where ``verify`` is false, a file counts for what it states: split, version, length
+    and content hash are compared, its values are not hashed.
     """
 
     def __init__(
@@ -317,6 +319,7 @@ class WindowReader:
         registry: Registry | None = None,
         cache_bytes: int = CACHE_BYTES,
         origin: bool = False,
+        verify: bool = False,
     ) -> None:
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
         subsets = (subset,) if isinstance(subset, str) else tuple(subset)
@@ -362,6 +365,8 @@ class WindowReader:
                 got=f"{self.length}: history {self.history}, future {future}",
                 fix="ask for fewer frames",
             )
+        if verify:
+            check_contents(tier, root_folder, paths)
         self.store = FrameStore(tier, paths, cache_bytes=cache_bytes)
 
     def __len__(self) -> int:
@@ -452,6 +457,7 @@ def windows(
     registry: Registry | None = None,
     cache_bytes: int = CACHE_BYTES,
     origin: bool = False,
+    verify: bool = False,
 ) -> Windows:
     """Open all windows of consecutive frames as NumPy arrays, without PyTorch.
 
@@ -473,10 +479,14 @@ def windows(
             never different.
         origin: whether windows hold the positions in the scenario's first frame too, as
             ``origin``.
+        verify: whether the values of all files are hashed first and compared with the
+            recorded content hashes. Takes seconds per gigabyte; a file that this
+            machine has hashed before is only read.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.
         DataError: scenarios are missing; the message has the command that makes them.
+            Or a file is damaged, and `verify` is true.
     """
     return Windows(
         split,
@@ -488,6 +498,7 @@ def windows(
         registry=registry,
         cache_bytes=cache_bytes,
         origin=origin,
+        verify=verify,
     )
 
 

@@ -5,23 +5,17 @@ They are hashed before use, and read a few frames at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.layout import quote_root
+from lagbench.data.contents import check_contents, registered_hash
 from lagbench.data.local import suggest_repair
-from lagbench.data.manifest import (
-    Manifest,
-    load_recorded_hashes,
-    read_or_empty,
-    record_hashes,
-)
 from lagbench.data.registry import Size, format_ids
-from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 
 BLOCK = 16
@@ -88,76 +82,11 @@ class Truth:
         Raises:
             DataError: a scenario is damaged or not the recorded one.
         """
-        noted_hash = load_recorded_hashes(self.folder)
-        manifest = None
-        if not self.size.measured:
-            manifest = read_or_empty(self.size, self.root)
-
-        new_hashes: dict[Path, str] = {}
-        for scenario in sorted(self.size.subsets[self.subset]):
-            path = self.path(scenario)
-            content = self._content_hash(path, noted_hash, new_hashes)
-            expected = self._expected_hash(scenario, manifest)
-            if not content.startswith(expected):
-                raise DataError(
-                    f"a {self.subset} scenario has another content hash",
-                    where=str(path),
-                    expected=expected,
-                    got=content,
-                    fix=self._hint_for_damage(),
-                )
-        record_hashes(self.folder, new_hashes)
-
-    def _content_hash(
-        self,
-        path: Path,
-        noted_hash: Callable[[Path], tuple[str, str] | None],
-        new_hashes: dict[Path, str],
-    ) -> str:
-        """Return the content hash of a file; one that was not noted is added."""
-        try:
-            hashes = noted_hash(path)
-            if hashes is not None:
-                return hashes[0]
-            new_hashes[path] = check_scenario(path)
-        except OSError as error:
-            raise DataError(
-                f"cannot read a {self.subset} scenario",
-                where=str(path),
-                got=error.strerror,
-                fix=self._hint_for_damage(),
-            ) from error
-        except DataError as error:
-            raise DataError(
-                error.what,
-                where=error.where or str(path),
-                expected=error.expected,
-                got=error.got,
-                fix=self._hint_for_damage(),
-            ) from error
-        return new_hashes[path]
-
-    def _expected_hash(self, scenario: int, manifest: Manifest | None) -> str:
-        """Return what is recorded of a content hash: all, its first digits, or none."""
-        if manifest is not None:
-            entry = manifest.entry(scenario)
-            if entry is not None:
-                return entry.content_sha256
-        return self._registered_hash(scenario)
-
-    def _registered_hash(self, scenario: int) -> str:
-        measured = self.size.measured
-        if measured is None:
-            return ""
-        return measured.scenario_sha256.get(scenario, "")
+        scenarios = self.size.subsets[self.subset]
+        check_contents(self.size, self.root, scenarios)
 
     def _hint(self) -> str:
         return suggest_repair(self.size, f"--subset {self.subset}", root=self.root)
-
-    def _hint_for_damage(self) -> str:
-        verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        place = quote_root(self.root)
-        return f"{self._hint()}; {verify} --root {place} says what is wrong"
 
     def open(self, scenario: int) -> ScenarioFile:
         """Open a scenario, and check that it is the one that the registry means.
@@ -176,7 +105,7 @@ class Truth:
             header.key.scenario,
         )
         expected_identity = (key.split, key.size, key.major, scenario)
-        expected_hash = self._registered_hash(scenario)
+        expected_hash = registered_hash(self.size, scenario)
         if identity == expected_identity and header.content_sha256.startswith(
             expected_hash
         ):

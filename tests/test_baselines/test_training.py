@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import h5py
 import netCDF4
 import numpy as np
 import pandas as pd
@@ -247,6 +249,20 @@ def test_training_draws_nothing_from_the_callers_generators(run: Run) -> None:
 
     expected = seed_and_draw(train_between=False)
     assert seed_and_draw(train_between=True) == expected
+
+
+@pytest.mark.parametrize("command", [("drift", "steps=2"), ("var",)])
+def test_a_changed_value_of_train_stops_the_training(
+    run: Run, generated: GenerationResult, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    """It is noticed before the first step, although the file states its old hash."""
+    shutil.copytree(generated.root, tmp_path / "data")
+    path = next((tmp_path / "data").glob("curl-noise/tiny/*/train/*.nc"))
+    with h5py.File(path, "r+") as file:
+        file["position"][1, 0, 0] += np.float32(1e-3)
+    with pytest.raises(DataError) as caught:
+        run(*command, root=tmp_path / "data")
+    assert str(path) in str(caught.value.where)
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) -> None:

@@ -751,6 +751,23 @@ def test_a_scenario_of_another_hash_is_refused(
     assert caught.value.where == str(path)
 
 
+def test_a_changed_value_is_noticed_where_asked(tmp_path: Path, train: Open) -> None:
+    """The file states its old hash; without the check its values are read as they are.
+
+    Files that were hashed are noted, and a change after that is noticed too.
+    """
+    folder = write_train(tmp_path)
+    assert len(train(tmp_path, verify=True)) == len(train(tmp_path))
+    path = folder / "0001.nc"
+    with h5py.File(path, "r+") as file:
+        file["position"][3, 2, 0] += np.float32(1e-3)
+    assert isinstance(train(tmp_path)[40], Window)
+    with pytest.raises(DataError) as caught:
+        train(tmp_path, verify=True)
+    assert str(path) in str(caught.value.where)
+    assert "lagbench generate" in str(caught.value.fix)
+
+
 def extrapolate(batch: Batch) -> torch.Tensor:
     """Move particles on as before, plus the walls' velocities of the next frame."""
     before, now = batch.position[:, -2:].unbind(1)

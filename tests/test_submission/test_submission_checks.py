@@ -30,6 +30,7 @@ from submission_data import (
     truth,
 )
 
+from lagbench.data import contents as module
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
@@ -37,7 +38,6 @@ from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 from lagbench.scoring.score import score
 from lagbench.submission import Severity, ValidationResult, template, validate
-from lagbench.submission import truth as module
 from lagbench.submission.checks import ScenarioScan, check_domain
 from lagbench.submission.issues import IssueCollector
 from lagbench.submission.truth import Truth
