@@ -1,0 +1,1 @@
+"""An attack on the readers of lagbench with seeded, mutated files."""

@@ -1,0 +1,175 @@
+"""Run a command of lagbench in a child process, with its time and memory measured."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import stat
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lagbench.data.layout import NOTES_NAME
+
+MOST_SECONDS = 60.0
+"""Longest time of a case [s]."""
+
+MOST_BYTES = 4 << 30
+"""Most memory of a case and of its child processes, each [bytes]."""
+
+DOCUMENTED_CODES = frozenset(range(6))
+"""Exit codes of lagbench; 130 and 141 are for interrupts and closed pipes."""
+
+MOST_HASHED_BYTES = 8 << 20
+"""Longer files count for the same while length and time of change stay [bytes]."""
+
+MARKER = "hostile"
+"""Begins the names of files that only code from a hostile file writes."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    code: int | None  # exit code; negative for a signal, None where it was killed
+    seconds: float
+    peak_bytes: int  # most memory of the process or one of its children
+    output: str
+    errors: str
+
+
+def run_command(arguments: Sequence[str], folder: Path, logs: Path) -> Outcome:
+    """Run ``lagbench ARGUMENTS`` in a folder, in a fork of this process.
+
+    Args:
+        arguments: words after the program's name.
+        folder: working folder of the command.
+        logs: folder for what the command prints.
+    """
+    started = time.monotonic()
+    process = os.fork()
+    if process == 0:
+        _become_command(arguments, folder, logs)
+    code: int | None = None
+    while True:
+        finished, status, usage = os.wait4(process, os.WNOHANG)
+        seconds = time.monotonic() - started
+        if finished:
+            code = os.waitstatus_to_exitcode(status)
+            break
+        if seconds > MOST_SECONDS:
+            os.killpg(process, signal.SIGKILL)
+            _, _, usage = os.wait4(process, 0)
+            break
+        time.sleep(0.02)
+    return Outcome(
+        code=code,
+        seconds=seconds,
+        peak_bytes=usage.ru_maxrss * 1024,
+        output=(logs / "stdout").read_text(errors="replace"),
+        errors=(logs / "stderr").read_text(errors="replace"),
+    )
+
+
+def _become_command(arguments: Sequence[str], folder: Path, logs: Path) -> None:
+    """Run a command in this process, a child, and end it."""
+    code = 99
+    try:
+        os.setsid()
+        os.chdir(folder)
+        for number, name in ((1, "stdout"), (2, "stderr")):
+            descriptor = os.open(logs / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(descriptor, number)
+        null_device = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(null_device, 0)
+        sys.argv = ["lagbench", *arguments]
+        from lagbench.__main__ import app
+
+        app(args=list(arguments), prog_name="lagbench")
+        code = 0
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def take_snapshot(folder: Path) -> dict[str, str]:
+    """Return what lies below a folder: a text for each path, links not followed."""
+    snapshot = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        status = path.lstat()
+        kind = stat.S_IFMT(status.st_mode)
+        text = str(kind)
+        if stat.S_ISREG(kind):
+            text += f" {status.st_size}"
+            if status.st_size <= MOST_HASHED_BYTES:
+                text += f" {hashlib.sha256(path.read_bytes()).hexdigest()}"
+            else:
+                text += f" {status.st_mtime_ns}"
+        snapshot[name] = text
+    return snapshot
+
+
+def find_failures(
+    outcome: Outcome, before: dict[str, str], after: dict[str, str]
+) -> list[str]:
+    """Return what is wrong with how a command ended, as kinds of failure.
+
+    Args:
+        outcome: how it ended.
+        before: what lay in the working folder before; see :func:`take_snapshot`.
+        after: what lay there after it.
+    """
+    failures = []
+    texts = f"{outcome.output}\n{outcome.errors}"
+    if "Traceback (most recent" in texts or "fault of lagbench" in texts:
+        failures.append("traceback")
+    if outcome.seconds > MOST_SECONDS:
+        failures.append("more than 60 s")
+    elif outcome.code not in DOCUMENTED_CODES:
+        failures.append("exit code")
+    elif outcome.code != 0 and not texts.strip():
+        failures.append("no message")
+    if outcome.peak_bytes > MOST_BYTES:
+        failures.append("more than 4 GB")
+
+    new_names = [name for name in after if name not in before]
+    changed_names = []
+    for name, text in before.items():
+        if after.get(name) != text:
+            changed_names.append(name)
+    if any(Path(name).name.startswith(MARKER) for name in new_names):
+        failures.append("code of a file was run")
+    if outcome.code == 0:
+        leftovers = [name for name in new_names if _is_temporary(name)]
+    else:
+        leftovers = [name for name in new_names if not _may_stay(name)]
+        leftovers += [name for name in changed_names if not _may_stay(name)]
+    if leftovers:
+        failures.append("half-written")
+    return failures
+
+
+def _may_stay(name: str) -> bool:
+    """Tell whether a file is a lock, or the notes of what was hashed."""
+    return _is_lock(name) or Path(name).name == NOTES_NAME
+
+
+def _is_lock(name: str) -> bool:
+    return Path(name).name == ".lock" or name.endswith(".lock")
+
+
+def _is_temporary(name: str) -> bool:
+    last = Path(name).name
+    if _may_stay(name):
+        return False
+    return last.startswith(".") or ".tmp" in last

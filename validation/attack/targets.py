@@ -1,0 +1,487 @@
+"""What is attacked: valid files, the mutations of each, and the commands that read it.
+
+The valid files are made by the shipped command line in a folder, once.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from lagbench.board.folder import (
+    GATES,
+    SCORES,
+    SEASONS,
+    SHIFT,
+    SUBMISSIONS,
+    VERIFIED,
+    WEIGHTS,
+)
+from lagbench.data.registry import load
+
+from .arrays import ARRAYS, write_gns, write_trajectories
+from .models import ONNX, write_straight_on
+from .models import WEIGHTS as WEIGHT_MUTATIONS
+from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
+from .running import run_command
+
+SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise", "fluid")
+"""Splits of which the root must hold ``tiny``."""
+
+COMMITTED_ENTRIES = ("gns", "hybrid-projection")
+"""Entries of the committed leaderboard, cavity mini, whose records are attacked."""
+
+PLACE = Path("cavity/mini")
+SEASON = "spring"
+RECIPE = """format: 1
+recipes:
+  curl-noise/tiny:
+    model: {scenarios: 2, frames: 5, evaluations: 5}
+    training: {seed: 0}
+"""
+DESCRIPTION = """title: A box
+licence: CC-BY-4.0
+bounds: [[0, 1], [0, 1]]
+periodic: [x, y]
+radius: 0.1
+frame_interval: 0.1
+full_box: true
+input_frames: 4
+cells: 8
+"""
+META = "name: Straight on\nauthors: [A. Author]\ncommand: make\n"
+
+Check = Callable[[Path, Path, str], str | None]
+"""From the valid folder, the attacked one and the output: what was accepted wrongly."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A valid file, what is done to it, and the commands that then read it."""
+
+    name: str  # kind of the table
+    source: str  # folder of the valid files that is copied
+    victim: str  # the file that is mutated, relative to the copy
+    mutations: Sequence[Mutation]
+    commands: Sequence[Sequence[str]]  # words after lagbench, run in the copy
+    weight: int = 1  # cases of this target in a round
+    # whether a file of other bytes must be refused
+    is_hashed: bool = False
+    check: Check | None = None  # what a success must fulfil
+
+
+# --- checks of what was accepted ------------------------------------------------------
+
+
+def find_wrong_score(valid: Path, attacked: Path, output: str) -> str | None:
+    """Tell whether predictions of another motion have the old scores."""
+    try:
+        new = _positions(attacked / "p.nc")
+        old = _positions(valid / "p.nc")
+    except (OSError, KeyError, TypeError):
+        return "predictions that cannot be read have scores"
+    scores = json.loads(output)
+    old_scores = json.loads((valid / "scores.json").read_text())
+    counted = _counted_frames(valid / "p.nc", old_scores["diverged_at"])
+    has_old_motion = new.shape == old.shape and bool(
+        np.all(_is_near(new, old)[counted])
+    )
+    has_old_scores = scores["metrics"] == old_scores["metrics"]
+    if has_old_scores and not has_old_motion:
+        return "a changed prediction has the old scores"
+    return None
+
+
+def _counted_frames(path: Path, diverged_at: dict[str, int]) -> NDArray[np.bool_]:
+    """Tell which frames count, shape [scenario, frame]: those before a blow-up."""
+    with h5py.File(path) as file:
+        frames = file["frame"][...]
+        scenarios = file["scenario"][...]
+    rows = []
+    for scenario in scenarios:
+        rows.append(frames < diverged_at.get(str(scenario), np.inf))
+    return np.stack(rows)
+
+
+def _is_near(new: NDArray[Any], old: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which positions are the same modulo the periods of the unit box."""
+    difference = new.astype(np.float64) - old
+    near: NDArray[np.bool_] = np.abs(difference - np.round(difference)) < 1e-7
+    return near
+
+
+def _positions(path: Path) -> NDArray[Any]:
+    with h5py.File(path) as file:
+        position: NDArray[Any] = file["position"][...]
+    return position
+
+
+def find_wrong_values(valid: Path, attacked: Path, output: str) -> str | None:
+    """Tell whether an adopted or imported split has positions outside its box."""
+    description = yaml.safe_load((attacked / "own/split.yaml").read_text())
+    bounds = np.array(description["splits"]["own"]["sizes"]["full"]["bounds"], float)
+    for path in sorted((attacked / "own").rglob("*.nc")):
+        with h5py.File(path) as file:
+            position = file["position"][...]
+        if not np.isfinite(position).all():
+            return "positions that are no numbers were accepted"
+        margin = 0.2
+        low = position >= bounds[:, 0] - margin
+        high = position <= bounds[:, 1] + margin
+        if not (low & high).all():
+            return "positions outside the box were accepted"
+    return None
+
+
+# --- valid files ----------------------------------------------------------------------
+
+
+def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
+    """Write the valid files of all targets; what is there already is kept.
+
+    Args:
+        folder: where they are written.
+        root: folder of all data sets, with ``tiny`` of all splits.
+        leaderboard: the committed leaderboard, of which some entries are copied.
+
+    Raises:
+        RuntimeError: a command refuses valid files.
+    """
+    if (folder / "complete").exists():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+
+    def run(*words: str, at: str = ".") -> str:
+        outcome = run_command(words, folder / at, folder)
+        if outcome.code != 0:
+            raise RuntimeError(f"{words}: {outcome.output}{outcome.errors}")
+        return outcome.output
+
+    for split in SPLITS:
+        run("generate", "--split", split, "--size", "tiny", "--root", str(root), "-q")
+
+    models = folder / "models"
+    models.mkdir()
+    write_straight_on(models / "model.onnx")
+    run(
+        *("train", "--baseline", "hybrid-projection", "--split", "curl-noise"),
+        *("--size", "tiny", "-o", "run", "--device", "cpu", "-q"),
+        at="models",
+    )
+    shutil.copy(models / "run/weights.pt", models / "weights.pt")
+    shutil.rmtree(models / "run")
+    (models / "recipe.yaml").write_text(RECIPE)
+
+    for split in ("decaying-vortices", "curl-noise-3d"):
+        (folder / split).mkdir()
+        run(
+            *("predict", "../models/model.onnx", "--split", split, "--size", "tiny"),
+            *("-o", "p.nc", "--method", "straight", "--no-bench", "-q"),
+            at=split,
+        )
+        scores = run("score", "p.nc", "-o", f"../scored-{split}", "--json", at=split)
+        (folder / split / "scores.json").write_text(scores)
+
+    _make_board(folder, run)
+    _copy_records(folder / "records", leaderboard)
+
+    for dimension in (2, 3):
+        write_trajectories(folder / f"arrays-{dimension}/runs", dimension)
+        write_gns(folder / f"gns-{dimension}/data", dimension)
+    (folder / "arrays-2/describe.yaml").write_text(DESCRIPTION)
+    _make_falling_split(folder, run)
+    for path in folder.glob("scored-*"):
+        shutil.rmtree(path)
+    (folder / "complete").touch()
+
+
+def _make_board(folder: Path, run: Callable[..., str]) -> None:
+    """Make a leaderboard of two entries with models, and a season of both."""
+    board = folder / "board"
+    board.mkdir()
+    (board / "meta.yaml").write_text(META)
+    shutil.copy(folder / "models/model.onnx", board / "model.onnx")
+    shutil.copy(folder / "decaying-vortices/p.nc", board / "p.nc")
+    run(
+        *("submit", "p.nc", "--from", "meta.yaml", "--weights", "model.onnx"),
+        *("--board", "b", "--new-board", "-q"),
+        at="board",
+    )
+    names = ("--board", "b", "-q")
+    close = ("season", "close", SEASON, "--scenarios", "4", *names)
+    run(*close, at="board")
+    run("generate", "--season", SEASON, *names, at="board")
+    run("season", "run", SEASON, *names, at="board")
+
+
+def _copy_records(folder: Path, leaderboard: Path) -> None:
+    """Copy some entries of the committed leaderboard with all their records."""
+    names = []
+    for method in COMMITTED_ENTRIES:
+        for room in (SUBMISSIONS, SCORES, WEIGHTS):
+            for path in (leaderboard / room / PLACE).glob(f"{method}[._]*"):
+                target = folder / "b" / path.relative_to(leaderboard)
+                copy_tree(path, target)
+        names.append(f"submissions/{PLACE}/{method}.yaml")
+    for record in (SHIFT, VERIFIED):
+        content = yaml.safe_load((leaderboard / record).read_text())
+        kept = {name: content[name] for name in names if name in content}
+        (folder / "b" / record).write_text(yaml.safe_dump(kept))
+    shutil.copy(leaderboard / GATES, folder / "b" / GATES)
+
+
+def _make_falling_split(folder: Path, run: Callable[..., str]) -> None:
+    """Adopt falling particles, whose naive predictors look up train."""
+    runs = folder / "analogs/runs"
+    runs.mkdir(parents=True)
+    rng = np.random.Generator(np.random.PCG64(5))
+    for number in range(6):
+        block = 0.1 + 0.2 * rng.random() + 0.3 * rng.random((100, 2))
+        frames = []
+        for frame in range(24):
+            fallen = block - [0, 2e-3 * frame**2]
+            frames.append(np.maximum(fallen, [0, 0.05]))
+        position = np.asarray(frames, np.float32)
+        np.savez(runs / f"{number}.npz", position=position)
+    run(
+        *("adopt", "runs", "-o", "own", "--radius", "0.1", "--frame-interval", "0.1"),
+        *("--bounds", "0,1,0,1", "-q"),
+        at="analogs",
+    )
+    run("template", "own/", "-o", "p.nc", "-q", at="analogs")
+    shutil.rmtree(runs)
+
+
+# --- targets --------------------------------------------------------------------------
+
+
+def list_targets(folder: Path) -> list[Target]:
+    """Return all targets; the valid files lie in a folder."""
+    predict_model = ("predict", "model.onnx", "--split", "decaying-vortices")
+    predict_weights = ("predict", "weights.pt", "-o", "p.nc", "--no-bench", "-q")
+    train = ("train", "--baseline", "hybrid-projection", "--split", "curl-noise")
+    targets = [
+        Target(
+            name="ONNX model",
+            source="models",
+            victim="model.onnx",
+            mutations=(*ONNX, *BYTES, *ONNX, *PLACES),
+            commands=[
+                (*predict_model, "--size", "tiny", "-o", "p.nc", "--no-bench", "-q")
+            ],
+            weight=20,
+        ),
+        Target(
+            name="hybrid-projection: weights",
+            source="models",
+            victim="weights.pt",
+            mutations=(*WEIGHT_MUTATIONS, *BYTES, *WEIGHT_MUTATIONS, *PLACES),
+            commands=[predict_weights],
+            weight=10,
+        ),
+        Target(
+            name="hybrid-projection: recipe",
+            source="models",
+            victim="recipe.yaml",
+            mutations=(*YAML, *BYTES, *YAML, *PLACES),
+            commands=[
+                (*train, "--size", "tiny", "--recipe", "recipe.yaml", "-o", "r", "-q")
+            ],
+            weight=6,
+        ),
+    ]
+    for split in ("decaying-vortices", "curl-noise-3d"):
+        target = Target(
+            name=f"predictions: {split}",
+            source=split,
+            victim="p.nc",
+            mutations=(*PREDICTIONS, *PREDICTIONS, *BYTES, *PLACES),
+            commands=[("score", "p.nc", "-o", "scores", "--json")],
+            weight=14,
+            check=find_wrong_score,
+        )
+        targets.append(target)
+    return [*targets, *_board_targets(folder), *_array_targets()]
+
+
+def _board_targets(folder: Path) -> list[Target]:
+    """Return the targets on leaderboards."""
+    board = ("--board", "b")
+    readers = [
+        ("leaderboard", "check", *board),
+        ("leaderboard", "show", "--json", *board),
+        ("leaderboard", "build", *board),
+    ]
+    season_readers = [
+        ("season", "show", SEASON, *board),
+        ("leaderboard", "check", *board),
+        ("season", "run", SEASON, "--check", *board, "-q"),
+    ]
+    season = f"b/{SEASONS}/{SEASON}"
+    vortices = "decaying-vortices/tiny/straight"
+    text_mutations = (*YAML, *YAML, *BYTES, *PLACES)
+    hashed_mutations = (*BYTES, *PLACES[:7])
+    submission = (
+        *("submit", "p.nc", "--from", "meta.yaml", "--weights", "model.onnx"),
+        *("--replace", *board, "-q"),
+    )
+    targets = [
+        Target(
+            name="season.yaml",
+            source="board",
+            victim=f"{season}/season.yaml",
+            mutations=text_mutations,
+            commands=season_readers,
+            weight=8,
+        ),
+        Target(
+            name="scores.yaml of a season",
+            source="board",
+            victim=f"{season}/scores.yaml",
+            mutations=text_mutations,
+            commands=season_readers,
+            weight=8,
+        ),
+        Target(
+            name="ONNX model on a board",
+            source="board",
+            victim=f"b/{WEIGHTS}/{vortices}_0.onnx",
+            mutations=hashed_mutations,
+            commands=[readers[0], ("leaderboard", "reproduce", "--all", *board, "-q")],
+            weight=4,
+            is_hashed=True,
+        ),
+        Target(
+            name="entry with a model",
+            source="board",
+            victim=f"b/{SUBMISSIONS}/{vortices}.yaml",
+            mutations=text_mutations,
+            commands=readers,
+            weight=6,
+        ),
+        Target(
+            name="lock of a board",
+            source="board",
+            victim="b/.lock",
+            mutations=(*PLACES, empty_and_locked),
+            commands=[submission, readers[2]],
+            weight=5,
+        ),
+    ]
+    records = (
+        (SHIFT, "shift record", 6),
+        (VERIFIED, "record of costs", 6),
+        (GATES, "record of gates", 5),
+    )
+    for victim, name, weight in records:
+        target = Target(
+            name=name,
+            source="records",
+            victim=f"b/{victim}",
+            mutations=text_mutations,
+            commands=readers,
+            weight=weight,
+        )
+        targets.append(target)
+    score_file = sorted((folder / f"records/b/{SCORES}" / PLACE).glob("*.nc"))[0]
+    target = Target(
+        name="score file",
+        source="records",
+        victim=score_file.relative_to(folder / "records").as_posix(),
+        mutations=hashed_mutations,
+        commands=[readers[0]],
+        weight=3,
+        is_hashed=True,
+    )
+    return [*targets, target]
+
+
+def empty_and_locked(path: Path, rng: np.random.Generator) -> None:
+    """Hold bytes that no lock holds."""
+    path.write_bytes(rng.bytes(100))
+
+
+def _array_targets() -> list[Target]:
+    """Return the targets that make or read local splits."""
+    size = load().size("decaying-vortices", "tiny")
+    frames = str(size.task.input_frames)
+    adopt = (
+        *("adopt", "runs", "-o", "own", "--radius", "0.1", "--frame-interval", "0.1"),
+        *("--input-frames", frames, "-q"),
+    )
+    boxes = {2: "0,1,0,1", 3: "0,1,0,1,0,1"}
+    axes = {2: "x,y", 3: "x,y,z"}
+    targets = []
+    for dimension in (2, 3):
+        periodic = ("--periodic", axes[dimension], "--bounds", boxes[dimension])
+        imported = ("import", "data", "--format", "gns-npz", "-o", "own")
+        targets += [
+            Target(
+                name=f"adopt --periodic, {dimension}-D",
+                source=f"arrays-{dimension}",
+                victim="runs/1.npz",
+                mutations=(*ARRAYS, *ARRAYS, *BYTES, *PLACES),
+                commands=[(*adopt, *periodic)],
+                weight=8,
+                check=find_wrong_values,
+            ),
+            Target(
+                name=f"import --periodic, {dimension}-D: metadata",
+                source=f"gns-{dimension}",
+                victim="data/metadata.json",
+                mutations=(*YAML, *YAML, *BYTES, *PLACES),
+                commands=[(*imported, "--input-frames", frames, "-q")],
+                weight=4,
+                check=find_wrong_values,
+            ),
+            Target(
+                name=f"import --periodic, {dimension}-D: arrays",
+                source=f"gns-{dimension}",
+                victim="data/train.npz",
+                mutations=(*BYTES, *PLACES),
+                commands=[(*imported, *periodic, "--input-frames", frames, "-q")],
+                weight=3,
+                check=find_wrong_values,
+            ),
+        ]
+    return [
+        *targets,
+        Target(
+            name="description of a Box",
+            source="arrays-2",
+            victim="describe.yaml",
+            mutations=(*YAML, *YAML, *BYTES, *PLACES),
+            commands=[("adopt", "runs", "-o", "own", "--describe", "describe.yaml")],
+            weight=6,
+            check=find_wrong_values,
+        ),
+        Target(
+            name="weighted-analogs: train",
+            source="analogs",
+            victim="own/full/v1/train/0000.nc",
+            mutations=(*BYTES, *PLACES),
+            commands=[
+                ("compare", "p.nc", "weighted-analogs", "--root", ".", "-q"),
+                ("score", "p.nc", "--split", "own/", "-o", "scores", "-q"),
+            ],
+            weight=4,
+        ),
+        Target(
+            name="split.yaml of a Box",
+            source="analogs",
+            victim="own/split.yaml",
+            mutations=(*YAML, *YAML, *BYTES, *PLACES),
+            commands=[("score", "p.nc", "--split", "own/", "-o", "scores", "-q")],
+            weight=5,
+        ),
+    ]
