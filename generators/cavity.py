@@ -1,18 +1,14 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
-Every moving wall follows a program of its own: knots with speeds drawn from [-U, U], of
-the other sign at each knot. Without the change of sign half of the walls would slide as
-before when it matters, and the frozen flow would do for an answer. Between two knots,
-at frames t0 and t1 with speeds a and b, the speed is
-
-    u(t) = a + (b - a) s^2 (3 - 2 s),    s = (t - t0) / (t1 - t0).
-
-One scenario in eight is the classic: lid at rest, then a constant speed. Expected
-behaviour: vortices grow from the moving walls, are cut off where a wall turns and
-merge; the flow never settles. Which walls move goes by id, so that every subset holds
-all six choices alike. Two walls that meet in a corner never move both, because their
-corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute speed of
-a wall, L the box's width.
+Every moving wall follows a program of its own (:mod:`.programs`): knots with speeds
+drawn from [-U, U], of the other sign at each knot. Without the change of sign half of
+the walls would slide as before when it matters, and the frozen flow would do for an
+answer. One scenario in eight is the classic: lid at rest, then a constant speed.
+Expected behaviour: vortices grow from the moving walls, are cut off where a wall turns
+and merge; the flow never settles. Which walls move goes by id, so that every subset
+holds all six choices alike. Two walls that meet in a corner never move both, because
+their corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute
+speed of a wall, L the box's width.
 
 The subset ``shift`` lies outside train on purpose. Its scenarios alternate: a Reynolds
 number beyond train's range, then two walls that meet in a corner. These slide as one
@@ -30,7 +26,8 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 
 from .constants import closed_box_walls, constants, interval, shift_number
-from .draws import RandomSource, choice, fill, log_uniform, quantise, uniform
+from .draws import RandomSource, choice, fill, log_uniform, uniform
+from .programs import draw_integer, draw_program
 from .split import ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:
@@ -69,33 +66,6 @@ def is_classic(scenario: int) -> bool:
     return (scenario + scenario // 24) % 8 == 7
 
 
-def _draw_integer(rng: RandomSource, low: float, high: float) -> int:
-    """Draw an integer, end points included."""
-    return int(low) + choice(rng, int(high) - int(low) + 1)
-
-
-def _draw_program(
-    rng: RandomSource, size: Size, frame_count: int
-) -> NDArray[np.float64]:
-    """Draw the speed of a wall towards each frame [length/s], shape [frame]."""
-    speed_max = size.value("speed_max")
-    knot_gap = interval(size, "knot_gap")
-    speed = np.empty(frame_count)
-    start = 0
-    start_speed = uniform(rng, -speed_max, speed_max)
-    while start < frame_count:
-        end = start + _draw_integer(rng, *knot_gap)
-        end_speed = uniform(rng, 0.0, speed_max)
-        if start_speed > 0.0:
-            end_speed = -end_speed
-        s = np.arange(min(end, frame_count) - start) / (end - start)
-        rise = s * s * (3.0 - 2.0 * s)
-        speed[start:end] = start_speed + (end_speed - start_speed) * rise
-        start = end
-        start_speed = end_speed
-    return quantise(speed)
-
-
 def _draw_motion(
     rng: RandomSource, size: Size, scenario: int, start: int
 ) -> NDArray[np.float64]:
@@ -105,6 +75,7 @@ def _draw_motion(
     """
     frame_count = start + size.frame_count(scenario)
     speed_max = size.value("speed_max")
+    knot_gap = interval(size, "knot_gap")
     velocity = np.zeros((frame_count, len(WALLS), 2))
 
     first_moving_frame = 0
@@ -113,11 +84,11 @@ def _draw_motion(
         # rest.
         earliest = start - size.value("lid_lead")
         latest = start + size.task.input_frames - 1
-        first_moving_frame = _draw_integer(rng, earliest, latest)
+        first_moving_frame = draw_integer(rng, earliest, latest)
 
     belt = _belt(size, scenario)
     if belt is not None:
-        speed = _draw_program(rng, size, frame_count)
+        speed = draw_program(rng, frame_count, amplitude=speed_max, knot_gap=knot_gap)
         for wall in belt:
             velocity[:, WALLS.index(wall), _TANGENT[wall]] = _TURN[wall] * speed
         return velocity
@@ -129,7 +100,9 @@ def _draw_motion(
             is_moving = np.arange(frame_count) >= first_moving_frame
             speed = np.where(is_moving, constant_speed, 0.0)
         else:
-            speed = _draw_program(rng, size, frame_count)
+            speed = draw_program(
+                rng, frame_count, amplitude=speed_max, knot_gap=knot_gap
+            )
         velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
     return velocity
 
@@ -150,7 +123,7 @@ def _driven_walls(size: Size, scenario: int) -> tuple[str, ...]:
 def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
     """Draw how many frames a scenario is simulated before frame 0; the first draw."""
     del scenario  # the same range for all
-    return _draw_integer(rng, *interval(size, "start_frame"))
+    return draw_integer(rng, *interval(size, "start_frame"))
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:

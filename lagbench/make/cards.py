@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Parameter, Size, Split, format_ids
 from lagbench.figures.tables import escape, markdown
@@ -39,6 +40,11 @@ NOTES: Mapping[str, str] = {
         "least 1 % of the "
         "greatest kinetic energy."
     ),
+    "poiseuille": (
+        "The force of all frames, those to be predicted included, is part of what is "
+        "given. `body_force` at frame f is what acts from frame f-1 to f: first on the "
+        "lower half, then on the upper one."
+    ),
     "curl-noise": (
         "Energy only decays: the higher the frequency, the faster. The equations have "
         "no viscosity, the grid "
@@ -46,28 +52,8 @@ NOTES: Mapping[str, str] = {
     ),
 }
 
-_WALLS = "closed box: what acts towards each frame; walls left, right, bottom, top"
-# variables of a file: name, dimensions, type, unit, meaning
-VARIABLES = (
-    (
-        "`position`",
-        "frame, particle, space",
-        "float32",
-        "length",
-        "particle positions in the unit box",
-    ),
-    (
-        "`velocity`",
-        "frame, particle, space",
-        "float32",
-        "length/s",
-        "particle velocities of the solver",
-    ),
-    ("`material`", "particle", "int8", "1", "0 liquid, 1 jelly, 2 snow, 3 rope"),
-    ("`particle_mass`", "", "float64", "density x area", "mass of one particle"),
-    ("`wall_velocity`", "frame, wall, space", "float32", "length/s", _WALLS),
-    ("`time`", "frame", "float64", "s", "time since frame 0"),
-)
+FORCE_PARAMETER = "force_max"
+"""Parameter of the splits that a body force drives."""
 
 
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
@@ -142,7 +128,7 @@ def dataset_card(
     parts += ["## Reading", *_reading_section(size)]
     parts += ["## Task", _task_table(size, manifest)]
     if manifest.statistics:
-        parts += _statistics_section(manifest)
+        parts += _statistics_section(size, manifest)
     parts += _soundness_section(manifest)
     parts += ["## Parameters", _parameter_table(size)]
     parts += ["## Regenerate and verify", *_verification_section(size, manifest)]
@@ -203,6 +189,7 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         ("frame interval", f"{size.frame_interval:.6g} s"),
         ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
         ("box", " x ".join(sides)),
+        ("periodic axes", ", ".join(size.periodic) or "none"),
         ("bytes", byte_count),
     ]
     return markdown(("", ""), rows)
@@ -242,8 +229,38 @@ def _reading_section(size: Size) -> list[str]:
         'position = data["position"]  # (scenario, frame, particle, space), read when '
         "computed\n"
         "```",
-        markdown(("variable", "dimensions", "type", "unit", "meaning"), VARIABLES),
+        markdown(
+            ("variable", "dimensions", "type", "unit", "meaning"), _variables(size)
+        ),
     ]
+
+
+def _variables(size: Size) -> list[tuple[str, str, str, str, str]]:
+    """Return name, dimensions, type, unit and meaning of the variables of a file."""
+    vectors = "frame, particle, space"
+    meaning = "particle positions in the unit box"
+    if size.periodic:
+        meaning += ", wrapped along periodic axes"
+    rows = [("`position`", vectors, "float32", "length", meaning)]
+    if size.stores_velocity:
+        meaning = "particle velocities of the solver"
+        rows.append(("`velocity`", vectors, "float32", "length/s", meaning))
+    rows.append(
+        ("`material`", "particle", "int8", "1", "0 liquid, 1 jelly, 2 snow, 3 rope")
+    )
+    mass = "density x volume" if size.dimension == 3 else "density x area"
+    rows.append(("`particle_mass`", "", "float64", mass, "mass of one particle"))
+    if size.box.walls:
+        names = ", ".join(WALL_NAMES[: 2 * size.dimension])
+        meaning = f"closed box: what acts towards each frame; walls {names}"
+        motion = ("`wall_velocity`", "frame, wall, space", "float32", "length/s")
+        rows.append((*motion, meaning))
+    if FORCE_PARAMETER in size.parameters:
+        meaning = "acceleration towards each frame, in layers along y, lowest first"
+        force = ("`body_force`", "frame, layer, space", "float32", "length/s^2")
+        rows.append((*force, meaning))
+    rows.append(("`time`", "frame", "float64", "s", "time since frame 0"))
+    return rows
 
 
 def _task_table(size: Size, manifest: Manifest) -> str:
@@ -270,7 +287,7 @@ def _task_table(size: Size, manifest: Manifest) -> str:
     return markdown(("", ""), rows)
 
 
-def _statistics_section(manifest: Manifest) -> list[str]:
+def _statistics_section(size: Size, manifest: Manifest) -> list[str]:
     rows = []
     for name, row in manifest.statistics.items():
         rows.append((name.replace("_", " "), *row))
@@ -278,7 +295,7 @@ def _statistics_section(manifest: Manifest) -> list[str]:
         "## Statistics of train",
         "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its "
         "difference.",
-        markdown(("", "x", "y"), rows),
+        markdown(("", *AXES[: size.dimension]), rows),
     ]
 
 

@@ -240,6 +240,32 @@ def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("split", "variables", "axes"),
+    [
+        ("cavity", {"velocity", "wall_velocity"}, "none"),
+        ("poiseuille", {"velocity", "body_force"}, "x, y"),
+        ("curl-noise-3d", set(), "x, y, z"),
+    ],
+)
+def test_a_card_lists_the_variables_of_its_files(
+    split: str, variables: set[str], axes: str
+) -> None:
+    """What drives the flow, and velocities where they are stored; one column of the
+    statistics for each axis.
+    """
+    size = registry.load().size(split, "tiny")
+    measured = size.measured
+    assert measured is not None
+    manifest = Manifest(split=split, size="tiny", version=size.version)
+    text = card(size, manifest, statistics=measured.statistics)
+    for name in ("velocity", "wall_velocity", "body_force"):
+        assert (f"| `{name}` |" in text) == (name in variables)
+    assert f"| periodic axes | {axes} |" in text
+    header = "|  | " + " | ".join("xyz"[: size.dimension]) + " |"
+    assert header in text
+
+
 def test_the_twin_floor_is_the_mean_over_test(tmp_path: Path) -> None:
     """Two twins that drift to 2e-3 and 4e-3 have a floor of 3e-3 at the last frame."""
     size, manifest = make(tmp_path, scenarios=(3, 4))

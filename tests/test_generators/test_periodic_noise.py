@@ -15,7 +15,7 @@ from lagbench.generators.periodic_noise import Flow, Smooth
 
 Array = NDArray[np.float64]
 STEP = 1e-5
-PERIODIC = ("decaying-vortices", "curl-noise-3d")
+PERIODIC = ("decaying-vortices", "poiseuille", "curl-noise-3d")
 
 
 def slopes(function: Callable[[Array], Array], points: Array) -> Array:

@@ -1,0 +1,93 @@
+"""Reverse Poiseuille flow: a periodic square with halves that are driven apart.
+
+The fluid below the middle, y < 1/2, is accelerated by f(t) along x, the fluid above it
+by -f(t). A constant f would end in a parabola in each half, of height H = 1/2,
+
+    u(y) = f y (H - y) / (2 nu),    0 <= y <= H,
+
+with the speed f H^2 / (8 nu) in its middle (Backer et al., J. Chem. Phys. 122 (2005)
+154503). Here f follows a smooth random program (:mod:`.programs`), so that the flow
+never settles, and eddies are added at the start: gradient noise on a wrapped lattice,
+as in :mod:`.decaying_vortices`. The force of all frames is given to predictors.
+
+Expected behaviour: the parallel flow follows the force with a lag; viscosity smooths
+its kinks at y = 0 and y = 1/2. It shears the eddies, and feeds them where its profile
+has inflections. The total momentum stays zero. The Reynolds number is U L / nu, with U
+the drawn speed of the eddies and L = 1.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .constants import constants, interval
+from .decaying_vortices import kinetic_energy, particles_per_side
+from .draws import RandomSource, log_uniform, uniform
+from .full_box_parameters import FullBoxParameters
+from .periodic_noise import draw_lattice, fill_box, noise, rotated_gradient, scaled_to
+from .programs import draw_integer, draw_program
+from .split import InitialState, Material
+
+if TYPE_CHECKING:
+    from lagbench.data.registry import Size
+
+__all__ = ["initial_state", "solver_parameters", "start_frame"]
+
+
+def solver_parameters(size: Size) -> FullBoxParameters:
+    """Return the solver's constants at this size: two layers of a body force."""
+    return constants(
+        FullBoxParameters, size, box=size.box, no_slip=False, force_layers=2
+    )
+
+
+def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
+    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
+    del scenario  # the same range for all
+    return draw_integer(rng, *interval(size, "start_frame"))
+
+
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw eddies, and the force that drives the halves through all frames."""
+    start = start_frame(size, scenario, rng)
+    program = draw_program(
+        rng,
+        start + size.frame_count(scenario),
+        amplitude=size.value("force_max"),
+        knot_gap=interval(size, "knot_gap"),
+    )
+    # acceleration of both layers towards each frame, shape [frame, layer, axis]
+    body_force = np.zeros((len(program), 2, 2))
+    body_force[:, 0, 0] = program
+    body_force[:, 1, 0] = -program
+
+    side = particles_per_side(size)
+    box = size.box
+    position = fill_box(
+        rng, (side, side), low=box.low, high=box.high, jitter=size.value("jitter")
+    )
+    frequency = size.value("frequency_min") + scenario % size.value("frequency_count")
+    psi = noise(position, draw_lattice(rng, frequency, 2))
+    speed = uniform(rng, *interval(size, "speed"))
+    flow = scaled_to(rotated_gradient(psi), speed)
+    reynolds = log_uniform(rng, *interval(size, "reynolds"))
+    viscosity = speed / reynolds
+    return InitialState(
+        position=position,
+        velocity=flow.velocity,
+        affine=flow.affine,
+        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        area=box.volume,
+        viscosity=viscosity,
+        body_force=body_force,
+        start_frame=start,
+        parameters={
+            "frequency": frequency,
+            "speed_rms": speed,
+            "reynolds": reynolds,
+            "viscosity": viscosity,
+            "initial_kinetic_energy": kinetic_energy(flow),
+        },
+    )
