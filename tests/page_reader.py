@@ -32,8 +32,18 @@ def read_page_data(page: str) -> PageData:
     """Return the data that stand in a page."""
     data = json.loads(decode(element_text(page, "page-data"), longest=LONGEST))
     arrays = decode(element_text(page, "page-arrays"), longest=LONGEST)
-    levels = np.frombuffer(arrays, "<i2")
+    levels = read_levels(arrays)
     return PageData(tabs=data["tabs"], hero=data["hero"], levels=levels)
+
+
+def read_levels(data: bytes) -> NDArray[np.int16]:
+    """Return the stored differences, number by number."""
+    count = len(data) // 2
+    levels = np.empty(count, np.int16)
+    for place in range(count):
+        folded = data[place] + 256 * data[count + place]
+        levels[place] = -(folded + 1) // 2 if folded % 2 else folded // 2
+    return levels
 
 
 def element_text(page: str, name: str) -> str:

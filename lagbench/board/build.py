@@ -434,6 +434,7 @@ def _make_tab(
 ) -> Tab:
     ranking = methods[0].ranking
     shift_references = _references_on_shift(size, ranking)
+    solver_time = solver_seconds(size)
     variants = _find_variants(methods)
     ranked = {}
     for method in methods:
@@ -455,6 +456,7 @@ def _make_tab(
             variant_of=variants.get(method.method),
             verified=verification_of(method.entry, verified),
             references=references,
+            solver_time=solver_time,
         )
         failed = gates_failed_by(method.entry, failed_gates)
         on_shift = _method_on_shift(method, size, shift, shift_references)
@@ -471,7 +473,9 @@ def _make_tab(
     scenarios = tuple(sorted(size.subsets["test"]))
     reference_rows = []
     for reference in references:
-        reference_row = _make_reference(reference, size, ranking, scope)
+        reference_row = _make_reference(
+            reference, size, ranking, scope, solver_time=solver_time
+        )
         shift_score = shift_references.get(reference.name)
         if shift_score is not None:
             on_shift = _on_shift([shift_score], shift_references)
@@ -491,7 +495,7 @@ def _make_tab(
         truth=truth.pictures,
         rows=tuple(rows),
         references=tuple(reference_rows),
-        solver_seconds=solver_seconds(size),
+        solver_seconds=solver_time,
     )
 
 
@@ -511,8 +515,9 @@ def _make_row(
     variant_of: str | None,
     verified: Verification | None,
     references: Sequence[ReferenceScores],
+    solver_time: float | None,
 ) -> BoardRow:
-    against = _against_classical(method, size, references, verified)
+    against = _against_classical(method, references, verified, solver_time=solver_time)
     rank = None
     is_tied = False
     p = math.nan
@@ -558,9 +563,10 @@ def _skill_of(
 
 def _against_classical(
     method: ScoredMethod,
-    size: Size,
     references: Sequence[ReferenceScores],
     verified: Verification | None,
+    *,
+    solver_time: float | None,
 ) -> AgainstClassical | None:
     """Return the score over that of the best classical solver that costs no more.
 
@@ -584,7 +590,7 @@ def _against_classical(
         seconds = seconds_where_measured(
             seconds_per_frame=method.entry.cost.seconds_per_frame,
             solver_seconds=method.entry.cost.solver_seconds_per_frame,
-            solver_seconds_here=solver_seconds(size),
+            solver_seconds_here=solver_time,
         )
     if seconds is None:
         return None
@@ -662,7 +668,12 @@ def _value_of_ratio(ratio: Skill | AgainstClassical | None) -> Value | None:
 
 
 def _make_reference(
-    reference: ReferenceScores, size: Size, ranking: str, scope: Scope
+    reference: ReferenceScores,
+    size: Size,
+    ranking: str,
+    scope: Scope,
+    *,
+    solver_time: float | None,
 ) -> ReferenceRow:
     description = REFERENCES[reference.name]
     values = {}
@@ -686,7 +697,7 @@ def _make_reference(
         cost = EntryCost.model_construct(
             seconds_per_frame=reference.seconds_per_frame,
             device="one core, where the reference predictors were measured",
-            solver_seconds_per_frame=solver_seconds(size),
+            solver_seconds_per_frame=solver_time,
         )
     return ReferenceRow(
         name=reference.name,

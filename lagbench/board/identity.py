@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import hashlib
 import unicodedata
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Tally
-from lagbench.metrics.metric import Direction, Metric
+from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
 
 from .entry import Entry
 from .folder import Folder
+from .model import Floats
 
 # share of the greatest value by which rounding may take one below zero, or above one
 ROUNDING = 1e-6
@@ -73,41 +73,65 @@ def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
     the truth.
     """
     for scenario, tally in sorted(stored.scores.tallies.items()):
-        zero_errors = []
-        has_error = False
-        for name in tally.names:
-            series = tally.series(name)
-            defined = series[~np.isnan(series)]
-            if name not in METRICS or not defined.size:
-                continue
-            outlier = _value_out_of_range(METRICS[name], defined)
-            if outlier is not None:
-                yield f"{name} {outlier:.6g} in scenario {scenario}"
-            if name.endswith(("_mse", "_mae")):
-                if np.any(defined != 0.0):
-                    has_error = True
-                else:
-                    zero_errors.append(name)
-        if has_error:
-            for name in zero_errors:
-                yield (
-                    f"{name} 0 at all frames of scenario {scenario}, though the "
-                    "prediction is not the truth"
-                )
+        names = [name for name in tally.names if name in METRICS]
+        if not names:
+            continue
+        values = np.stack([tally.series(name) for name in names])
+        for name, outlier in _values_out_of_range(names, values):
+            yield f"{name} {outlier:.6g} in scenario {scenario}"
+        for name in _false_zeros(names, values):
+            yield (
+                f"{name} 0 at all frames of scenario {scenario}, though the "
+                "prediction is not the truth"
+            )
 
 
-def _value_out_of_range(metric: Metric, values: NDArray[np.floating]) -> float | None:
-    """Return a value below the perfect 0 or above the perfect 1; None without any."""
-    margin = ROUNDING * np.abs(values).max()
-    lowest = float(values.min())
-    highest = float(values.max())
-    is_error = metric.direction is Direction.LOWER and metric.perfect == 0.0
-    is_correlation = metric.direction is Direction.HIGHER and metric.perfect == 1.0
-    if is_error and lowest < -margin:
-        return lowest
-    if is_correlation and highest > 1.0 + margin:
-        return highest
-    return None
+def _values_out_of_range(
+    names: Sequence[str], values: Floats
+) -> Iterator[tuple[str, float]]:
+    """Yield metrics with a value below the perfect 0 or above the perfect 1.
+
+    Args:
+        names: the metrics.
+        values: NaN where undefined, shape [metric, frame].
+    """
+    is_defined = ~np.isnan(values)
+    lowest = np.min(values, axis=1, where=is_defined, initial=np.inf)
+    highest = np.max(values, axis=1, where=is_defined, initial=-np.inf)
+    # metrics without any value stay within both bounds
+    margin = ROUNDING * np.maximum(np.abs(lowest), np.abs(highest))
+    is_below = lowest < -margin
+    is_above = highest > 1.0 + margin
+    for i in np.flatnonzero(is_below | is_above).tolist():
+        metric = METRICS[names[i]]
+        is_error = metric.direction is Direction.LOWER and metric.perfect == 0.0
+        is_correlation = metric.direction is Direction.HIGHER and metric.perfect == 1.0
+        if is_error and is_below[i]:
+            yield names[i], float(lowest[i])
+        elif is_correlation and is_above[i]:
+            yield names[i], float(highest[i])
+
+
+def _false_zeros(names: Sequence[str], values: Floats) -> list[str]:
+    """Return errors that are 0 at all frames where another error is not.
+
+    Args:
+        names: the metrics.
+        values: NaN where undefined, shape [metric, frame].
+    """
+    is_defined = ~np.isnan(values)
+    has_value = np.asarray(is_defined.any(axis=1))
+    has_error = np.asarray(((values != 0.0) & is_defined).any(axis=1))
+    zero_errors = []
+    is_truth = True
+    for i, name in enumerate(names):
+        if not name.endswith(("_mse", "_mae")) or not has_value[i]:
+            continue
+        if has_error[i]:
+            is_truth = False
+        else:
+            zero_errors.append(name)
+    return [] if is_truth else zero_errors
 
 
 LOOKALIKES = str.maketrans(

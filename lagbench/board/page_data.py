@@ -22,7 +22,16 @@ from lagbench.figures.html import MISSING, text, words
 from .columns import describe_check, format_ranks
 from .encoding import ArrayStore
 from .entry import Entry
-from .model import BoardRow, Curve, Histogram, Pictures, ReferenceRow, Tab, Value
+from .model import (
+    BoardRow,
+    Curve,
+    Floats,
+    Histogram,
+    Pictures,
+    ReferenceRow,
+    Tab,
+    Value,
+)
 from .sampling import spaced
 from .table_view import Line, TableView, describe_verification, target_loss
 
@@ -30,7 +39,9 @@ FILM_FRAMES = 20  # most frames of a film
 FILM_PARTICLES = 80  # most particles of a film
 CURVE_LEVELS = 2000  # steps of a curve: six to a pixel
 MAP_LEVELS = 500  # steps of a vorticity map: more than a colour has
-FILM_LEVELS = 2000  # steps across a film: four to a pixel
+FILM_LEVELS = 1000  # steps across a film: two to a pixel
+HISTOGRAM_LEVELS = 500  # steps of a histogram: two to a pixel
+SHOWN_DIGITS = 3  # of the values at frames of interest
 
 # Values of maps are cut off at so many times the truth's greatest: an explosion would
 # leave nothing of the others.
@@ -66,7 +77,9 @@ def page_data(
     data = {"colours": COLOURS, "hero": None, "tabs": tabs}
     if hero is not None:
         data["hero"] = _hero(*hero, arrays)
-    encoded = json.dumps(data, ensure_ascii=True, allow_nan=False)
+    encoded = json.dumps(
+        data, ensure_ascii=True, allow_nan=False, separators=(",", ":")
+    )
     return encoded.encode(), arrays.to_bytes()
 
 
@@ -126,7 +139,7 @@ class _TabWriter:
             "columns": list(self._columns()),
             "presets": self._view.presets,
             "curves": curves,
-            "energy": self._curve(tab.energy),
+            "energy": self._mean_curve(tab.energy),
             "truth": self._pictures(tab.truth),
             "references": references,
             "rows": rows,
@@ -145,11 +158,14 @@ class _TabWriter:
     def _reference(self, line: Line, row: ReferenceRow) -> Plain:
         energy = None
         if row.energy is not None:
-            energy = self._curve(row.energy)
+            energy = self._mean_curve(row.energy)
+        curves = {}
+        for name, curve in row.curves.items():
+            curves[name] = self._mean_curve(curve)
         return {
             **self._line(line),
             "status": "reference",
-            "curves": self._curves(row.curves),
+            "curves": curves,
             "energy": energy,
             "spread": self._spread(row.values),
         }
@@ -242,7 +258,7 @@ class _TabWriter:
             by_frame = values[name].at
             numbers = []
             for frame in self._tab.marked:
-                numbers.append(plain_number(by_frame.get(frame, math.nan)))
+                numbers.append(_as_shown(by_frame.get(frame, math.nan)))
             at[name] = numbers
         return at
 
@@ -250,8 +266,15 @@ class _TabWriter:
         return {name: self._curve(curve) for name, curve in curves.items()}
 
     def _curve(self, curve: Curve) -> Plain:
-        # shape [frame, 3]
         values = np.stack([curve.mean, curve.low, curve.high], axis=1)
+        return self._points(curve, values)
+
+    def _mean_curve(self, curve: Curve) -> Plain:
+        """Return a curve that is drawn without its band."""
+        return self._points(curve, curve.mean[:, None])
+
+    def _points(self, curve: Curve, values: Floats) -> Plain:
+        """Return frames and values of shape [frame, 1 or 3]."""
         return {
             "frames": self._arrays.add_whole(curve.frames),
             "values": self._arrays.add(
@@ -263,7 +286,7 @@ class _TabWriter:
         return {
             "low": round_digits(histogram.low, 6),
             "high": round_digits(histogram.high, 6),
-            "shares": self._arrays.add(histogram.shares),
+            "shares": self._arrays.add(histogram.shares, levels=HISTOGRAM_LEVELS),
         }
 
     def _pictures(self, pictures: Pictures | None) -> Plain | None:
@@ -309,6 +332,21 @@ def plain_number(value: float | str) -> float | str | None:
     if math.isinf(value):
         return "Infinity" if value > 0 else "-Infinity"
     return round_digits(value)
+
+
+def _as_shown(value: float) -> float | str | None:
+    """Return a number with the digits that the page shows.
+
+    The page shows whole numbers without a fraction, so no other number becomes one.
+
+    >>> _as_shown(0.123456), _as_shown(0.99999), _as_shown(12345.0)
+    (0.123, 0.99999, 12345.0)
+    """
+    if math.isfinite(value):
+        shown = round_digits(value, SHOWN_DIGITS)
+        if not shown.is_integer():
+            return shown
+    return plain_number(value)
 
 
 def _search_text(line: Line, entry: Entry) -> str:

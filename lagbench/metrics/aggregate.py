@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
-from .metric import Metric, mean
+from .metric import Metric, identity, mean
 
 LARGEST = float(np.finfo(np.float32).max)
 
@@ -260,21 +260,21 @@ class Resampling:
         lower = (1.0 - LEVEL) / 2.0
         normal = NormalDist().inv_cdf(upper)
         stretch = student_quantile(self.freedom, upper) / normal
-        ordered = np.sort(self.deviations)
-        low = quantile(ordered, lower)
-        high = quantile(ordered, upper)
+        low = quantile(self.deviations, lower)
+        high = quantile(self.deviations, upper)
         return (self.mean + stretch * low, self.mean + stretch * high)
 
 
-def quantile(ordered: Floats, share: float) -> float:
-    """Return a quantile of ascending values, linear between two of them.
+def quantile(values: Floats, share: float) -> float:
+    """Return a quantile of values, linear between two of them.
 
     Its bits are those of ``np.quantile``, which takes several times as long on the few
     thousand draws of a bootstrap.
     """
-    place = share * (len(ordered) - 1)
-    below = min(int(place), len(ordered) - 2)
+    place = share * (len(values) - 1)
+    below = min(int(place), len(values) - 2)
     part = place - below
+    ordered = np.partition(values, (below, below + 1))
     low, high = ordered[below : below + 2].tolist()
     gap = high - low
     if part < 0.5:
@@ -423,21 +423,44 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
 
     None where it was measured nowhere or the task is too short.
     """
-    if not tallies:
-        return None
-    scenarios = tuple(sorted(tallies))
-    frames = tallies[scenarios[0]].frames
+    return aggregate([metric], tallies).get(metric.name)
 
-    rows = []
-    for i in scenarios:
-        measured = [tallies[i].measured(name) for name in metric.of]
-        rows.append(np.all(measured, axis=0))
-    is_measured = np.array(rows)  # shape [scenario, frame]
-    if metric.horizon > len(frames) or not is_measured.any():
-        return None
 
+class _SeriesByStatistic:
+    """The statistics of some scenarios, each of shape [scenario, frame]."""
+
+    def __init__(self, tallies: Mapping[int, Tally]) -> None:
+        self.scenarios = tuple(sorted(tallies))
+        self._tallies = [tallies[i] for i in self.scenarios]
+        self.frames = self._tallies[0].frames
+        self._values: dict[str, Floats] = {}
+        self._measured: dict[str, NDArray[np.bool_]] = {}
+
+    def values(self, name: str) -> Floats:
+        """Return a statistic, NaN without a value."""
+        if name not in self._values:
+            rows = [tally.series(name) for tally in self._tallies]
+            self._values[name] = np.stack(rows)
+        return self._values[name]
+
+    def measured(self, name: str) -> NDArray[np.bool_]:
+        """Return where a statistic was measured."""
+        if name not in self._measured:
+            rows = [tally.measured(name) for tally in self._tallies]
+            self._measured[name] = np.stack(rows)
+        return self._measured[name]
+
+
+def _score(metric: Metric, statistics: _SeriesByStatistic) -> Score | None:
+    """Return the score of one metric.
+
+    None where it was measured nowhere or the task is too short.
+    """
+    is_measured = np.all([statistics.measured(name) for name in metric.of], axis=0)
+    if metric.horizon > len(statistics.frames) or not is_measured.any():
+        return None
     try:
-        series = _series(metric, [tallies[i] for i in scenarios])
+        series = _series(metric, statistics)
         values = _over_frames(metric, series)
     except (Exception, SystemExit) as error:
         metric.raise_named(error, "over all frames")
@@ -445,28 +468,35 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
     undefined = np.count_nonzero(is_measured & np.isnan(series), axis=1)
     return Score(
         metric=metric,
-        scenarios=scenarios,
-        frames=frames,
+        scenarios=statistics.scenarios,
+        frames=statistics.frames,
         per_frame=series,
         values=values,
         undefined=tuple(undefined.tolist()),
     )
 
 
-def _series(metric: Metric, tallies: Sequence[Tally]) -> Floats:
+def _series(metric: Metric, statistics: _SeriesByStatistic) -> Floats:
     """Return the value of a metric per frame, shape [scenario, frame]."""
+    parts = [statistics.values(name) for name in metric.of]
+    if metric.series is identity:
+        return parts[0]
     rows = []
-    for scenario in tallies:
-        statistics = [scenario.series(name) for name in metric.of]
-        rows.append(np.asarray(metric.series(*statistics), np.float64))
+    for row_of_parts in zip(*parts, strict=True):
+        rows.append(np.asarray(metric.series(*row_of_parts), np.float64))
     return np.stack(rows)
 
 
 def _over_frames(metric: Metric, series: Floats) -> Floats:
     """Return the value of a metric over the horizon, shape [scenario]."""
-    if metric.over_frames is mean and not np.isnan(series).any():
-        # all rows at once, to the same bits
-        return np.asarray(series.mean(axis=1))
+    if metric.over_frames is mean:
+        is_defined = ~np.isnan(series)
+        # metrics that are measured at every tenth frame have the same gaps in all rows
+        has_same_gaps = bool((is_defined == is_defined[0]).all())
+        if has_same_gaps and is_defined[0].any():
+            # all rows at once, to the same bits
+            defined = np.compress(is_defined[0], series, axis=1)
+            return np.asarray(defined.mean(axis=1))
     return np.array([metric.over_frames(row) for row in series])
 
 
@@ -474,9 +504,12 @@ def aggregate(
     metrics: Iterable[Metric], tallies: Mapping[int, Tally]
 ) -> dict[str, Score]:
     """Return the scores of all metrics that this split and size have, by name."""
-    scores = {}
+    scores: dict[str, Score] = {}
+    if not tallies:
+        return scores
+    statistics = _SeriesByStatistic(tallies)
     for metric in metrics:
-        metric_score = score(metric, tallies)
+        metric_score = _score(metric, statistics)
         if metric_score is not None:
             scores[metric.name] = metric_score
     return scores

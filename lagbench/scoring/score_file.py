@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.variables import open_netcdf
+from lagbench.data.hdf5 import open_hdf5, read_attribute
+from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
@@ -76,54 +77,67 @@ def read_statistics(path: Path) -> SubmissionStatistics:
         UnreadableFileError: it is no scores.nc.
     """
     try:
-        with open_netcdf(path) as file:
-            file.set_auto_maskandscale(False)
-            if file.lagbench_scores != FORMAT:
-                raise ValueError(f"layout {file.lagbench_scores!r}, not {FORMAT}")
-            reference, reference_values = _read_reference(file)
-            return SubmissionStatistics(
-                identity={name: _read_text(file, name) for name in IDENTITY},
-                predictions_sha256=_read_text(file, "predictions_sha256"),
-                ranking=_read_text(file, "ranking_metric"),
-                tallies=_read_tallies(file),
-                best_reference=reference,
-                best_reference_values=reference_values,
-            )
+        with open_hdf5(path) as file:
+            return statistics_in(file)
+    except UnreadableFileError:
+        raise
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
 
 
-def _read_text(file: Any, name: str) -> str:  # noqa: ANN401
-    text = file.getncattr(name)
+def statistics_in(file: h5py.File) -> SubmissionStatistics:
+    """Return the statistics of an open scores.nc.
+
+    Damaged bytes raise nearly any type.
+
+    Raises:
+        ValueError: it is no scores.nc.
+    """
+    layout = read_attribute(file, "lagbench_scores")
+    if layout != FORMAT:
+        raise ValueError(f"layout {layout!r}, not {FORMAT}")
+    reference, reference_values = _read_reference(file)
+    return SubmissionStatistics(
+        identity={name: _read_text(file, name) for name in IDENTITY},
+        predictions_sha256=_read_text(file, "predictions_sha256"),
+        ranking=_read_text(file, "ranking_metric"),
+        tallies=_read_tallies(file),
+        best_reference=reference,
+        best_reference_values=reference_values,
+    )
+
+
+def _read_text(file: h5py.File, name: str) -> str:
+    text = read_attribute(file, name)
     if not isinstance(text, str):
         raise ValueError(f"{name} is no text")
     return require_name(text)
 
 
-def _read_reference(file: Any) -> tuple[str | None, NDArray[np.float64]]:  # noqa: ANN401
+def _read_reference(file: h5py.File) -> tuple[str | None, NDArray[np.float64]]:
     """Return name and values of the best reference; None where the file has none."""
-    if "best_floor" not in file.ncattrs():
+    name = read_attribute(file, "best_floor")
+    if name is None:
         return None, np.empty(0)
-    name = file.getncattr("best_floor")
-    values = np.asarray(file["best_floor_value"][:], np.float64)
-    has_right_shape = values.shape == (len(file["scenario"]),)
+    values = np.asarray(file["best_floor_value"][...], np.float64)
+    has_right_shape = values.shape == file["scenario"].shape
     if name not in NAIVE or not has_right_shape or np.isinf(values).any():
         raise ValueError("not the scores of a reference")
-    return name, values
+    return str(name), values
 
 
-def _read_tallies(file: Any) -> dict[int, Tally]:  # noqa: ANN401
+def _read_tallies(file: h5py.File) -> dict[int, Tally]:
     """Return the statistics of each scenario."""
-    names = tuple(str(file.statistics).split())
-    frames = tuple(file["frame"][:].tolist())
-    scenarios = file["scenario"][:].tolist()
-    values = file["value"][:].astype(np.float64)
-    measured = file["measured"][:]
+    names = tuple(str(read_attribute(file, "statistics")).split())
+    frames = tuple(file["frame"][...].tolist())
+    scenarios = file["scenario"][...].tolist()
+    # shape [statistic, scenario, frame]
+    values = file["value"][...].astype(np.float64)
+    is_measured = file["measured"][...] != 0  # of the same shape
 
     tallies = {}
     for i, scenario in enumerate(scenarios):
-        is_measured = measured[:, i] != 0
-        tallies[scenario] = _make_tally(names, frames, values[:, i], is_measured)
+        tallies[scenario] = _make_tally(names, frames, values[:, i], is_measured[:, i])
     return tallies
 
 
@@ -133,7 +147,14 @@ def _make_tally(
     values: NDArray[np.float64],
     is_measured: NDArray[np.bool_],
 ) -> Tally:
-    """Return the tally of values of shape [statistic, frame]."""
+    """Return a tally.
+
+    Args:
+        names: the statistics.
+        frames: absolute numbers of the frames.
+        values: NaN where undefined, shape [statistic, frame].
+        is_measured: of the same shape.
+    """
     if values.shape != (len(names), len(frames)):
         raise ValueError(
             f"{values.shape} values of {len(names)} statistics at {len(frames)} frames"

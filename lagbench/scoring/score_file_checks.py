@@ -29,7 +29,7 @@ from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import run_in_child
 
 from .published_scores import PublishedScores
-from .score_file import SubmissionStatistics, read_statistics
+from .score_file import SubmissionStatistics, statistics_in
 from .score_layout import (
     FILM_RANGE,
     FRAMES,
@@ -104,9 +104,8 @@ def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
     try:
         with open_hdf5(path) as file:
             check_structure(file, path, STRUCTURE)
-        scores = read_statistics(path)
-        _check_statistics(scores)
-        with open_hdf5(path) as file:
+            scores = statistics_in(file)
+            _check_statistics(scores)
             preview, precision = _read_preview(file[GROUP])
         _check_shapes(preview)
         if size is not None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from page_reader import read_array
+from page_reader import read_array, read_levels
 
 from lagbench.board.encoding import LEVELS, ArrayStore, decode, encode
 from lagbench.board.sampling import coarsen
@@ -21,8 +21,7 @@ GAP = st.just(float("nan"))
 
 def restore(store: ArrayStore, reference: dict[str, float | bool]) -> NDArray:
     """Return an array as the page's script reads it."""
-    levels = np.frombuffer(store.to_bytes(), "<i2")
-    return read_array(levels, reference)
+    return read_array(read_levels(store.to_bytes()), reference)
 
 
 @given(st.lists(NUMBERS | GAP, min_size=1, max_size=40), st.booleans())

@@ -1,4 +1,5 @@
 // The data of the page: JSON, and arrays of 16-bit integers; see lagbench/board/encoding.py.
+// First stand the lower bytes of all integers, then the upper ones.
 
 const MISSING_LEVEL = -32768;
 
@@ -12,7 +13,14 @@ async function bytesIn(id) {
 
 const [dataBytes, arrayBytes] = await Promise.all([bytesIn("page-data"), bytesIn("page-arrays")]);
 const BOARD = JSON.parse(new TextDecoder().decode(dataBytes));
-const STORED = new Int16Array(arrayBytes);
+const STORED = new Uint8Array(arrayBytes);
+const STORED_COUNT = STORED.length / 2;
+
+/** Return a stored integer; 0, 1, 2, 3, 4 stand for 0, -1, 1, -2, 2. */
+function storedAt(place) {
+  const folded = STORED[place] + 256 * STORED[STORED_COUNT + place];
+  return (folded >>> 1) ^ -(folded & 1);
+}
 
 /** Return the numbers of an array, row by row, NaN where missing; each array is read once. */
 function numbersOf(array) {
@@ -21,7 +29,7 @@ function numbersOf(array) {
 }
 
 function readNumbers({ start, rows, columns, zero, step, log }) {
-  const levels = STORED.slice(start, start + rows * columns);
+  const levels = Int16Array.from({ length: rows * columns }, (_, i) => storedAt(start + i));
   // Rows are stored as differences, which wrap around as the elements of an Int16Array do.
   for (let i = columns; i < levels.length; i += 1) levels[i] += levels[i - columns];
   return Float64Array.from(levels, (level) => {
@@ -31,12 +39,14 @@ function readNumbers({ start, rows, columns, zero, step, log }) {
   });
 }
 
-/** Return frames, mean, lowest and highest values of a curve; null without a curve. */
+/** Return frames, mean, lowest and highest values of a curve, of reference predictors the mean alone; null without a curve. */
 function curveOf(curve) {
   if (!curve) return null;
   const frames = numbersOf(curve.frames);
   const values = numbersOf(curve.values);
-  const column = (k) => frames.map((_, i) => values[3 * i + k]);
+  const { columns } = curve.values;
+  const column = (k) => frames.map((_, i) => values[columns * i + k]);
+  if (columns === 1) return { frames, mean: column(0) };
   return { frames, mean: column(0), low: column(1), high: column(2) };
 }
 
