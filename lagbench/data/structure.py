@@ -147,8 +147,14 @@ class ArrayInfo:
         return tuple(counts)
 
 
-def describe_array(dataset: h5py.Dataset) -> ArrayInfo:
-    """Return what the header of a data set says; no value is read."""
+def describe_array(dataset: h5py.Dataset, *, has_dims: bool = True) -> ArrayInfo:
+    """Return what the header of a data set says; no value is read.
+
+    Args:
+        dataset: the data set.
+        has_dims: whether the names of its dimensions are needed, each of which has to
+            be looked up.
+    """
     layout = read_layout(dataset)
     # HDF5 opens the sources of a virtual data set to tell its shape.
     is_inside = layout in INSIDE
@@ -178,7 +184,7 @@ def describe_array(dataset: h5py.Dataset) -> ArrayInfo:
     value_type = dataset.id.get_type()
     return ArrayInfo(
         shape=shape,
-        dims=read_dimensions(dataset) if is_inside else (),
+        dims=read_dimensions(dataset) if is_inside and has_dims else (),
         kind=_name_type(value_type),
         item=value_type.get_size(),
         layout=layout,
@@ -326,6 +332,8 @@ def check_structure(
 ) -> dict[str, ArrayInfo]:
     """Return the arrays of an open file by name ("a", "group/b"); refuse a trap.
 
+    They have no names of dimensions.
+
     Refused are links, foreign storage and filters, filters that are applied twice,
     groups and types that the format does not have, and arrays that unpack to far more
     than the file holds. The headers tell most of it. Large chunks are unpacked up to
@@ -338,11 +346,12 @@ def check_structure(
     arrays = {}
     with hdf5_errors(path):
         for name in _list_arrays(file, path, expected):
-            array = describe_array(file[name])
+            dataset = file[name]
+            array = describe_array(dataset, has_dims=False)
             issue = (
                 find_storage_issue(array, length=length, cache=expected.cache)
                 or _find_type_issue(array, expected)
-                or _find_inflation(file[name], array)
+                or _find_inflation(dataset, array)
             )
             if issue is not None:
                 raise _refusal(path, name, issue)
