@@ -21,6 +21,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Self
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -30,7 +31,7 @@ from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
 
-from .augmentation import Symmetry, augment
+from .augmentation import Symmetry, augment, velocity_towards_path
 from .baseline import (
     Baseline,
     Batch,
@@ -230,6 +231,8 @@ class GraphNetworkOptions(Options):
             "loss",
             "loss_norm",
             "link_weight",
+            "pushforward",
+            "recovery",
             "rollout_loss_steps",
             "symmetry",
         }
@@ -255,6 +258,12 @@ class GraphNetworkOptions(Options):
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # steps over which the loss is a mean; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
+    # largest number of own steps before those, without gradients: training then sees
+    # states of rollouts
+    pushforward: int = Field(default=0, ge=0)
+    # each frame the gap to the true path is to close by 1/recovery of it: a third is
+    # left after so many frames; None asks for true velocities alone
+    recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
     # whether the velocities of moving walls in the next frame are features
     wall_velocity: bool = False
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect
@@ -329,6 +338,12 @@ class GraphNetwork(Baseline):
             nn.init.zeros_(parameter)
 
     @property
+    def acceleration_std(self) -> float:
+        """Deviation of true accelerations, of one component [length/frame^2]."""
+        deviations = self.info.statistics["acceleration_std"]
+        return float(np.sqrt(np.mean(np.square(deviations))))
+
+    @property
     def _grid_box(self) -> Box:
         """Box of the loss's grid: the unit square where there are only walls."""
         box = self.info.box
@@ -365,8 +380,8 @@ class GraphNetwork(Baseline):
 
     @property
     def future(self) -> int:
-        """Frames to predict in training: as many as the loss has rollout steps."""
-        return self.options.rollout_loss_steps
+        """Frames to predict in training, with gradients and without."""
+        return self.options.rollout_loss_steps + self.options.pushforward
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -394,9 +409,13 @@ class GraphNetwork(Baseline):
         state = self.start(batch.part(slice(self.history)))
         if generator is not None:
             state = self._forget(state, batch.windows, generator)
+        first_frame = self.history  # the first frame whose error counts
+        if generator is not None and self.options.pushforward:
+            state, frame_count = self._push_forward(state, generator)
+            first_frame += frame_count
 
         step_terms = []
-        for frame in range(self.history, self.history + self.future):
+        for frame in range(first_frame, first_frame + self.options.rollout_loss_steps):
             following, operator_losses = self.step(state, generator)
             terms = self._step_terms(state, following, batch, frame)
             self._check_names(terms, operator_losses)
@@ -409,14 +428,34 @@ class GraphNetwork(Baseline):
             means[name] = torch.stack(values).mean()
         return means
 
+    @torch.no_grad()
+    def _push_forward(
+        self, state: ParticleState, generator: torch.Generator
+    ) -> tuple[ParticleState, int]:
+        """Return the state after a random number of own steps, and their number."""
+        most = self.options.pushforward + 1
+        drawn = torch.randint(most, (), generator=generator, device=generator.device)
+        frame_count = int(drawn)
+        for _ in range(frame_count):
+            state, _ = self.step(state)
+        return state, frame_count
+
     def _step_terms(
         self, state: ParticleState, following: ParticleState, batch: Batch, frame: int
     ) -> dict[str, Tensor]:
-        """Return the terms of one step to a frame of the batch."""
+        """Return the terms of one step to a frame of the batch.
+
+        With ``recovery`` the target is the true velocity and the way back to the true
+        path.
+        """
         target_position = batch.position[:, frame]
-        target_velocity = self.box.displacement(
-            batch.position[:, frame - 1], target_position
-        )
+        true_position = batch.position[:, frame - 1]
+        target_velocity = self.box.displacement(true_position, target_position)
+        if self.options.recovery is not None:
+            gap = self.box.displacement(state.position.detach(), true_position)
+            target_velocity = target_velocity + velocity_towards_path(
+                gap, self.options.recovery, acceleration_std=self.acceleration_std
+            )
         predicted_velocity = following.velocity[:, -1]
         # Both accelerations start from the state's velocity.
         last_velocity = state.velocity[:, -1]

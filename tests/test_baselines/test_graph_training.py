@@ -274,6 +274,41 @@ def test_an_oracle_has_no_loss(target: str) -> None:
         assert float(value) < 2e-5
 
 
+def test_an_oracle_has_no_loss_after_own_steps() -> None:
+    """However many steps without gradients come first, the right frame is compared."""
+    frames = swirl(0, 12)
+    exact = torch.from_numpy(frames).transpose(0, 1)
+    model = oracle(exact, "acceleration", pushforward=4, noise_std=0.0)
+    assert model.future == 5
+    for seed in range(8):
+        model.frame = 0
+        terms = model(batch(frames), seeded(seed))
+        for name in TERMS:
+            assert float(terms[name]) < 2e-5
+
+
+@pytest.mark.parametrize(("recovery", "error"), [(None, 2.0), (4.0, 2.25)])
+def test_recovery_asks_for_a_share_of_the_gap(
+    recovery: float | None, error: float
+) -> None:
+    """The particles stand still, while each step of the model adds a velocity.
+
+    After one own step the gap is that velocity, and the next step has twice of it.
+    """
+    still = np.repeat(jittered(0, low=0.3, high=0.7)[None], 9, axis=0)
+    model = network(pushforward=1, recovery=recovery, noise_std=0.0)
+    added = torch.full((2,), 1e-5)  # so small that the way back has no limit
+    model.network.decoder[-1].bias.data = model.acceleration(added)
+
+    losses = set()
+    for seed in range(8):
+        terms = model(batch(still), seeded(seed))
+        losses.add(round(float(terms["velocity"]), 9))
+    first = float(torch.sum((added / model.velocity.std) ** 2))
+    pushed = error**2 * first
+    assert sorted(losses) == pytest.approx([first, pushed], rel=2e-2)
+
+
 def test_an_untrained_network_has_a_loss() -> None:
     with torch.no_grad():
         terms = network()(batch(swirl(0, 10)))
