@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .full_box_parameters import FullBoxParameters
 from .split import (
     ClosedBoxParameters,
+    FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
@@ -81,6 +82,7 @@ class Solver(Protocol):
 _IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
     ClosedBoxParameters: (".closed_box", "ClosedBox"),
     FreeSurfaceParameters: (".free_surface", "FreeSurface"),
+    FreeSurface3DParameters: (".free_surface_3d", "FreeSurface3D"),
     FullBoxParameters: (".full_box", "FullBox"),
 }
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ClosedBoxParameters",
+    "FreeSurface3DParameters",
     "FreeSurfaceParameters",
     "InitialState",
     "Material",
@@ -104,6 +105,15 @@ class FreeSurfaceParameters:
     snow_hardening_max: float = 5.0  # upper cap of the hardening factor [1]
     snow_jp_min: float = 0.3  # lower bound of the plastic Jacobian Jp [1]
     snow_jp_max: float = 4.0  # upper bound of the plastic Jacobian Jp [1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSurface3DParameters(FreeSurfaceParameters):
+    """Constants of the MLS-MPM solver for a liquid in a cube.
+
+    The equations stand in :mod:`.liquid_stress_3d`. Densities are per length^3, moduli
+    in mass/(length s^2). The constants of solids have no meaning yet.
+    """
 
 
 SolverParameters: TypeAlias = (

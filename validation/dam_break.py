@@ -1,12 +1,13 @@
 """A column of liquid breaks: its front beside the experiment of Martin & Moyce (1952).
 
     python -m validation.dam_break --size full --json dam.json
+    python -m validation.dam_break --split fluid-3d --size mini
 
 A column of width a and height 2 a stands at rest in the corner of the box of ``fluid``
-and is let go. Its front z runs along the floor; Martin and Moyce measured Z = z / a
-against T = t sqrt(2 g / a) (Phil. Trans. R. Soc. A 244, 312-324, columns with n^2 = 2).
-The solver has the constants of the split at a size; the particles fill cells as
-densely as :data:`PER_CELL` says.
+and is let go; in ``fluid-3d`` it fills the cube along z. Its front z runs along the
+floor; Martin and Moyce measured Z = z / a against T = t sqrt(2 g / a) (Phil. Trans. R.
+Soc. A 244, 312-324, columns with n^2 = 2). The solver has the constants of the split at
+a size; the particles fill cells as densely as :data:`PER_SIDE` says.
 
 The deviation counts from Z = 1.44 on: before, the experiment's gate was still opening.
 Exit code 0: done; 2: bad options; 5: the solver failed.
@@ -28,9 +29,8 @@ from numpy.typing import NDArray
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, WorkFailedError
-from lagbench.generators.constants import free_surface_walls
+from lagbench.generators.constants import free_surface_walls, solver_constants
 from lagbench.generators.draws import quantise
-from lagbench.generators.fluid import solver_parameters
 from lagbench.generators.solver import build
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
@@ -45,11 +45,11 @@ EXPERIMENT_TIME = np.array(_EXPERIMENT.split()[::2], dtype=np.float64)
 EXPERIMENT_FRONT = np.array(_EXPERIMENT.split()[1::2], dtype=np.float64)
 """Z of the experiment at these times [1]."""
 
-WIDTH = 0.2
-"""Width a of the column [length]."""
+WIDTH = {"fluid": 0.2, "fluid-3d": 0.17}
+"""Width a of the column [length], by split: the front must not reach the other wall."""
 
-PER_CELL = 4
-"""Particles of a cell."""
+PER_SIDE = 2
+"""Particles along each side of a cell."""
 
 FIRST_FRONT = 1.44
 """Least Z of the experiment that counts [1]."""
@@ -62,7 +62,8 @@ SPRAY = 0.002
 class DamBreak:
     """The front of a breaking column beside that of the experiment."""
 
-    size: str  # size of fluid whose constants were used
+    split: str  # split whose constants were used
+    size: str  # its size
     particles: int  # particles of the column
     time: tuple[float, ...]  # T of the experiment [1]
     front: tuple[float, ...]  # Z of the solver at these times [1]
@@ -71,52 +72,67 @@ class DamBreak:
     bias: float  # mean of Z / Z_experiment - 1 where it counts [1]
 
 
-def column(parameters: FreeSurfaceParameters, low: float) -> InitialState:
-    """Return a column at rest in the left corner, on a lattice of particles."""
-    spacing = 1.0 / (parameters.grid * math.sqrt(PER_CELL))
-    columns = round(WIDTH / spacing)
-    rows = round(2.0 * WIDTH / spacing)
-    x = low + (np.arange(columns) + 0.5) * (WIDTH / columns)
-    y = low + (np.arange(rows) + 0.5) * (2.0 * WIDTH / rows)
-    grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
-    position = np.stack([grid_x.ravel(), grid_y.ravel()], axis=-1)
-    count = len(position)
+def column(
+    parameters: FreeSurfaceParameters, bounds: Sequence[tuple[float, float]], a: float
+) -> InitialState:
+    """Return a column at rest at the left wall, on a lattice of particles.
+
+    Args:
+        parameters: constants of the solver.
+        bounds: walls along each axis [length].
+        a: width of the column [length].
+    """
+    sides = [a, 2.0 * a]
+    if len(bounds) == 3:
+        low, high = bounds[2]
+        sides.append(high - low)
+    axes = []
+    for (low, _), side in zip(bounds, sides, strict=True):
+        count = round(side * parameters.grid * PER_SIDE)
+        axes.append(low + (np.arange(count) + 0.5) * (side / count))
+    lattice = np.meshgrid(*axes, indexing="ij")
+    position = np.stack([coordinate.ravel() for coordinate in lattice], axis=-1)
+    particle_count, dimension = position.shape
     return InitialState(
         position=quantise(position),
-        velocity=np.zeros((count, 2)),
-        affine=np.zeros((count, 2, 2)),
-        material=np.full(count, Material.LIQUID, dtype=np.int8),
-        area=2.0 * WIDTH * WIDTH,
+        velocity=np.zeros((particle_count, dimension)),
+        affine=np.zeros((particle_count, dimension, dimension)),
+        material=np.full(particle_count, Material.LIQUID, dtype=np.int8),
+        area=math.prod(sides),
+        wall_velocity=np.zeros((2 * dimension, dimension)),
     )
 
 
-def front_of(position: NDArray[np.float32], low: float) -> float:
+def front_of(position: NDArray[np.float32], low: float, a: float) -> float:
     """Return Z: how far the front has run, without the spray ahead of it [1]."""
-    return (float(np.quantile(position[:, 0], 1.0 - SPRAY)) - low) / WIDTH
+    return (float(np.quantile(position[:, 0], 1.0 - SPRAY)) - low) / a
 
 
-def run(size: str) -> DamBreak:
-    """Let the column break with the constants of a size of fluid.
+def run(size: str, split: str = "fluid") -> DamBreak:
+    """Let the column break with the constants of a split's size.
 
     Raises:
         LagbenchError: there is no such size, or the solver failed.
     """
-    tier = load().size("fluid", size)
+    tier = load().size(split, size)
     low, _ = free_surface_walls(tier)
-    constants = solver_parameters(tier)
-    state = column(constants, low)
+    width = WIDTH[split]
+    constants = solver_constants(tier)
+    if not isinstance(constants, FreeSurfaceParameters):
+        raise TypeError(f"{split} has no free surface")
+    state = column(constants, tier.box.bounds, width)
     constants = replace(constants, particles=len(state.position))
     solver = build(constants)
     solver.load([state])
 
-    time_unit = math.sqrt(WIDTH / (2.0 * constants.gravity))  # of T [s]
+    time_unit = math.sqrt(width / (2.0 * constants.gravity))  # of T [s]
     times: list[float] = []
     fronts: list[float] = []
     substep = 0
     stride = max(1, tier.substeps_per_frame // 4)
     while not times or times[-1] < EXPERIMENT_TIME[-1]:
         times.append(substep * constants.dt / time_unit)
-        fronts.append(front_of(solver.position()[0], low))
+        fronts.append(front_of(solver.position()[0], low, width))
         solver.advance(stride)
         substep += stride
 
@@ -124,6 +140,7 @@ def run(size: str) -> DamBreak:
     counts = EXPERIMENT_FRONT >= FIRST_FRONT
     relative = front[counts] / EXPERIMENT_FRONT[counts] - 1.0
     return DamBreak(
+        split=split,
         size=size,
         particles=constants.particles,
         time=tuple(EXPERIMENT_TIME.tolist()),
@@ -141,11 +158,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--size", default="full", help="size of fluid (default full)")
+    parser.add_argument("--split", default="fluid", choices=sorted(WIDTH))
+    parser.add_argument("--size", default="full", help="size of the split")
     parser.add_argument("--json", type=Path, metavar="FILE", help="results")
     options = parser.parse_args(arguments)
     try:
-        result = run(options.size)
+        result = run(options.size, options.split)
         if options.json is not None:
             text = json.dumps(asdict(result), indent=1) + "\n"
             options.json.write_text(text, encoding="utf-8")

@@ -1,0 +1,179 @@
+"""Liquid with a free surface in a cube: falls, throws, dam breaks and splashes.
+
+Scenario ids walk through four families:
+
+    0  falling-ball   a ball falls
+    1  thrown-block   a block is thrown along the floor and up
+    2  dam-break      a column at rest beside a wall breaks
+    3  splash         a ball falls into a pool at rest
+
+Each scenario draws sizes, places and velocities. All particles of a scenario stand for
+the same volume. The walls are free-slip. Expected behaviour: a sheet along the floor or
+a crown around the impact, jets up the walls, sloshing.
+
+The column that breaks fills the cube along one horizontal axis, which goes by the id.
+It is the dam break of Martin and Moyce (1952) between two glass walls.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .constants import constants, free_surface_walls, interval
+from .draws import RandomSource, choice, quantise, uniform
+from .solids import Ball, Block, Solid, sample_solid
+from .split import (
+    FreeSurface3DParameters,
+    FreeSurfaceParameters,
+    InitialState,
+    Material,
+)
+
+if TYPE_CHECKING:
+    from lagbench.data.registry import Size
+
+Array = NDArray[np.float64]
+Point: TypeAlias = tuple[float, float, float]
+
+FAMILIES = ("falling-ball", "thrown-block", "dam-break", "splash")
+"""Family of a scenario, by id % 4."""
+
+AT_REST: Point = (0.0, 0.0, 0.0)
+
+
+def solver_parameters(size: Size) -> FreeSurfaceParameters:
+    """Return the solver's constants at this size."""
+    return constants(FreeSurface3DParameters, size)
+
+
+def _draw_vector(rng: RandomSource, size: Size, name: str) -> Point:
+    """Draw a vector from the intervals ``<name>_x``, ``<name>_y`` and ``<name>_z``."""
+    x = uniform(rng, *interval(size, f"{name}_x"))
+    y = uniform(rng, *interval(size, f"{name}_y"))
+    z = uniform(rng, *interval(size, f"{name}_z"))
+    return x, y, z
+
+
+def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> Point:
+    """Draw where a solid hangs: within the walls' margin, its centre above a height."""
+    low, high = free_surface_walls(size)
+    margin = size.value("margin")
+    reach_x, reach_y, reach_z = solid.reach
+    x = uniform(rng, low + margin + reach_x, high - margin - reach_x)
+    y = uniform(rng, max(lowest, low + margin + reach_y), high - margin - reach_y)
+    z = uniform(rng, low + margin + reach_z, high - margin - reach_z)
+    return x, y, z
+
+
+def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
+    ball = Ball(uniform(rng, *interval(size, "ball_radius")))
+    centre = _draw_place(rng, size, ball, size.value("fall_height"))
+    velocity = _draw_vector(rng, size, "fall_velocity")
+    return _state(rng, size, "falling-ball", [(ball, centre, velocity)])
+
+
+def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
+    sides = []
+    for _ in range(3):
+        sides.append(uniform(rng, *interval(size, "block_side")))
+    block = Block((sides[0], sides[1], sides[2]))
+    centre = _draw_place(rng, size, block, 0.0)
+    velocity = _draw_vector(rng, size, "throw_velocity")
+    # towards either end of both horizontal axes
+    sign_x = 1.0 - 2.0 * choice(rng, 2)
+    sign_z = 1.0 - 2.0 * choice(rng, 2)
+    thrown = (sign_x * velocity[0], velocity[1], sign_z * velocity[2])
+    return _state(rng, size, "thrown-block", [(block, centre, thrown)])
+
+
+def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
+    low, high = free_surface_walls(size)
+    width = uniform(rng, *interval(size, "column_width"))
+    height = uniform(rng, *interval(size, "column_height"))
+    start = low + 0.5 * width
+    if choice(rng, 2) == 1:
+        start = high - 0.5 * width
+    y = low + 0.5 * height
+    middle = 0.5 * (low + high)
+    if number % 2 == 0:
+        column = Block((width, height, high - low))
+        centre = (start, y, middle)
+    else:
+        column = Block((high - low, height, width))
+        centre = (middle, y, start)
+    return _state(rng, size, "dam-break", [(column, centre, AT_REST)])
+
+
+def _splash(rng: RandomSource, size: Size) -> InitialState:
+    low, high = free_surface_walls(size)
+    depth = uniform(rng, *interval(size, "pool_depth"))
+    pool = Block((high - low, depth, high - low))
+    middle = 0.5 * (low + high)
+    pool_centre = (middle, low + 0.5 * depth, middle)
+    ball = Ball(uniform(rng, *interval(size, "drop_radius")))
+    lowest = low + depth + size.value("margin") + ball.radius
+    ball_centre = _draw_place(rng, size, ball, lowest)
+    velocity = _draw_vector(rng, size, "drop_velocity")
+    bodies: list[tuple[Solid, Point, Point]] = [
+        (pool, pool_centre, AT_REST),
+        (ball, ball_centre, velocity),
+    ]
+    return _state(rng, size, "splash", bodies)
+
+
+def _state(
+    rng: RandomSource,
+    size: Size,
+    family: str,
+    bodies: list[tuple[Solid, Point, Point]],
+) -> InitialState:
+    """Return bodies of liquid, each a solid, its centre and its velocity.
+
+    Particles are shared out by volume; the last body has what rounding leaves.
+    """
+    total_volume = sum(solid.volume for solid, _, _ in bodies)
+    positions = []
+    velocities = []
+    left_count = size.particles
+    for index, (solid, centre, velocity) in enumerate(bodies):
+        count = left_count
+        if index < len(bodies) - 1:
+            count = int(size.particles * (solid.volume / total_volume))
+        left_count -= count
+        positions.append(sample_solid(rng, solid, centre, count))
+        velocities.append(np.tile(np.array(velocity), (count, 1)))
+
+    low, high = free_surface_walls(size)
+    position = np.clip(np.concatenate(positions), low, high)
+    _, last_centre, last_velocity = bodies[-1]
+    parameters: dict[str, int | float | str] = {
+        "family": family,
+        "volume": total_volume,
+    }
+    for axis, name in enumerate("xyz"):
+        parameters[f"centre_{name}"] = float(quantise(last_centre[axis]))
+        parameters[f"velocity_{name}"] = float(last_velocity[axis])
+    return InitialState(
+        position=position,
+        velocity=quantise(np.concatenate(velocities)),
+        affine=np.zeros((size.particles, 3, 3)),
+        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        area=total_volume,
+        wall_velocity=np.zeros((6, 3)),
+        parameters=parameters,
+    )
+
+
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw one or two bodies of liquid, their places and velocities."""
+    family = FAMILIES[scenario % len(FAMILIES)]
+    if family == "falling-ball":
+        return _falling_ball(rng, size)
+    if family == "thrown-block":
+        return _thrown_block(rng, size)
+    if family == "dam-break":
+        return _dam_break(rng, size, scenario // len(FAMILIES))
+    return _splash(rng, size)
