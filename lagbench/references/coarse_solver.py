@@ -3,8 +3,8 @@
 What a surrogate must be compared with: accuracy against cost. It learns nothing, but it
 knows the equations, the viscosity, the materials and the motion of the walls to the
 end. Its grid has half as many cells along each axis, or a quarter, and its time step is
-two or four times as long. A seeded subset of the particles, a quarter or a sixteenth of
-them and as evenly spread, carries the mass. In a full box the others
+two or four times as long. A seeded subset of the particles, as many to a cell as before
+and as evenly spread, carries the mass. In a full box the others
 move as those around them do (see :mod:`.predictor`); on a free surface each keeps its
 offset to the nearest particle of its material that carries mass.
 
@@ -50,7 +50,7 @@ MIN_CELLS = 16
 MIN_PARTICLES = 100
 """Least particles that carry the mass on a coarser grid."""
 
-SOLVED = ("fluid", "multimaterial")
+SOLVED = ("fluid", "multimaterial", "fluid-3d")
 """Splits that are solved; in full boxes the projection solver is cheaper and better."""
 
 
@@ -74,7 +74,7 @@ def coarser(size: Size, times: int) -> Size | None:
         "grid": size.grid // times,
         "wall": wall // times,
         "substeps_per_frame": math.ceil(size.substeps_per_frame / times),
-        "particles": size.particles // (times * times),
+        "particles": size.particles // times**size.dimension,
     }
     if values["grid"] < MIN_CELLS or values["particles"] < MIN_PARTICLES:
         return None
@@ -144,20 +144,41 @@ def spread_subset(
     Groups are neighbours in columns of nearly equal counts, as the lattices of full
     boxes are.
     """
-    rank = np.empty(len(position), np.intp)
-    for kind in np.unique(material):
-        members = np.flatnonzero(material == kind)
-        columns = math.isqrt(math.ceil(count * len(members) / len(position)))
-        place = np.argsort(
-            np.argsort(position[members, 0], kind="stable"), kind="stable"
-        )
-        rank[members] = place * columns // len(members)
-    order = np.lexsort((position[:, 1], rank, material))
+    order = _order_of_columns(position, material, count)
     draws = np.random.Generator(np.random.PCG64(0)).random(count)
     groups = np.array_split(order, count)
     return np.sort(
         [group[int(u * len(group))] for u, group in zip(draws, groups, strict=True)]
     )
+
+
+def _order_of_columns(
+    position: Floats, material: NDArray[np.integer], count: int
+) -> NDArray[np.intp]:
+    """Return the particles of each material column by column, along the last axis.
+
+    In three dimensions a slab across x holds columns across y.
+    """
+    dimension = position.shape[1]
+    column = np.zeros(len(position), np.intp)
+    for kind in np.unique(material):
+        members = np.flatnonzero(material == kind)
+        chosen_count = math.ceil(count * len(members) / len(position))
+        if dimension == 2:
+            column[members] = _rank(position[members, 0], math.isqrt(chosen_count))
+            continue
+        side = max(1, round(float(np.cbrt(chosen_count))))
+        slab = _rank(position[members, 0], side)
+        for number in range(side):
+            inside = members[slab == number]
+            column[inside] = number * side + _rank(position[inside, 1], side)
+    return np.lexsort((position[:, -1], column, material))
+
+
+def _rank(coordinate: Floats, groups: int) -> NDArray[np.intp]:
+    """Return in which of so many groups of nearly equal counts each one lies."""
+    place = np.argsort(np.argsort(coordinate, kind="stable"), kind="stable")
+    return np.asarray(place * groups // max(1, len(coordinate)), np.intp)
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:

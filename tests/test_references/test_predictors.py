@@ -399,6 +399,24 @@ def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
     np.testing.assert_array_equal(chosen, again)
 
 
+def test_the_subset_is_spread_evenly_in_three_dimensions() -> None:
+    """An eighth of a jittered lattice has eight in 4 x 4 x 4 spacings.
+
+    Their number per cell deviates less than that of a random choice, which is 2.6.
+    """
+    rng = np.random.default_rng(3)
+    axes = np.meshgrid(*[np.arange(16)] * 3, indexing="ij")
+    points = np.stack([axis.ravel() for axis in axes], axis=-1) + 0.5
+    points = (points + rng.uniform(-0.1, 0.1, points.shape)) / 16
+    material = np.zeros(len(points), np.int8)
+    chosen = spread_subset(points, material, 512)
+    assert len(set(chosen.tolist())) == 512
+    x, y, z = (points[chosen] * 4).astype(int).T
+    counts = np.bincount((x * 4 + y) * 4 + z, minlength=64)
+    assert counts.min() >= 3
+    assert counts.std() < 2.0
+
+
 def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     """With its own grid, time step and particles it moves them as the solver does."""
     size = load().size("fluid", "tiny")
