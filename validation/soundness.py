@@ -21,7 +21,7 @@ from lagbench.data.manifest import FileEntry, read_manifest
 from lagbench.data.registry import Size, load
 from lagbench.errors import DataError, LagbenchError
 
-SPLITS = ("fluid", "multimaterial")
+SPLITS = ("fluid", "multimaterial", "fluid-3d")
 SIZES = ("tiny", "mini", "full")
 
 MACH_MAX = 0.3
