@@ -1,0 +1,219 @@
+"""A set of another code base, in a periodic square and with scenarios of different
+particle numbers: import, train, predict, score.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from exchange_writers import SUBSETS, write_metadata
+from numpy.typing import NDArray
+
+import lagbench
+from lagbench.baselines.predict import predict
+from lagbench.baselines.train import train
+from lagbench.data.local import locate
+from lagbench.exchange import adopt, import_split
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.scoring.card import ScoreCard
+
+Floats = NDArray[np.float64]
+
+SIDES = {"train": (18, 22), "valid": (20,), "test": (26, 18)}
+"""Particles along each axis, by subset: 324 to 676 in a scenario."""
+FRAMES = 16
+GIVEN = 4
+DRIFT = np.array([0.037, -0.021])  # of the whole fluid [length/frame]
+VORTEX = 0.006  # greatest speed of the vortices [length/frame]
+SHIFT = np.array([0.03, 0.0])  # of a prediction [length]
+
+RECIPE = """
+format: 1
+recipes:
+  '*/full': {training: {steps: 3, batch: 1, learning_rate: 1.0e-4}}
+"""
+
+
+def vortices(position: Floats) -> Floats:
+    """Return the velocity of Taylor-Green vortices at rest [length/frame]."""
+    x, y = 2.0 * math.pi * position.T
+    return VORTEX * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y)], axis=1)
+
+
+def carried(side: int) -> NDArray[np.float32]:
+    """Return particles in vortices that drift through the ends of the square."""
+    axis = (np.arange(side) + 0.5) / side
+    x = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    frames = []
+    for frame in range(FRAMES):
+        frames.append((x + frame * DRIFT) % 1.0)
+        half = x + vortices(x) / 2.0
+        x = x + vortices(half)
+    wrapped = np.asarray(np.stack(frames), np.float32)
+    # A coordinate may round up to the end of the period, which is its start.
+    return np.where(wrapped >= 1.0, np.float32(0.0), wrapped)
+
+
+def write_set(folder: Path) -> Path:
+    """Write train.h5, valid.h5, test.h5 and metadata.json as LagrangeBench does."""
+    folder.mkdir()
+    for subset in SUBSETS:
+        with h5py.File(folder / f"{subset}.h5", "w") as file:
+            for number, side in enumerate(SIDES[subset]):
+                position = carried(side)
+                group = file.create_group(f"{number:05d}")
+                group["position"] = position
+                group["particle_type"] = np.zeros(position.shape[1], np.int64)
+    changes = {
+        "bounds": [[0.0, 1.0], [0.0, 1.0]],
+        "sequence_length": FRAMES,
+        "default_connectivity_radius": 0.08,
+        "periodic_boundary_conditions": [True, True],
+    }
+    write_metadata(folder, changes)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """The set as it is imported; the metadata say that it is periodic."""
+    folder = tmp_path_factory.mktemp("periodic")
+    return import_split(
+        write_set(folder / "theirs"),
+        format="lagrangebench-h5",
+        output=folder / "drift",
+        input_frames=GIVEN,
+        full_box=True,
+        cells=8,
+    )
+
+
+def ids_of_test(made: LocalSplit) -> dict[int, int]:
+    """Return the particles along each axis of each test scenario."""
+    ids = locate(made.folder).size.subsets["test"]
+    return dict(zip(ids, SIDES["test"], strict=True))
+
+
+def score_of(
+    made: LocalSplit, positions: dict[int, NDArray[np.float32]], folder: Path
+) -> ScoreCard:
+    """Return the scores of predictions."""
+    path = folder / "predictions.nc"
+    root = made.folder.parent
+    lagbench.submission.write(path, positions, split=made.folder, method="trivial")
+    validated = lagbench.validate(path, root=root, isolated=False)
+    assert validated.valid
+    return lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+
+
+def test_the_box_and_the_numbers_of_particles_are_theirs(made: LocalSplit) -> None:
+    size = locate(made.folder).size
+    assert size.box.periodic == (True, True)
+    counts = {size.particle_count(number) for number in size.scenarios}
+    assert counts == {324, 400, 484, 676}
+
+
+def test_positions_adopted_with_the_same_axes_are_the_same(
+    made: LocalSplit, tmp_path: Path
+) -> None:
+    """Arrays with --periodic make the scenarios that the format makes."""
+    paths: list[Path] = []
+    for subset in SUBSETS:
+        for side in SIDES[subset]:
+            paths.append(tmp_path / f"run{len(paths)}.npy")
+            np.save(paths[-1], carried(side))
+    own = adopt(
+        paths,
+        output=tmp_path / "own",
+        valid=1,
+        test=2,
+        radius=0.08,
+        frame_interval=0.05,
+        bounds=((0.0, 1.0), (0.0, 1.0)),
+        periodic=("x", "y"),
+        input_frames=GIVEN,
+        full_box=True,
+    )
+    for subset in SUBSETS:
+        with (
+            lagbench.open_split(made.folder, subset=subset) as theirs,
+            lagbench.open_split(own.folder, subset=subset) as ours,
+        ):
+            np.testing.assert_array_equal(ours["position"], theirs["position"])
+
+
+def test_a_particle_that_crosses_the_boundary_costs_no_error(
+    made: LocalSplit, tmp_path: Path
+) -> None:
+    """The truth has no error, and a fluid moved by a little has that error alone, with
+    the particles that the move brings to the other end.
+    """
+    truth = {}
+    moved = {}
+    crossing_count = 0
+    for number, side in ids_of_test(made).items():
+        truth[number] = carried(side)[GIVEN:]
+        shifted = truth[number].astype(np.float64) + SHIFT
+        crossing_count += int((shifted >= 1.0).sum())
+        moved[number] = (shifted % 1.0).astype(np.float32)
+    assert crossing_count > 100
+
+    perfect = score_of(made, truth, tmp_path)
+    for name in ("position_rmse", "velocity_rmse", "mse_avg_10", "vorticity_nrmse"):
+        assert perfect.submission[name].mean == 0.0
+    near = score_of(made, moved, tmp_path)
+    # mean squares over axes: one of two is moved
+    square = float(SHIFT @ SHIFT) / 2.0
+    assert near.submission["position_mse"].mean == pytest.approx(square, rel=1e-4)
+    root = math.sqrt(square)
+    assert near.submission["position_rmse"].mean == pytest.approx(root, rel=1e-4)
+    # The references reach across the ends too: a drift is what a velocity predicts.
+    errors = {name: row["position_rmse"].mean for name, row in near.scores.items()}
+    assert errors["constant-velocity"] < 0.3 * errors["persistence"]
+    assert near.skill is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("baseline", ["gns", "neuralmpm"])
+def test_a_few_steps_of_training_are_scored(
+    made: LocalSplit, tmp_path: Path, baseline: str
+) -> None:
+    """Models learn from, and predict, any number of particles in a periodic box."""
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(RECIPE)
+    settings = {
+        "gns": ("model.latent=16", "model.layers=2"),
+        "neuralmpm": ("model.cells=12", "model.width=8", "model.velocities=2"),
+    }
+    trained = train(
+        baseline,
+        str(made.folder),
+        recipe=str(recipe),
+        settings=settings[baseline],
+        output=tmp_path / "model",
+    )
+    root = made.folder.parent
+    path = tmp_path / "predictions.nc"
+    predict(trained.weights, path, root=root)
+    validated = lagbench.validate(path, root=root, isolated=False)
+    assert validated.valid
+    card = lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+    errors = {name: row["position_rmse"].mean for name, row in card.scores.items()}
+    # An untrained model keeps velocities; it loses no particle at the ends.
+    assert errors["submission"] < errors["persistence"]
+
+
+def test_metadata_without_the_axes_are_refused(tmp_path: Path) -> None:
+    """Particles that jump through the box are no data between walls."""
+    folder = write_set(tmp_path / "theirs")
+    metadata = json.loads((folder / "metadata.json").read_text())
+    metadata["periodic_boundary_conditions"] = [False, False]
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    with pytest.raises(lagbench.errors.DataError) as caught:
+        import_split(folder, format="lagrangebench-h5", output=tmp_path / "walls")
+    assert "--periodic" in str(caught.value.fix)
