@@ -7,6 +7,9 @@ with any other object in it. So a stranger's file runs no code. The one threat t
 left is memory: an archive of a few kilobytes may unpack to more than the machine has.
 So the size that its members state is limited. Options may ask for a model beyond all
 memory; building it fails, and so does :func:`restore`.
+
+A file named ``.safetensors`` holds the weights and the text ``about``, see
+:mod:`.safetensors_file`.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from lagbench.submission.budget import Budget, parse_budget
 from .baseline import Baseline, DatasetInfo
 from .catalogue import find
 from .dataset_info import read_dataset_info
+from .safetensors_file import SUFFIX, read_tensors, write_tensors
 
 FORMAT = 1
 KEY = "lagbench_checkpoint"
@@ -102,6 +106,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; it appears whole or not at all.
 
     Raises:
+        UsageError: a file of safetensors cannot hold the state of an optimiser.
         WorkFailedError: the disk is full, or nobody may write there.
     """
     facts = asdict(checkpoint.info)
@@ -114,6 +119,16 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         "facts": facts,
         "training": dict(checkpoint.training),
     }
+    if path.suffix == SUFFIX:
+        if checkpoint.optimizer is not None:
+            raise UsageError(
+                "a file of safetensors holds weights only",
+                where=str(path),
+                got="the state of an optimiser too",
+                fix="save the weights without it",
+            )
+        write_tensors(path, json.dumps(about, sort_keys=True), checkpoint.weights)
+        return
     weights = {}
     for name, tensor in checkpoint.weights.items():
         weights[name] = tensor.detach().cpu()
@@ -143,7 +158,12 @@ def load(path: str | Path) -> Checkpoint:
         UnreadableFileError: the file is no checkpoint, damaged, or too large.
     """
     file = Path(path)
-    content = _load_content(file)
+    content: dict[str, Any]
+    if file.suffix == SUFFIX:
+        recipe_text, tensors = read_tensors(file)
+        content = {KEY: FORMAT, "about": recipe_text, "weights": tensors}
+    else:
+        content = _load_content(file)
     try:
         if type(content[KEY]) is not int or content[KEY] != FORMAT:
             raise _unreadable(file, f"format {FORMAT}", f"format {content[KEY]!r}")

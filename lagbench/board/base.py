@@ -18,6 +18,7 @@ from lagbench.submission.issues import ValidationIssue
 from .entry_file import MAX_ENTRY_BYTES
 from .folder import (
     DEPTH,
+    GATES,
     REFERENCES,
     SCORES,
     SEASONS,
@@ -72,7 +73,7 @@ def check_base(
         if str(path) in LONGEST_LISTS:
             if not _lost_own_lines_only(folder, path, start, own_methods):
                 yield _maintained_issue(path, verb)
-        elif path.parts[0] == SEASONS:
+        elif path.parts[0] == SEASONS or path == Path(GATES):
             yield _maintained_issue(path, verb)
         elif path.parts[0] == REFERENCES:
             if path in paths_at_start:

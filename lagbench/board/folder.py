@@ -4,6 +4,7 @@
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
+    weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
     weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
     seasons/<name>/season.yaml                    frozen entries of a blind season
     seasons/<name>/scores.yaml                    their blind scores
@@ -40,8 +41,10 @@ README = "README.md"
 LOCK = ".lock"  # held while the folder is written
 STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
 
-MODEL_ENDINGS = (".pt", ".onnx")
-"""Endings of models: weights of `lagbench train`, and ONNX files."""
+MODEL_ENDINGS = (".pt", ".safetensors", ".onnx")
+"""Endings of models: weights of `lagbench train` or of a registered architecture, and
+ONNX files.
+"""
 
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
@@ -109,15 +112,15 @@ def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Pa
     Args:
         place: split, size and method of the entry.
         seed: the seed.
-        like: a file name; if it ends as an ONNX file, so does the path.
+        like: a file name; the path ends as it does, where models may end so.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
     'weights/cavity/mini/gns_3.pt'
     """
     split, size, method = place
     ending = ".pt"
-    if str(like).endswith(".onnx"):
-        ending = ".onnx"
+    if Path(like).suffix in MODEL_ENDINGS:
+        ending = Path(like).suffix
     return Path(WEIGHTS, split, size, f"{method}_{seed or 0}{ending}")
 
 

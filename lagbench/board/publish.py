@@ -368,7 +368,7 @@ def _find_files_to_remove(
         stale_paths = set(previous.files) - set(entry.files)
     for path in moves:
         log = path.with_suffix(".json")
-        if path.suffix == ".pt" and log not in moves:
+        if path.suffix in (".pt", ".safetensors") and log not in moves:
             stale_paths.add(log)
     whole_paths = []
     for path in sorted(stale_paths):

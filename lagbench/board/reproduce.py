@@ -245,6 +245,10 @@ def open_model(
     check_installed("torch", extra="baselines")
     from lagbench.baselines.runner import WeightsRunner
 
+    if path.suffix == ".safetensors":
+        from lagbench.baselines.weights_check import check_in_child
+
+        check_in_child(path)
     provenance = prediction.provenance or entry.provenance
     settings: tuple[str, ...] = ()
     if provenance is not None:

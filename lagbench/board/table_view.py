@@ -25,7 +25,6 @@ from .columns import (
     value_of,
 )
 from .entry import Entry, EntryFlag, Verification
-from .folder import weights_path
 from .model import BoardRow, ReferenceRow, Tab, Value
 
 MOST_REASONS = 4
@@ -307,15 +306,15 @@ def _links_of(entry: Entry) -> Iterator[tuple[str, str]]:
             yield label, address
     if entry.weights:
         return
-    seeds = []
+    models = []
     for prediction in entry.predictions:
         if prediction.weights:
-            seeds.append(prediction.seed)
-    for seed in seeds:
+            models.append((prediction.seed, prediction.weights.path))
+    for seed, path in models:
         label = f"weights {seed}"
-        if len(seeds) == 1:
+        if len(models) == 1:
             label = "weights"
-        yield label, weights_path(entry.place, seed).as_posix()
+        yield label, path
 
 
 def chips_of(row: BoardRow) -> Iterator[Chip]:

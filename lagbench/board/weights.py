@@ -4,6 +4,7 @@
 ``leaderboard reproduce`` runs them.
 
 weights/<split>/<size>/<method>_<seed>.pt     parameters, which `lagbench predict` reads
+weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
 weights/<split>/<size>/<method>_<seed>.onnx   or a model of another code base
 weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
 """
@@ -76,7 +77,10 @@ def inspect_weights(path: Path) -> WeightsFile:
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import count_rounded_parameters, load
     from lagbench.baselines.provenance import training_provenance
+    from lagbench.baselines.weights_check import check_in_child
 
+    if path.suffix == ".safetensors":
+        check_in_child(path)
     checkpoint = load(path)
     info = checkpoint.info
     recipe = checkpoint.training.get("recipe", {})

@@ -48,6 +48,7 @@ OPTIONAL_LIBRARIES = {
     "pytorch-lightning": "baselines",
     "statsmodels": "baselines",
     "tensorboard": "baselines",
+    "safetensors": "baselines",
     "distributed": "cluster",
     "s3fs": "s3",
     "pot": "transport",

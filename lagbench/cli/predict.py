@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def predict_command(
     checkpoint: Annotated[
-        Path, typer.Argument(metavar="FILE", help="weights.pt, checkpoint.pt, or ONNX.")
+        Path, typer.Argument(metavar="FILE", help="weights.pt, safetensors, or ONNX.")
     ],
     output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
         "predictions.nc"

@@ -56,7 +56,8 @@ def submit_command(
         list[Path] | None,
         option(
             "--weights FILE",
-            "weights.pt to keep beside the entry; at most one for each seed.",
+            "weights.pt, safetensors or ONNX to keep beside the entry; at most one "
+            "for each seed.",
         ),
     ] = None,
     replace: Annotated[

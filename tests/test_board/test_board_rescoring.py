@@ -330,6 +330,11 @@ CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
         "changed",
     ),
     "floors changed": (lambda b: (b.folder / PREDICTOR).unlink(), PREDICTOR, "removed"),
+    "gates claimed": (
+        lambda b: (b.folder / "gates.json").write_text('{"weights": []}'),
+        "gates.json",
+        "added",
+    ),
 }
 
 

@@ -1,0 +1,64 @@
+"""Check a stranger's file of weights in a child process with limits.
+
+The child reads the file and builds the model: its options may ask for more memory than
+there is, or for years of work. What passes here can be loaded in this process.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lagbench.errors import LagbenchError, UnreadableFileError
+from lagbench.work.machine import run_in_child
+
+from .checkpoint import load, restore
+
+SECONDS = 20.0  # processor time of reading and building, without imports [s]
+WALL_SECONDS = 120.0  # time of the clock, with imports on a busy machine [s]
+MEMORY = 8 << 30
+"""Address space of the child [bytes]; importing torch for the CPU takes 1 GB of it, for
+CUDA several.
+"""
+
+
+def examine(path: str) -> dict[str, Any]:
+    """Return why weights are refused, None where they can be used.
+
+    It is run in a child process.
+    """
+    try:
+        checkpoint = load(path)
+        restore(checkpoint, where=path)
+    except LagbenchError as error:
+        parts = [error.what, error.got]
+        words = [str(part) for part in parts if part is not None]
+        return {"refused": ": ".join(words)[:300]}
+    return {"refused": None}
+
+
+def check_in_child(path: Path) -> None:
+    """Read weights and build their model in a child process.
+
+    Raises:
+        UnreadableFileError: the file or its recipe cannot be used, or needs too much
+            memory or time.
+    """
+    answers = run_in_child(
+        f"{__name__}.{examine.__name__}",
+        [str(path.absolute())],
+        seconds=SECONDS,
+        wall=WALL_SECONDS,
+        memory=MEMORY,
+    )
+    reason = answers.stopped
+    if answers.values:
+        reason = answers.values[0]["refused"]
+    if reason is not None:
+        raise UnreadableFileError(
+            "the weights are refused",
+            where=str(path),
+            expected="weights of a registered architecture with their recipe",
+            got=reason,
+            fix="write them with lagbench.models.registered.export_safetensors",
+        )

@@ -1,0 +1,88 @@
+"""Hand in a registered architecture that you trained with a program of your own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.catalogue import find
+from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.safetensors_file import SUFFIX
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
+
+__all__ = ["build_registered", "export_safetensors"]
+
+RECIPE = "own-training"
+"""Name of the recipe of a model that `lagbench train` did not train."""
+
+
+def build_registered(
+    baseline: str,
+    *,
+    split: str,
+    size: str | None = None,
+    options: Mapping[str, Any] | None = None,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Baseline:
+    """Return an untrained model of a registered architecture, a ``torch.nn.Module``.
+
+    Args:
+        baseline: name of the architecture, such as ``gns`` or ``neuralmpm``.
+        split: name of the split.
+        size: name of the size; the only one with data when None.
+        options: options of the model; those that are missing have their defaults.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: no such architecture, or it cannot be built for this data set.
+        DataError: the data set is not generated.
+    """
+    info = read_dataset_info(split, size, root=root, registry=registry)
+    return find(baseline).model.build(options or {}, info)
+
+
+def export_safetensors(
+    model: Baseline, path: str | Path, *, baseline: str, seed: int = 0, step: int = 0
+) -> Path:
+    """Write a trained model as a file of safetensors that an entry can carry.
+
+    Args:
+        model: a model of :func:`build_registered`.
+        path: file to write, named ``.safetensors``.
+        baseline: name of its architecture.
+        seed: seed of the training.
+        step: steps of the training.
+
+    Raises:
+        UsageError: the file has another suffix.
+        UnreadableFileError: weights are not finite, or the model is of another
+            architecture.
+    """
+    target = Path(path)
+    if target.suffix != SUFFIX:
+        raise UsageError(
+            "a file of safetensors needs its suffix",
+            where="path",
+            expected=f"a name that ends with {SUFFIX}",
+            got=target.name,
+        )
+    checkpoint = Checkpoint(
+        baseline=baseline,
+        options=model.options.model_dump(mode="json"),
+        info=model.info,
+        weights=model.state_dict(),
+        training={
+            "step": step,
+            "recipe": {"name": RECIPE, "training": {"seed": seed}},
+        },
+    )
+    restore(checkpoint, where=str(target))
+    save(target, checkpoint)
+    load(target)
+    return target

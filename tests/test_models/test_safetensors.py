@@ -1,0 +1,118 @@
+"""Models in the safetensors format: of registered architectures, with their recipe."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from hostile_safetensors import (
+    HOSTILE,
+    not_a_number,
+    rewrite_recipe,
+    small_model,
+    sound_file,
+)
+
+from lagbench.baselines.checkpoint import load, restore
+from lagbench.baselines.predict import predict
+from lagbench.baselines.weights_check import check_in_child, examine
+from lagbench.board.check import check_board
+from lagbench.board.entry import Level, Meta
+from lagbench.board.reproduce import reproduce
+from lagbench.board.submit import submit
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.make.generate import GenerationResult
+from lagbench.models.registered import export_safetensors
+
+MOST_SECONDS = 5.0  # until a hostile file is refused [s]
+
+
+@pytest.fixture
+def sound(tmp_path: Path, generated: GenerationResult) -> Path:
+    """A file that can be used; the test may change it."""
+    return sound_file(tmp_path / "model.safetensors", generated)
+
+
+def test_weights_and_recipe_come_back(sound: Path, generated: GenerationResult) -> None:
+    """To the bit, and with the options that have defaults."""
+    model = small_model(generated)
+    checkpoint = load(sound)
+    restored = restore(checkpoint)
+    assert checkpoint.baseline == "gns"
+    assert restored.options == model.options
+    for name, value in model.state_dict().items():
+        assert torch.equal(restored.state_dict()[name], value), name
+    assert examine(str(sound)) == {"refused": None}
+
+
+@pytest.mark.parametrize("spoil", HOSTILE, ids=lambda spoil: spoil.__name__)
+def test_a_hostile_file_is_refused(spoil: Callable[[Path], None], sound: Path) -> None:
+    """With a reason, and soon.
+
+    The checks run in this process here, for speed; the child is tested below.
+    """
+    spoil(sound)
+    started = time.process_time()
+    assert examine(str(sound))["refused"]
+    assert time.process_time() - started < MOST_SECONDS
+
+
+def test_a_header_may_be_as_long_as_a_pickle_begins(sound: Path) -> None:
+    """A file that begins with the bytes 80 02 is a pickle, or has such a header."""
+    data = sound.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    longer = (length // 2**16 + 1) * 2**16 + 0x0280
+    header = data[8 : 8 + length].ljust(longer)
+    sound.write_bytes(longer.to_bytes(8, "little") + header + data[8 + length :])
+    assert sound.read_bytes().startswith(b"\x80\x02")
+    assert load(sound).baseline == "gns"
+
+
+def test_the_checks_run_in_a_child(sound: Path) -> None:
+    """What it refuses is an error of an unreadable file here."""
+    check_in_child(sound)
+    not_a_number(sound)
+    with pytest.raises(UnreadableFileError) as caught:
+        check_in_child(sound)
+    assert caught.value.where == str(sound)
+
+
+def test_what_cannot_be_exported_is_refused(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Another suffix, another architecture, weights that are not finite."""
+    model = small_model(generated)
+    with pytest.raises(UsageError):
+        export_safetensors(model, tmp_path / "model.pt", baseline="gns")
+    with pytest.raises(UnreadableFileError):
+        export_safetensors(model, tmp_path / "a.safetensors", baseline="neuralmpm")
+    next(model.parameters()).data[:] = torch.nan
+    with pytest.raises(UnreadableFileError):
+        export_safetensors(model, tmp_path / "a.safetensors", baseline="gns")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_entry_carries_a_file_of_safetensors(
+    tmp_path: Path, sound: Path, generated: GenerationResult
+) -> None:
+    """It is submitted, checked, and predicts the scores of its entry again."""
+    board = tmp_path / "board"
+    root = generated.root
+    predictions = tmp_path / "predictions.nc"
+    predict(sound, predictions, root=root, device="cpu", threads=1, method="own")
+    meta = Meta(authors=("A. Author",), command="make")
+    submit([predictions], meta, board=board, root=root, new_board=True, weights=[sound])
+    weights = board / "weights/curl-noise/tiny/own_0.safetensors"
+    assert weights.read_bytes() == sound.read_bytes()
+    assert check_board(board, root=root, isolated=False).findings == ()
+
+    result = reproduce(board, ["curl-noise/tiny/own"], root=root, costs=False)
+    (line,) = result.lines.values()
+    assert line.level is Level.REPRODUCED
+    assert line.reproduced[0].difference == 0.0
+
+    rewrite_recipe(sound, lambda recipe: recipe["options"].update(layers=3))
+    assert examine(str(sound))["refused"]
