@@ -45,6 +45,9 @@ NEVER = {
 knows no score.
 """
 
+LONGEST_CHAIN = 15
+"""Modules in the longest chain of imports, at most."""
+
 DRAWN = {"matplotlib", "PIL", "xarray", "taichi", "torch"}
 HEAVY = {
     "taichi",
@@ -155,6 +158,27 @@ def test_no_import_cycle() -> None:
         assert free, f"a cycle among {sorted(left)}"
         for name in free:
             del left[name]
+
+
+def test_no_chain_of_imports_is_long() -> None:
+    """A reader who follows imports from any module of the package ends soon."""
+    graph = edges()
+
+    @functools.cache
+    def chain_length(module: str) -> int:
+        lengths_below = [chain_length(imported) for imported in graph[module]]
+        return 1 + max(lengths_below, default=0)
+
+    chain_lengths = {}
+    for module in graph:
+        if not module.startswith("studies"):
+            chain_lengths[module] = chain_length(module)
+    long_chains = {}
+    for module, length in chain_lengths.items():
+        if length > LONGEST_CHAIN:
+            long_chains[module] = length
+    assert max(chain_lengths.values()) > 1
+    assert not long_chains
 
 
 def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:

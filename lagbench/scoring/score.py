@@ -18,7 +18,7 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import ReferenceScores, shipped
-from lagbench.references.table import NAIVE
+from lagbench.references.table import CLASSICAL, NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -230,8 +230,12 @@ def _make_card(
         if row in NAIVE and ranking in row_scores:
             counting[row] = row_scores[ranking]
 
+    classical = {}
+    for name in CLASSICAL.intersection(shipped_references):
+        classical[name] = shipped_references[name]
+
     against_classical, why_not = compare_with_solvers(
-        header, task.size, submission, shipped_references
+        header, task.size, submission, classical
     )
     few_nodes = _warn_of_few_nodes(task, measurement.tallies[SUBMISSION])
     return ScoreCard(

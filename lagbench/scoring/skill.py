@@ -36,7 +36,6 @@ from lagbench.metrics.aggregate import (
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
 from lagbench.references.shipped import ReferenceScores, solver_seconds
-from lagbench.references.table import CLASSICAL
 from lagbench.submission.format import Header
 
 
@@ -186,7 +185,7 @@ def compare_with_solvers(
     header: Header,
     size: Size,
     submission: Score,
-    references: Mapping[str, ReferenceScores],
+    classical: Mapping[str, ReferenceScores],
 ) -> tuple[AgainstClassical | None, str | None]:
     """Return the submission's score over that of the best classical solver of its cost.
 
@@ -196,12 +195,11 @@ def compare_with_solvers(
         header: what the predictions say about themselves, its costs among it.
         size: the data set.
         submission: score of the submission in the ranking metric.
-        references: shipped scores and costs of the reference predictors.
+        classical: shipped scores and costs of the classical solvers.
     """
     solvers = {}
     costs = {}
-    for name in CLASSICAL.intersection(references):
-        reference = references[name]
+    for name, reference in classical.items():
         if submission.metric.name in reference.scores:
             solvers[name] = reference.scores[submission.metric.name]
             costs[name] = reference.seconds_per_frame
