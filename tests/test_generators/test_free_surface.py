@@ -72,12 +72,15 @@ def test_free_flight_is_a_parabola(material: Material) -> None:
     substeps = 180
     solver.advance(substeps)
     t = substeps * CONSTANTS.dt
-    vx, vy = solver.velocity()[0].astype(np.float64).mean(axis=0)
+    velocity = solver.velocity()[0].astype(np.float64)
+    vx, vy = velocity.mean(axis=0)
     assert abs(vx - 0.25) <= 2e-5
-    assert abs(vy - (0.5 - 2.5 * t)) <= 2e-5
+    expected_vy = 0.5 - 2.5 * t
+    assert abs(vy - expected_vy) <= 2e-5
     # Symplectic Euler: position lags by half a substep of acceleration.
-    expected = y + 0.5 * t - 0.5 * 2.5 * t * (t + CONSTANTS.dt)
-    assert abs(mean_height(solver) - expected) <= 2e-5
+    fall = 0.5 * 2.5 * t * (t + CONSTANTS.dt)
+    expected_height = y + 0.5 * t - fall
+    assert abs(mean_height(solver) - expected_height) <= 2e-5
 
 
 @pytest.mark.parametrize("material", Material)
@@ -87,12 +90,10 @@ def test_momentum_and_spin_are_conserved(material: Material) -> None:
     state = scenario(WEIGHTLESS, Part(material, DISC, (0.5, 0.5)))
     x, y = (state.position - 0.5).T
     rotation = spin * np.stack([-y, x], axis=1)
+    drift = np.array([0.1, 0.2])
     gradient = np.array([[0.0, -spin], [spin, 0.0]])
-    turning = dataclasses.replace(
-        state,
-        velocity=rotation + np.array([0.1, 0.2]),
-        affine=np.broadcast_to(gradient, (len(x), 2, 2)),
-    )
+    affine = np.broadcast_to(gradient, (len(x), 2, 2))
+    turning = dataclasses.replace(state, velocity=rotation + drift, affine=affine)
     solver = start(WEIGHTLESS, [turning])
     dx = 1 / WEIGHTLESS.grid
     momentum = total_momentum(solver)
@@ -135,35 +136,42 @@ def test_friction_decelerates_by_mu_g() -> None:
     """
     decelerations = {}
     for friction in (0.0, 0.3):
-        block = Part(Material.ROPE, Rectangle(0.3, 0.1), (0.3, LOW + 0.065))
+        shape = Rectangle(0.3, 0.1)
+        block = Part(Material.ROPE, shape, (0.3, LOW + 0.065))
         state = scenario(CONSTANTS, block, friction=friction)
         solver = start(CONSTANTS, [state])
         solver.advance(600)
         resting = solver.position()[0].astype(np.float64)
         pushed = state.velocity + np.array([0.6, 0.0])
-        solver.load([dataclasses.replace(state, position=resting, velocity=pushed)])
+        sliding = dataclasses.replace(state, position=resting, velocity=pushed)
+        solver.load([sliding])
         solver.advance(60)
         early = solver.velocity()[0, :, 0].mean()
         solver.advance(180)
         late = solver.velocity()[0, :, 0].mean()
-        decelerations[friction] = (early - late) / (180 * CONSTANTS.dt)
+        duration = 180 * CONSTANTS.dt
+        decelerations[friction] = (early - late) / duration
     assert abs(decelerations[0.0]) <= 1e-4
     assert decelerations[0.3] == pytest.approx(0.3 * 2.5, rel=0.1)
 
 
 def test_walls_hold_and_health_tells() -> None:
     """Nothing leaves the box; health reports the extremes of the last advance."""
-    state = scenario(CONSTANTS, Part(Material.LIQUID, DISC, (0.25, 0.25), (-2.0, -2.0)))
+    towards_corner = (-2.0, -2.0)
+    drop = Part(Material.LIQUID, DISC, (0.25, 0.25), towards_corner)
+    state = scenario(CONSTANTS, drop)
     solver = start(CONSTANTS, [state])
     assert solver.health()[0].max_speed == 2.0
     solver.advance(120)
     health = solver.health()[0]
     assert health.finite
-    assert 2.0 < health.max_speed < 1.0 / (CONSTANTS.grid * CONSTANTS.dt)
+    cell_per_substep = 1.0 / (CONSTANTS.grid * CONSTANTS.dt)
+    assert 2.0 < health.max_speed < cell_per_substep
     assert 0.5 <= health.jacobian_min < 0.99
     assert health.jacobian_max == 1.0
-    assert solver.position().min() >= np.float32(LOW)
-    assert solver.position().max() <= np.float32(1.0 - LOW)
+    position = solver.position()
+    assert position.min() >= np.float32(LOW)
+    assert position.max() <= np.float32(1.0 - LOW)
 
 
 def test_displace_moves_and_keeps_in_the_box() -> None:
@@ -175,8 +183,10 @@ def test_displace_moves_and_keeps_in_the_box() -> None:
     offset[0, 1] = -5.0, 5.0
     solver.displace(offset)
     after = solver.position()
-    np.testing.assert_array_equal(after[0, 0], before[0, 0] + offset[0, 0])
-    np.testing.assert_allclose(after[0, 1], [LOW, 1.0 - LOW], atol=1e-4)
+    expected = before[0, 0] + offset[0, 0]
+    np.testing.assert_array_equal(after[0, 0], expected)
+    corner = [LOW, 1.0 - LOW]
+    np.testing.assert_allclose(after[0, 1], corner, atol=1e-4)
     np.testing.assert_array_equal(after[0, 2:], before[0, 2:])
     solver.advance(5)
 
@@ -222,10 +232,12 @@ def test_states_that_do_not_fit_are_refused() -> None:
     good = ball(Material.LIQUID)
     with pytest.raises(UsageError):
         solver.load([good, good])
+    one_less = dataclasses.replace(good, position=good.position[:-1])
     with pytest.raises(UsageError) as caught:
-        solver.load([dataclasses.replace(good, position=good.position[:-1])])
+        solver.load([one_less])
     assert caught.value.where == "scenario 0"
-    nowhere = dataclasses.replace(good, position=good.position * np.nan)
+    not_numbers = np.full_like(good.position, np.nan)
+    nowhere = dataclasses.replace(good, position=not_numbers)
     fast = dataclasses.replace(good, velocity=good.velocity + 100.0)
     for state in (nowhere, fast):
         with pytest.raises(WorkFailedError):
@@ -237,11 +249,14 @@ def test_courant_numbers_by_hand() -> None:
     64/1200.
     """
     fluid = parameters(grid=128, dt=1 / 1200, liquid_modulus=30.0)
-    assert courant(fluid)[Material.LIQUID] == pytest.approx(0.58424, abs=1e-5)
-    both = courant(parameters(grid=64, dt=1 / 1200))
+    liquid_number = courant(fluid)[Material.LIQUID]
+    assert liquid_number == pytest.approx(0.58424, abs=1e-5)
+
+    numbers = courant(parameters(grid=64, dt=1 / 1200))
     sound_speed = np.sqrt(5 * 40 * 0.8 / (1.2 * 0.6))
-    assert both[Material.SNOW] == pytest.approx(sound_speed * 64 / 1200)
-    assert max(both.values()) <= 0.8
+    snow_number = sound_speed * 64 / 1200
+    assert numbers[Material.SNOW] == pytest.approx(snow_number)
+    assert max(numbers.values()) <= 0.8
 
 
 def test_jacobian_of_liquid_and_of_solids() -> None:
@@ -266,9 +281,13 @@ def test_two_bodies_in_touch_share_the_grid() -> None:
     """A liquid that falls on jelly stops above it: the bodies do not pass through each
     other.
     """
-    below = Part(Material.JELLY, Rectangle(0.86, 0.2), (0.5, LOW + 0.11))
-    above = Part(Material.LIQUID, Rectangle(0.5, 0.1), (0.5, LOW + 0.32))
+    bed = Rectangle(0.86, 0.2)
+    layer = Rectangle(0.5, 0.1)
+    below = Part(Material.JELLY, bed, (0.5, LOW + 0.11))
+    above = Part(Material.LIQUID, layer, (0.5, LOW + 0.32))
     state = scenario(CONSTANTS, below, above)
     position = run(CONSTANTS, [state], 600)[0][0]
-    jelly = state.material == Material.JELLY
-    assert position[jelly, 1].mean() < position[~jelly, 1].mean() - 0.1
+    is_jelly = state.material == Material.JELLY
+    jelly_height = position[is_jelly, 1].mean()
+    liquid_height = position[~is_jelly, 1].mean()
+    assert jelly_height < liquid_height - 0.1

@@ -34,10 +34,20 @@ LIQUID_IDS = (0, 4, 1, 5, 2, 6, 3, 7)
 PAIR_IDS = (48, 54, 49, 55, 50, 56, 51, 57, 52, 58, 53, 59)
 # Equals stand side by side: families repeat with the id by 4, pairs by 6, and a commit
 # takes every third.
-EVERY = [("fluid", i) for i in LIQUID_IDS] + [("multimaterial", i) for i in PAIR_IDS]
-SETTLING = [("fluid", i) for i in (4, 5, 6, 7)] + [("multimaterial", 53)]
-SMALL = [("fluid", size, i) for size in ("mini", "tiny") for i in range(4)]
-SMALL += [("multimaterial", size, i) for size in ("mini", "tiny") for i in range(6)]
+LIQUIDS = [("fluid", scenario) for scenario in LIQUID_IDS]
+PAIRS = [("multimaterial", scenario) for scenario in PAIR_IDS]
+EVERY = [*LIQUIDS, *PAIRS]
+SETTLING = [
+    ("fluid", 4),
+    ("fluid", 5),
+    ("fluid", 6),
+    ("fluid", 7),
+    ("multimaterial", 53),
+]
+SMALL: list[tuple[str, str, int]] = []
+for small_split, families in (("fluid", 4), ("multimaterial", 6)):
+    for small_size in ("mini", "tiny"):
+        SMALL += [(small_split, small_size, family) for family in range(families)]
 
 
 @dataclass(frozen=True)
@@ -61,9 +71,8 @@ class History:
 
 def constants(split: str, size: str) -> FreeSurfaceParameters:
     """Return the solver's constants at a size of the registry."""
-    return cast(
-        "FreeSurfaceParameters", solver_constants(registry.load().size(split, size))
-    )
+    described = registry.load().size(split, size)
+    return cast("FreeSurfaceParameters", solver_constants(described))
 
 
 FULL = dataclasses.replace(constants("multimaterial", "full"), particles=1250, wall=3)
@@ -83,13 +92,16 @@ def wave_speeds(p: FreeSurfaceParameters) -> Array:
     )
     moduli = [p.liquid_modulus]
     for young, nu in solids:
-        moduli.append(young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu)))
-    return np.sqrt(np.array(moduli) / p.density)
+        divisor = (1.0 + nu) * (1.0 - 2.0 * nu)
+        moduli.append(young * (1.0 - nu) / divisor)
+    square_speeds = np.array(moduli) / p.density
+    return np.sqrt(square_speeds)
 
 
 def spacing(state: InitialState) -> float:
     """Mean distance of particles, the square root of the area of one."""
-    return float(np.sqrt(state.area / len(state.position)))
+    particle_area = state.area / len(state.position)
+    return float(np.sqrt(particle_area))
 
 
 @functools.cache
@@ -105,6 +117,7 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
     gap = 0.0
     sound = wave_speeds(solver_parameters)[state.material]
     is_liquid = state.material == Material.LIQUID
+    is_rope = state.material == Material.ROPE
     mach = []
     jacobian = []
     energy = solver.energy()
@@ -115,24 +128,34 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
         (health,) = solver.health()
         assert health.finite
         fastest = max(fastest, health.max_speed)
-        mach.append(np.linalg.norm(solver.velocity()[0], axis=1) / sound)
+        speed = np.linalg.norm(solver.velocity()[0], axis=1)
+        mach.append(speed / sound)
         jacobian.append(solver.volume_ratio()[0, is_liquid])
-        rope = solver.position()[0, state.material == Material.ROPE].astype(np.float64)
-        if len(rope) and len(kinetic) % 15 == 0:
-            gap = max(gap, longest_edge(rope))
+        if is_rope.any() and len(kinetic) % 15 == 0:
+            rope = solver.position()[0, is_rope]
+            gap = max(gap, longest_edge(rope.astype(np.float64)))
         energy = solver.energy()
+
+    kinetic.append(energy.kinetic[0])
+    total.append(energy.total[0])
+    position = solver.position()[0]
+    ratio = solver.volume_ratio()[0]
+    lowest_ratio, _ = solver.volume_ratio_extremes()
+    least_jacobian = 1.0
+    if is_liquid.any():
+        least_jacobian = float(np.quantile(jacobian, 0.001))
     return History(
         parameters=solver_parameters,
         state=state,
-        kinetic=np.array([*kinetic, energy.kinetic[0]]),
-        total=np.array([*total, energy.total[0]]),
+        kinetic=np.array(kinetic),
+        total=np.array(total),
         fastest=fastest,
-        position=solver.position()[0].astype(np.float64),
-        ratio=solver.volume_ratio()[0].astype(np.float64),
+        position=position.astype(np.float64),
+        ratio=ratio.astype(np.float64),
         largest_gap=gap,
         mach=float(np.quantile(mach, 0.999)),
-        liquid_jacobian=float(np.quantile(jacobian, 0.001)) if is_liquid.any() else 1.0,
-        lowest=solver.volume_ratio_extremes()[0][0].astype(np.float64),
+        liquid_jacobian=least_jacobian,
+        lowest=lowest_ratio[0].astype(np.float64),
     )
 
 
@@ -141,11 +164,18 @@ def longest_edge(position: Array) -> float:
     spanning tree.
     """
     triangles = Delaunay(position).simplices
-    sides = [triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]
+    sides = [
+        triangles[:, [0, 1]],
+        triangles[:, [1, 2]],
+        triangles[:, [0, 2]],
+    ]
     first, second = np.concatenate(sides).T
-    length = np.linalg.norm(position[first] - position[second], axis=1)
-    graph = coo_matrix((length, (first, second)), shape=(len(position), len(position)))
-    return float(minimum_spanning_tree(graph.tocsr()).data.max())
+    difference = position[first] - position[second]
+    length = np.linalg.norm(difference, axis=1)
+    count = len(position)
+    graph = coo_matrix((length, (first, second)), shape=(count, count))
+    tree = minimum_spanning_tree(graph.tocsr())
+    return float(tree.data.max())
 
 
 def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> Array:
@@ -155,22 +185,31 @@ def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> 
     scaled = position * p.grid
     base = np.floor(scaled - 0.5).astype(int)
     f = scaled - base
-    weight = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2)
-    count = np.zeros((p.grid + 1, p.grid + 1))
-    stencil = [
-        (i, j, weight[i][:, 0] * weight[j][:, 1]) for i in range(3) for j in range(3)
-    ]
-    for i, j, w in stencil:
-        np.add.at(count, (base[:, 0] + i, base[:, 1] + j), w)
+    low = 0.5 * (1.5 - f) ** 2
+    middle = 0.75 - (f - 1.0) ** 2
+    high = 0.5 * (f - 0.5) ** 2
+    weight = (low, middle, high)
+    stencil = []
+    for i, j in np.ndindex(3, 3):
+        node = (base[:, 0] + i, base[:, 1] + j)
+        stencil.append((node, weight[i][:, 0] * weight[j][:, 1]))
+
+    node_count = p.grid + 1
+    count = np.zeros((node_count, node_count))
+    for node, w in stencil:
+        np.add.at(count, node, w)
+    walls = ((p.wall, 1), (p.grid - p.wall, -1))
     for n in (count, count.T):
-        for wall, inside, outside in ((p.wall, 1, -1), (p.grid - p.wall, -1, 1)):
+        for wall, inwards in walls:
             n[wall] *= 2.0
-            n[wall + inside] += n[wall + outside]
-            n[wall + outside] = n[wall + inside]
-    gathered = np.sum(
-        [w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil], axis=0
-    )
-    return np.asarray(gathered * area / p.particles * p.grid**2)
+            n[wall + inwards] += n[wall - inwards]
+            n[wall - inwards] = n[wall + inwards]
+
+    gathered = np.zeros(len(position))
+    for node, w in stencil:
+        gathered += w * count[node]
+    particle_area = area / p.particles
+    return gathered * particle_area * p.grid**2
 
 
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
@@ -178,8 +217,10 @@ def test_sound_stays_within_a_cell(size: str) -> None:
     """The acoustic Courant number of every material of a split is at most 0.8 at every
     size.
     """
-    assert courant(constants("fluid", size))[Material.LIQUID] <= 0.8
-    assert max(courant(constants("multimaterial", size)).values()) <= 0.8
+    liquid = courant(constants("fluid", size))
+    materials = courant(constants("multimaterial", size))
+    assert liquid[Material.LIQUID] <= 0.8
+    assert max(materials.values()) <= 0.8
 
 
 def assert_sound(run: History) -> None:
@@ -191,9 +232,12 @@ def assert_sound(run: History) -> None:
     low = run.parameters.wall / run.parameters.grid
     assert run.position.min() >= low
     assert run.position.max() <= 1.0 - low
-    assert run.fastest * run.parameters.dt * run.parameters.grid <= 0.8
-    rise = (run.total - np.minimum.accumulate(run.total)).max()
-    assert rise <= 0.02 * (run.total[0] - run.total.min())
+    cells_per_substep = run.fastest * run.parameters.dt * run.parameters.grid
+    assert cells_per_substep <= 0.8
+    least_so_far = np.minimum.accumulate(run.total)
+    largest_rise = np.max(run.total - least_so_far)
+    total_fall = run.total[0] - run.total.min()
+    assert largest_rise <= 0.02 * total_fall
 
 
 @pytest.mark.slow
@@ -213,20 +257,22 @@ def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
     assert run.liquid_jacobian >= 0.9
     p = run.parameters
     material = run.state.material
-    assert (run.lowest[material == Material.LIQUID] > p.jacobian_min).all()
+    liquid_ratio = run.lowest[material == Material.LIQUID]
+    assert np.all(liquid_ratio > p.jacobian_min)
     # neither Jp nor the hardening exp(xi (1 - Jp)) meets its numerical bound
-    least_plastic = max(
-        p.snow_jp_min, 1.0 - np.log(p.snow_hardening_max) / p.snow_hardening
-    )
-    assert (run.lowest[material == Material.SNOW] > least_plastic).all()
-    assert run.kinetic[-1] <= 0.03 * run.kinetic.max()
-    rope = run.state.material == Material.ROPE
+    hardest = 1.0 - np.log(p.snow_hardening_max) / p.snow_hardening
+    snow_ratio = run.lowest[material == Material.SNOW]
+    assert np.all(snow_ratio > max(p.snow_jp_min, hardest))
+    most_kinetic = run.kinetic.max()
+    assert run.kinetic[-1] <= 0.03 * most_kinetic
+    rope = material == Material.ROPE
     if rope.any():
         position = run.position[rope]
         distance, _ = cKDTree(position).query(position, k=2)
         neighbour = np.asarray(distance)[:, 1]
         assert neighbour.max() <= 2.0 * spacing(run.state)
-        assert run.largest_gap <= 1.5 * longest_edge(run.state.position[rope])
+        initial_gap = longest_edge(run.state.position[rope])
+        assert run.largest_gap <= 1.5 * initial_gap
 
 
 @pytest.mark.slow
@@ -246,20 +292,28 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
     x, y = run.position.T
     share = (x - low) / width
     column = np.clip(share * columns, 0, columns - 1).astype(int)
-    heights = [np.quantile(y[column == c], 0.98) for c in range(columns)]
+    heights = []
+    for c in range(columns):
+        heights.append(np.quantile(y[column == c], 0.98))
     top = np.array(heights) - low
-    np.testing.assert_allclose(top, run.state.area / width, rtol=0.25)
+    mean_depth = run.state.area / width
+    np.testing.assert_allclose(top, mean_depth, rtol=0.25)
+
     below = low + top[column] - y
-    deep = below > 2.0 * cell
-    density = relative_density(run.position, run.state.area, p)[deep]
-    assert abs(density.mean() - 1.0) <= 0.02
-    assert density.std() <= 0.05
+    density = relative_density(run.position, run.state.area, p)
+    deep_density = density[below > 2.0 * cell]
+    assert abs(deep_density.mean() - 1.0) <= 0.02
+    assert deep_density.std() <= 0.05
+
     pressure = p.liquid_modulus * (1.0 - run.ratio)
-    floor = p.density * p.gravity * top.mean()
-    for start_of_bin, end in pairwise(np.linspace(2.0 * cell, top.mean(), 6)):
-        here = (below >= start_of_bin) & (below < end)
-        excess = pressure[here].mean() - p.density * p.gravity * below[here].mean()
-        assert abs(excess) <= 0.1 * floor
+    weight = p.density * p.gravity  # per area and depth
+    floor_pressure = weight * top.mean()
+    depths = np.linspace(2.0 * cell, top.mean(), 6)
+    for least_depth, most_depth in pairwise(depths):
+        here = (below >= least_depth) & (below < most_depth)
+        hydrostatic = weight * below[here].mean()
+        excess = pressure[here].mean() - hydrostatic
+        assert abs(excess) <= 0.1 * floor_pressure
 
 
 @pytest.mark.slow
@@ -281,7 +335,8 @@ def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
     tree = cKDTree(state.position)
     first, second = tree.query_pairs(reach, output_type="ndarray").T
     x = solver.position()[0].astype(np.float64)
-    distance = np.linalg.norm(x[first] - x[second], axis=1)
+    difference = x[first] - x[second]
+    distance = np.linalg.norm(difference, axis=1)
     torn = distance > 3.0 * spacing(state)
     assert torn.mean() >= 0.05
 
@@ -294,24 +349,30 @@ def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
     """
     radius = 0.126
     drop = 0.45
-    ball = Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius))
+    floor = 3 / 64
+    centre = (0.5, floor + drop + radius)
+    ball = Part(Material.JELLY, Disc(radius), centre)
     state = scenario(FULL, ball, seed=seed)
     solver = start(FULL, [state])
     heights = []
     for _ in range(120):
-        heights.append(float(solver.position()[0, :, 1].mean()))
+        y = solver.position()[0, :, 1]
+        heights.append(float(y.mean()))
         solver.advance(FRAME)
     lowest = int(np.argmin(heights[:60]))
     rest = heights[0] - drop
-    assert 0.6 <= (max(heights[lowest:]) - rest) / drop <= 0.9
+    rebound = max(heights[lowest:]) - rest
+    assert 0.6 <= rebound / drop <= 0.9
     solver.advance(480 * FRAME)
     # root mean square distance after the best rigid motion (Kabsch)
     after = solver.position()[0].astype(np.float64)
     a = state.position - state.position.mean(axis=0)
     b = after - after.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
-    turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    square = ((a @ turn - b) ** 2).sum(axis=1)
+    handedness = np.sign(np.linalg.det(u @ vt))
+    rotation = u @ np.diag([1.0, handedness]) @ vt
+    deviation = a @ rotation - b
+    square = np.sum(deviation**2, axis=1)
     assert np.sqrt(square.mean()) <= 0.03 * radius
 
 
@@ -323,19 +384,28 @@ def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
     """A free bar swings lengthwise at sqrt(E / (rho (1 - nu^2))) / 2L to 2 %."""
     length = 0.6
     weightless = dataclasses.replace(FULL, particles=900, gravity=0.0)
-    state = scenario(weightless, Part(material, Rectangle(length, 0.05), (0.5, 0.5)))
-    mode = np.cos(np.pi * (state.position[:, 0] - 0.5 + 0.5 * length) / length)
+    bar = Part(material, Rectangle(length, 0.05), (0.5, 0.5))
+    state = scenario(weightless, bar)
+    left_end = 0.5 - 0.5 * length
+    along = (state.position[:, 0] - left_end) / length
+    mode = np.cos(np.pi * along)
     state.velocity[:, 0] = 0.05 * mode
     solver = start(weightless, [state])
     amplitude = []
     for _ in range(1200):
         solver.advance(5)
-        amplitude.append(float((solver.velocity()[0, :, 0] * mode).mean()))
+        velocity = solver.velocity()[0, :, 0]
+        amplitude.append(float(np.mean(velocity * mode)))
     a = np.array(amplitude)
     before = np.flatnonzero(np.diff(np.sign(a)))
-    crossing = (before + a[before] / (a[before] - a[before + 1])) * 5 * weightless.dt
-    frequency = 0.5 * (len(crossing) - 1) / (crossing[-1] - crossing[0])
-    expected = np.sqrt(young / (1.0 - 0.3**2)) / (2.0 * length)
+    # where the line between the two amplitudes is 0
+    share = a[before] / (a[before] - a[before + 1])
+    crossing = (before + share) * 5 * weightless.dt
+    half_periods = len(crossing) - 1
+    duration = crossing[-1] - crossing[0]
+    frequency = 0.5 * half_periods / duration
+    sound = np.sqrt(young / (1.0 - 0.3**2))
+    expected = sound / (2.0 * length)
     assert frequency == pytest.approx(expected, rel=0.02)
 
 
