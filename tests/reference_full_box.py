@@ -28,7 +28,8 @@ class ReferenceFullBox:
         self.shape = tuple(count + 2 for count in parameters.cells)
         self.viscosity = state.viscosity
         self.walls = state.wall_velocity
-        self.mass = state.area / parameters.particles / self.dx**self.dimension
+        particle_volume = state.area / parameters.particles
+        self.mass = particle_volume / self.dx**self.dimension
         self.x = state.position.copy()
         self.v = state.velocity.copy()
         self.c = state.affine.copy()
@@ -36,11 +37,11 @@ class ReferenceFullBox:
         self.force = np.zeros((*self.shape, self.dimension))
         if state.body_force is not None:
             layers = state.body_force[0]
-            row = np.clip(np.arange(self.shape[1]) - 1, 0, parameters.cells[1] - 1)
-            per_row = layers[row * len(layers) // parameters.cells[1]]
-            self.force += np.expand_dims(
-                per_row, tuple(a for a in range(self.dimension) if a != 1)
-            )
+            row_count = parameters.cells[1]
+            row = np.clip(np.arange(self.shape[1]) - 1, 0, row_count - 1)
+            per_row = layers[row * len(layers) // row_count]
+            other_axes = tuple(a for a in range(self.dimension) if a != 1)
+            self.force += np.expand_dims(per_row, other_axes)
         self.tangential = 1.0
         if parameters.no_slip:
             self.tangential = -1.0
@@ -52,7 +53,8 @@ class ReferenceFullBox:
             self.fill(v, moving=True)
             self.fill_scalar(r)
             self.fill_scalar(jbar)
-            gain = self.p.dt * (self.acceleration(v, jbar) + self.force)
+            acceleration = self.acceleration(v, jbar) + self.force
+            gain = self.p.dt * acceleration
             v = v + gain
             self.fill(v, moving=True)
             self.fill(gain, moving=False)
@@ -63,14 +65,18 @@ class ReferenceFullBox:
         scaled = (self.x - np.array(self.box.low)) / self.dx + 0.5
         base = np.floor(scaled - 0.5).astype(int)
         f = scaled - base
-        weight = [0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2]
+        low = 0.5 * (1.5 - f) ** 2
+        middle = 0.75 - (f - 1) ** 2
+        high = 0.5 * (f - 0.5) ** 2
+        weight = [low, middle, high]
         result = []
-        for step in itertools.product(range(3), repeat=self.dimension):
+        for step in np.ndindex((3,) * self.dimension):
             w = np.ones(len(f))
             for axis, i in enumerate(step):
                 w = w * weight[i][:, axis]
-            node = tuple((base + np.array(step)).T)
-            result.append((node, w, (np.array(step) - f) * self.dx))
+            offset = np.array(step)
+            node = tuple((base + offset).T)
+            result.append((node, w, (offset - f) * self.dx))
         return result
 
     def to_grid(self) -> tuple[Array, Array, Array]:
@@ -96,7 +102,8 @@ class ReferenceFullBox:
                 sign = np.full(self.dimension, self.tangential)
                 sign[axis] = -1.0
                 speed = self.walls[2 * axis + side]
-                drag[edge] += drag[ghost] + 2.0 * speed * count[ghost][..., None]
+                ghost_count = count[ghost][..., None]
+                drag[edge] += drag[ghost] + 2.0 * speed * ghost_count
                 momentum[edge] += sign * momentum[ghost]
                 count[edge] += count[ghost]
                 volume[edge] += volume[ghost]
@@ -106,7 +113,8 @@ class ReferenceFullBox:
         v = np.zeros_like(momentum)
         r = np.zeros_like(count)
         jbar = np.ones_like(count)
-        v[inner] = (momentum + drag)[inner] / count[inner][..., None]
+        total = momentum + drag
+        v[inner] = total[inner] / count[inner][..., None]
         r[inner] = count[inner] * self.mass
         jbar[inner] = volume[inner] / count[inner]
         return v, r, jbar
@@ -167,7 +175,8 @@ class ReferenceFullBox:
             for along in range(self.dimension):
                 laplacian = laplacian + np.roll(v[..., axis], 1, along)
                 laplacian = laplacian + np.roll(v[..., axis], -1, along)
-            total = stiffness * q + self.viscosity / self.dx**2 * laplacian
+            diffusion = self.viscosity / self.dx**2 * laplacian
+            total = stiffness * q + diffusion
             a[..., axis][inner] = total[inner]
         return a
 
@@ -191,8 +200,10 @@ class ReferenceFullBox:
         scale = 4.0 / self.dx**2
         c *= scale
         density = np.maximum(density, 0.5)
-        shift = -p.shift * self.dx**2 * scale * thicker / density[:, None]
-        shift = np.clip(shift, -0.1 * self.dx, 0.1 * self.dx)
+        gradient = scale * thicker / density[:, None]
+        shift = -p.shift * self.dx**2 * gradient
+        most = 0.1 * self.dx
+        shift = np.clip(shift, -most, most)
         u = self.v + push
         u += p.velocity_relaxation * (here - u)
         self.v = u + np.einsum("pab,pb->pa", c, shift)

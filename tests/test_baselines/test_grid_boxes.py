@@ -30,13 +30,15 @@ from lagbench.tensors import Batch, TensorBox
 
 Positions = NDArray[np.float64]
 
+UNIT = (0.0, 1.0)
+LOW = (0.0, 0.75)
 BOXES = {
-    "square": Box.from_bounds([(0.0, 1.0)] * 2, [True] * 2),
-    "channel": Box.from_bounds([(0.0, 1.0), (0.0, 0.75)], [True, False]),
-    "oblong": Box.from_bounds([(0.25, 1.25), (0.0, 0.45)], [True] * 2),
-    "room": Box.from_bounds([(0.0, 1.0)] * 3),
-    "cube": Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3),
-    "duct": Box.from_bounds([(0.0, 1.0), (0.0, 0.75), (0.0, 1.0)], [True, False, True]),
+    "square": Box.from_bounds([UNIT, UNIT], periodic=[True, True]),
+    "channel": Box.from_bounds([UNIT, LOW], periodic=[True, False]),
+    "oblong": Box.from_bounds([(0.25, 1.25), (0.0, 0.45)], periodic=[True, True]),
+    "room": Box.from_bounds([UNIT, UNIT, UNIT]),
+    "cube": Box.from_bounds([UNIT, UNIT, UNIT], periodic=[True, True, True]),
+    "duct": Box.from_bounds([UNIT, LOW, UNIT], periodic=[True, False, True]),
 }
 
 SMALL: dict[str, object] = {
@@ -79,11 +81,9 @@ def surrogate(name: str, *, awake: float = 0.0, **options: Any) -> Any:
         ("acceleration_std", 0.0002),
     ):
         statistics[kind] = (value,) * box.dimension
+    dataset = info(bounds=box.bounds, periodic=tuple(axes), statistics=statistics)
     torch.manual_seed(0)
-    model = NeuralMPM.build(
-        SMALL | options,
-        info(bounds=box.bounds, periodic=tuple(axes), statistics=statistics),
-    )
+    model = NeuralMPM.build(SMALL | options, dataset)
     if awake:
         for parameter in model.network.end.parameters():
             nn.init.normal_(parameter, std=awake)
@@ -93,8 +93,9 @@ def surrogate(name: str, *, awake: float = 0.0, **options: Any) -> Any:
 def window_of(frames: Positions, walls: Tensor | None = None) -> Batch:
     """Return one window from positions of shape [frame, particle, axis]."""
     particles = frames.shape[1]
+    position = frames.swapaxes(0, 1).astype(np.float32)
     return Batch(
-        position=torch.from_numpy(frames.swapaxes(0, 1).astype(np.float32)),
+        position=torch.from_numpy(position),
         sample=torch.zeros(particles, dtype=torch.int64),
         material=torch.zeros(particles, dtype=torch.int64),
         wall_velocity=walls,
@@ -107,7 +108,8 @@ def drift(name: str, frames: int, velocity: Sequence[float]) -> Positions:
     """Return a cloud that fills the box and moves as one through its seams."""
     box = BOXES[name]
     time = np.arange(frames)[:, None, None]
-    return box.wrap(draw_places(name, 300) + time * np.array(velocity))
+    displacement = time * np.array(velocity)
+    return box.wrap(draw_places(name, 300) + displacement)
 
 
 @pytest.mark.parametrize("cells", [7, 8])
@@ -121,26 +123,28 @@ def test_constant_fields_stay_constant(name: str, cells: int) -> None:
     layer = torch.zeros(200, dtype=torch.int64)
     stencil = grid.stencil(place, layer)
     ones = torch.ones(1, 1, *grid.shape)
-    torch.testing.assert_close(grid.gather(stencil, ones), torch.ones(200, 1))
+    gathered = grid.gather(stencil, ones)
+    torch.testing.assert_close(gathered, torch.ones(200, 1))
 
     # Two particles a cell along each axis: B-splines sum to a constant over them.
     axes = []
     for axis, width in zip(grid.axes, grid.cell.tolist(), strict=True):
         offsets = torch.tensor([-0.25, 0.25]) * width
-        axes.append((axis[:, None] + offsets).flatten())
-    lattice = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    lattice = lattice.reshape(-1, box.dimension)
-    is_inside = torch.from_numpy(box.contains(lattice.numpy(), tolerance=1e-6))
-    lattice = lattice[is_inside]
-    evenly = grid.stencil(lattice, torch.zeros(len(lattice), dtype=torch.int64))
-    density = grid.spread(evenly, torch.ones(len(lattice), 1), 1)[0, 0]
+        places = axis[:, None] + offsets
+        axes.append(places.flatten())
+    lattice = torch.cartesian_prod(*axes)
+    is_inside = box.contains(lattice.numpy(), tolerance=1e-6)
+    lattice = lattice[torch.from_numpy(is_inside)]
+    count = len(lattice)
+    evenly = grid.stencil(lattice, torch.zeros(count, dtype=torch.int64))
+    density = grid.spread(evenly, torch.ones(count, 1), 1)[0, 0]
+    reach = 1.501 * grid.spacing
     for number, places in enumerate(grid.axes):
         if not box.periodic[number]:  # beside walls there is less
-            reach = 1.501 * grid.spacing
-            is_inner = (places > box.low[number] + reach) & (
-                places < box.high[number] - reach
-            )
-            density = density.index_select(number, is_inner.nonzero()[:, 0])
+            is_above = places > box.low[number] + reach
+            is_below = places < box.high[number] - reach
+            inner = torch.nonzero(is_above & is_below)[:, 0]
+            density = density.index_select(number, inner)
     assert density.numel()
     expected = torch.full_like(density, 2.0**box.dimension)
     torch.testing.assert_close(density, expected)
@@ -152,10 +156,10 @@ def test_spread_is_the_scorers_transfer(name: str) -> None:
     grid = make_grid(name)
     place = draw_places(name, 400)
     velocity = np.random.default_rng(1).normal(size=place.shape)
-    stencil = grid.stencil(
-        torch.from_numpy(place).float(), torch.zeros(400, dtype=torch.int64)
-    )
-    sums = grid.spread(stencil, torch.from_numpy(velocity).float(), 1)[0]
+    layer = torch.zeros(400, dtype=torch.int64)
+    stencil = grid.stencil(torch.from_numpy(place).float(), layer)
+    value = torch.from_numpy(velocity).float()
+    sums = grid.spread(stencil, value, 1)[0]
     expected = transfer(place, velocity, Grid(8, box=box))
     momentum = np.moveaxis(expected.momentum, -1, 0)
     np.testing.assert_allclose(sums.numpy(), momentum, atol=1e-5)
@@ -175,13 +179,16 @@ def test_gather_is_the_adjoint_of_spread(name: str) -> None:
     for direction in ("spread", "gather"):
         stencil = grid.stencil(place, layer)
         if direction == "spread":
-            product = (grid.spread(stencil, value, 2) * field).sum()
+            sums = grid.spread(stencil, value, 2)
+            product = torch.sum(sums * field)
         else:
-            product = (value * grid.gather(stencil, field)).sum()
+            gathered = grid.gather(stencil, field)
+            product = torch.sum(value * gathered)
         products.append(float(product.detach()))
-        gradients.append(torch.autograd.grad(product, place)[0])
-    assert products[0] == pytest.approx(products[1], rel=1e-9)
-    torch.testing.assert_close(gradients[0], gradients[1])
+        gradients += torch.autograd.grad(product, place)
+    of_spread, of_gather = products
+    assert of_spread == pytest.approx(of_gather, rel=1e-9)
+    torch.testing.assert_close(*gradients)
 
 
 @pytest.mark.parametrize("name", ["square", "oblong", "cube"])
@@ -194,11 +201,14 @@ def test_a_shift_by_a_cell_shifts_the_fields(name: str) -> None:
 
     def density(position: Positions) -> Tensor:
         wrapped = torch.from_numpy(box.wrap(position)).float()
-        return grid.spread(grid.stencil(wrapped, layer), torch.ones(300, 1), 1)[0, 0]
+        stencil = grid.stencil(wrapped, layer)
+        return grid.spread(stencil, torch.ones(300, 1), 1)[0, 0]
 
     steps = (1, -2, 3)[: box.dimension]
-    moved = density(place + np.array(steps) * grid.cell.numpy())
-    expected = density(place).roll(steps, tuple(range(box.dimension)))
+    axes = tuple(range(box.dimension))
+    shift = np.array(steps) * grid.cell.numpy()
+    moved = density(place + shift)
+    expected = density(place).roll(steps, axes)
     torch.testing.assert_close(moved, expected, rtol=0, atol=2e-5)
 
 
@@ -207,16 +217,21 @@ def test_a_shift_along_periodic_axes_shifts_the_prediction(name: str) -> None:
     """By a node of the U-Net's coarsest level, with any weights."""
     box = BOXES[name]
     model = surrogate(name, awake=0.1, context=2, smoothing=0.3)
-    frames = drift(name, 3, (0.03, -0.01, 0.02)[: box.dimension])
-    shift = np.where(box.periodic, 4 * model.grid.cell.numpy(), 0.0)
+    velocity = (0.03, -0.01, 0.02)[: box.dimension]
+    frames = drift(name, 3, velocity)
+    four_nodes = 4 * model.grid.cell.numpy()
+    shift = np.where(box.periodic, four_nodes, 0.0)
+    shifted_frames = box.wrap(frames + shift)
     path = rolled(model, window_of(frames), 4)
-    shifted = rolled(model, window_of(box.wrap(frames + shift)), 4)
+    shifted = rolled(model, window_of(shifted_frames), 4)
     expected = path + torch.from_numpy(shift).float()
     difference = model.box.displacement(expected, shifted)
     assert float(difference.abs().max()) < 1e-5
     # Weights that do nothing would pass as well.
-    still = rolled(surrogate(name, smoothing=0.3), window_of(frames), 4)
-    assert float(model.box.displacement(still, path).abs().max()) > 1e-4
+    unmoved_model = surrogate(name, smoothing=0.3)
+    still = rolled(unmoved_model, window_of(frames), 4)
+    effect = model.box.displacement(still, path)
+    assert float(effect.abs().max()) > 1e-4
 
 
 @pytest.mark.parametrize("name", ["square", "cube"])
@@ -231,7 +246,8 @@ def test_the_seam_is_not_seen(name: str) -> None:
 
     path = rolled(model, window_of(frames[:3]), 9)
     truth = torch.from_numpy(frames[3:].swapaxes(0, 1)).float()
-    assert float(model.box.displacement(truth, path).abs().max()) < 1e-5
+    error = model.box.displacement(truth, path)
+    assert float(error.abs().max()) < 1e-5
     assert float(path.min()) >= 0.0
     assert float(path.max()) < 1.0
 
@@ -239,14 +255,16 @@ def test_the_seam_is_not_seen(name: str) -> None:
 def test_images_of_the_cube_are_a_group() -> None:
     """48 signed permutations; four leave the direction of gravity as it is."""
     images = mirror_matrices(Symmetry.SQUARE, 3)
-    numbers = {tuple(image.flatten().tolist()) for image in images}
-    assert len(images) == len(numbers) == 48
+    distinct = images.unique(dim=0)
+    assert len(images) == 48
+    assert len(distinct) == 48
     products = torch.einsum("aij,bjk->abik", images, images).flatten(0, 1)
-    assert {tuple(product.flatten().tolist()) for product in products} == numbers
+    assert torch.equal(products.unique(dim=0), distinct)
     torch.testing.assert_close(images[0], torch.eye(3))
     mirrors = mirror_matrices(Symmetry.MIRROR, 3)
+    up = torch.tensor([0.0, 1.0, 0.0])
     assert len(mirrors) == 4
-    assert bool((mirrors[:, 1] == torch.tensor([0.0, 1.0, 0.0])).all())
+    assert torch.equal(mirrors[:, 1], up.expand(4, 3))
 
 
 @pytest.mark.parametrize(("name", "number"), [("cube", 19), ("room", 30)])
@@ -256,12 +274,15 @@ def test_the_mirror_average_has_the_symmetry_of_the_cube(
     """The rollout of an image is the image of the rollout, with moving walls too."""
     matrix = mirror_matrices(Symmetry.SQUARE, 3)[number]
     frames = drift(name, 3, (0.0, 0.0, 0.0))
-    swirl = np.sin(2 * np.pi * np.roll(frames[0], 1, axis=1)) * 0.01
-    frames = BOXES[name].inside(frames + np.arange(3)[:, None, None] * swirl)
+    other_axes = np.roll(frames[0], 1, axis=1)
+    swirl = 0.01 * np.sin(2 * np.pi * other_axes)
+    time = np.arange(3)[:, None, None]
+    frames = BOXES[name].inside(frames + time * swirl)
     is_walled = name == "room"
     walls = None
     if is_walled:
-        walls = 0.01 * torch.arange(18.0).view(1, 1, 6, 3).expand(1, 3, 6, 3)
+        velocity = 0.01 * torch.arange(18.0)
+        walls = velocity.view(1, 1, 6, 3).expand(1, 3, 6, 3)
     window = window_of(frames, walls)
     image = mirror_batch(window, matrix[None], BOXES[name].bounds)
     model = surrogate(
@@ -302,8 +323,10 @@ def test_windows_are_shifted_along_periodic_axes_only() -> None:
     first = way[:300, :, 0]
     second = way[300:, :, 0]
     for ways in (first, second):
-        assert float((ways - ways[0, 0]).abs().max()) < 1e-6
-    assert abs(float(first[0, 0] - second[0, 0])) > 1e-3
+        shift = ways[:1, :1].expand_as(ways)
+        torch.testing.assert_close(ways, shift, rtol=0, atol=1e-6)
+    difference = first[0, 0] - second[0, 0]
+    assert abs(float(difference)) > 1e-3
 
 
 @pytest.mark.parametrize(

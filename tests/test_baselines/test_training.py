@@ -164,7 +164,6 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
     ("baseline", "settings"),
     [
         ("drift", []),
-        ("supergat", ["model.noise_std=1e-4"]),
         (
             "neuralmpm",
             [

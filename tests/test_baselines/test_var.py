@@ -65,7 +65,8 @@ def least_squares(x: Array, y: Array) -> Array:
 
 def relative_error(value: Array, expected: Array) -> float:
     """Return the norm of a difference over that of the expected value."""
-    return float(np.linalg.norm(value - expected) / np.linalg.norm(expected))
+    error = np.linalg.norm(value - expected)
+    return float(error / np.linalg.norm(expected))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,8 @@ def test_coefficients_are_those_of_statsmodels(lags: int, spread: float) -> None
     """They agree within 1e-6, up to condition numbers of 1e6."""
     states = series(300, 24, spread=spread)
     solution = solve(LaggedRows([states], lags=lags))
-    expected = StatsmodelsVAR(states.astype(float)).fit(lags, trend="c").params
+    model = StatsmodelsVAR(states.astype(float))
+    expected = model.fit(lags, trend="c").params
     condition = np.linalg.cond(design_matrix(states, lags))
     assert condition <= 1e6
     assert relative_error(solution.coefficients, expected) <= 1e-6
@@ -112,7 +114,8 @@ def test_the_solution_is_that_of_lapack(
     expected = least_squares(x, y)
     solution = solve(LaggedRows([states], lags=1))
     assert relative_error(solution.coefficients, expected) < tolerance
-    assert solution.condition == pytest.approx(np.linalg.cond(x), rel=2e-3)
+    condition = np.linalg.cond(x)
+    assert solution.condition == pytest.approx(condition, rel=2e-3)
     if frames > 24:
         normal_equations = np.linalg.solve(x.T @ x, x.T @ y)
         assert relative_error(normal_equations, expected) > tolerance
@@ -125,8 +128,10 @@ def test_equal_columns_fit_as_well() -> None:
     solution = solve(LaggedRows([states], lags=1))
     x = design_matrix(states, 1)
     y = states[1:].astype(float)
-    error = np.square(y - x @ solution.coefficients).sum()
-    best = np.square(y - x @ least_squares(x, y)).sum()
+    residual = y - x @ solution.coefficients
+    least_residual = y - x @ least_squares(x, y)
+    error = np.square(residual).sum()
+    best = np.square(least_residual).sum()
     assert error == pytest.approx(best, rel=1e-6)
     assert solution.condition > 1e6
 
@@ -138,7 +143,8 @@ def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
     too_short = series(1, 3, seed=3)
     rows = LaggedRows([longer_than_a_block, plain, too_short], lags=2)
 
-    x = np.concatenate([design_matrix(longer_than_a_block, 2), design_matrix(plain, 2)])
+    blocks = [design_matrix(states, 2) for states in (longer_than_a_block, plain)]
+    x = np.concatenate(blocks)
     y = np.concatenate([longer_than_a_block[2:], plain[2:]]).astype(float)
     assert rows.rows == len(x)
     assert sum(len(block) for block, _ in rows) == len(x)
@@ -206,12 +212,14 @@ def test_lags_count_from_the_latest_frame() -> None:
     """A step is the intercept + A_1 times the last state + A_2 times the one before."""
     scenario = noisy_orbits(1)[0]
     model = VAR.build({"lags": 2}, info_of([scenario]))
-    coefficients = np.random.default_rng(0).normal(0, 0.1, (49, 24))
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(0, 0.1, (49, 24))
     model.coefficients.copy_(torch.from_numpy(coefficients))
 
     start = model.start(batch_of([scenario[:5]]))
     next_state = model.next_state(start).flatten().numpy()
-    before, last = model.states(scenario[:5])[-2:].astype(float)
+    states = model.states(scenario[:5]).astype(float)
+    before, last = states[-2:]
     regressors = np.concatenate([[1.0], last, before])
     expected = regressors @ model.coefficients.numpy()
     np.testing.assert_allclose(next_state, expected, atol=1e-5)
@@ -233,8 +241,9 @@ def test_one_step_of_training_and_of_a_rollout_agree() -> None:
     predicted = rolled(model, batch_of([window[:2]]), 1)[:, 0]
     deviation = torch.tensor(model.info.statistics["position_std"])
     error = (predicted - torch.from_numpy(window[2])) / deviation
+    mean_square = float(error.square().mean())
     loss = float(model(batch_of([window]))["position"])
-    assert loss == pytest.approx(float(error.square().mean()), rel=1e-3)
+    assert loss == pytest.approx(mean_square, rel=1e-3)
 
 
 def test_without_ridge_and_truncation_stable_is_plain() -> None:
@@ -266,8 +275,11 @@ def test_a_heavy_ridge_leaves_persistence() -> None:
     model = StableVAR.build({"ridge": 1e9}, info_of(scenarios))
     model.fit(scenarios)
     window = batch_of([scenarios[0][:2]])
-    step = rolled(model, window, 1)[:, 0] - window.position[:, -1]
-    changes = [np.diff(x[1:].astype(float), axis=0) for x in scenarios]
+    predicted = rolled(model, window, 1)[:, 0]
+    step = predicted - window.position[:, -1]
+    changes = []
+    for positions in scenarios:
+        changes.append(np.diff(positions[1:].astype(float), axis=0))
     mean_change = np.concatenate(changes).mean(axis=0)
     np.testing.assert_allclose(step.numpy(), mean_change, atol=1e-6)
 
@@ -348,6 +360,9 @@ def test_the_protocol_of_the_thesis_runs(
     # There are fewer frames than features, so that the fit meets every one.
     assert result["fit_mse"] < 1e-9
 
-    mse_at = {int(frame): value for frame, value in result["mse_at"].items()}
-    protocol_result = var_protocol.ProtocolResult(**(result | {"mse_at": mse_at}))
+    mse_at = {}
+    for frame, value in result["mse_at"].items():
+        mse_at[int(frame)] = value
+    fields = result | {"mse_at": mse_at}
+    protocol_result = var_protocol.ProtocolResult(**fields)
     assert "| 3.5e+18 |" in var_protocol.result_markdown(protocol_result)

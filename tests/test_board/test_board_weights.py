@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -63,20 +64,19 @@ def trained(
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}-{share}"
     folder.mkdir()
-    said = {
-        "training": training,
-        "parameters": parameters,
-        "seed": seed,
-        "budget": BUDGET.model_dump_json(),
-    }
-    labels = {key: held for key, held in said.items() if held is not None}
+    labels: dict[str, Any] = {"seed": seed, "budget": BUDGET.model_dump_json()}
+    if training is not None:
+        labels["training"] = training
+    if parameters is not None:
+        labels["parameters"] = parameters
 
     def between(truth: Any, n: int, h: int) -> Any:
-        return truth[n : n + h] + (share + 0.1 * seed) * (
-            noisy(truth, n, h) - truth[n : n + h]
-        )
+        future = truth[n : n + h]
+        error = noisy(truth, n, h) - future
+        return future + (share + 0.1 * seed) * error
 
-    own.predict(between, "drift", **labels).rename(folder / "predictions.nc")
+    predictions = own.predict(between, "drift", **labels)
+    predictions.rename(folder / "predictions.nc")
     with open_predictions(folder / "predictions.nc") as opened:
         header = opened.header
     info = replace(
@@ -86,12 +86,14 @@ def trained(
         dataset_sha256=header.dataset_sha256,
     )
     recipe = {"name": "cavity/tiny", "training": {"seed": seed}}
-    held = round_weights(Drift.build({}, info))
-    told = {"step": 6, "recipe": recipe}
-    weights = Checkpoint(
-        baseline="drift", options={}, info=info, weights=held, training=told
+    checkpoint = Checkpoint(
+        baseline="drift",
+        options={},
+        info=info,
+        weights=round_weights(Drift.build({}, info)),
+        training={"step": 6, "recipe": recipe},
     )
-    save(folder / "weights.pt", weights)
+    save(folder / "weights.pt", checkpoint)
     (folder / "training.json").write_text(json.dumps({"step": 6}))
     return folder
 
@@ -105,46 +107,67 @@ def submitted(
 ) -> SubmitResult:
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
-    given = (
-        tuple(folder / "weights.pt" for folder in folders)
-        if weights is None
-        else weights
-    )
+    if weights is None:
+        weights = tuple(folder / "weights.pt" for folder in folders)
     meta = Meta(authors=("A. Author",), command="make", method=method, name=method)
-    return submit(files, meta, weights=given, **own.where, **options)
+    return submit(files, meta, weights=weights, **own.where, **options)
+
+
+@pytest.fixture(scope="module")
+def first_submission(
+    home: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[BoardBench, Path]:
+    """A leaderboard with the entry of a run and its weights, and the run.
+
+    Do not change the files.
+    """
+    bench = copied(home, tmp_path_factory.mktemp("first"))
+    run = trained(bench, 0)
+    submitted(bench, run)
+    return bench, run
 
 
 @pytest.fixture
-def first(own: BoardBench) -> Path:
+def first(own: BoardBench, first_submission: tuple[BoardBench, Path]) -> Path:
     """A run whose entry is on the board, with its weights."""
-    run = trained(own, 0)
-    submitted(own, run)
-    return run
+    bench, run = first_submission
+    shutil.copytree(bench.folder, own.folder, dirs_exist_ok=True)
+    return Path(shutil.copytree(run, own.folder.parent / run.name))
 
 
 def hashes(own: BoardBench, method: str = "drift") -> list[str | None]:
     """Return the SHA-256 of the weights of each seed, as the entry has them."""
-    made = read_entry(own.entry(method)).predictions
-    return [one.weights.sha256 if one.weights else None for one in made]
+    weight_hashes: list[str | None] = []
+    for prediction in read_entry(own.entry(method)).predictions:
+        if prediction.weights is None:
+            weight_hashes.append(None)
+        else:
+            weight_hashes.append(prediction.weights.sha256)
+    return weight_hashes
 
 
-def lying(own: BoardBench) -> dict[str, bytes]:
+def kept_files(own: BoardBench) -> dict[str, bytes]:
     """Return name and content of the weights and records on the board."""
-    return {
-        path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")
-    }
+    contents = {}
+    for path in (own.folder / "weights").rglob("*.*"):
+        contents[path.name] = path.read_bytes()
+    return contents
 
 
 def claim(own: BoardBench, path: str, source: Path) -> None:
     """Let the entry glide name a file as its weights, with the hash of another."""
-    said = {"path": path, "sha256": file_sha256(source)}
-    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
+    weights = {"path": path, "sha256": file_sha256(source)}
+
+    def name_weights(entry: dict[str, Any]) -> None:
+        entry["predictions"][0]["weights"] = weights
+
+    own.edit("glide", name_weights)
 
 
-def found(own: BoardBench) -> set[str]:
+def failing_checks(own: BoardBench) -> set[str]:
     """Return the names of the checks that find something."""
     result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
-    return {one.check for one in result.findings}
+    return {finding.check for finding in result.findings}
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
@@ -157,21 +180,20 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     runs = [trained(own, 0), trained(own, 3)]
     submitted(own, *runs)
     entry = read_entry(own.entry("drift"))
-    for run, made, seed in zip(runs, entry.predictions, (0, 3), strict=True):
-        assert made.weights is not None
-        assert made.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
-        file = own.folder / made.weights.path
+    for run, prediction, seed in zip(runs, entry.predictions, (0, 3), strict=True):
+        assert prediction.weights is not None
+        assert prediction.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
+        file = own.folder / prediction.weights.path
         assert file.read_bytes() == (run / "weights.pt").read_bytes()
-        assert file_sha256(file) == made.weights.sha256
-        assert made.budget == BUDGET
-        assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
+        assert file_sha256(file) == prediction.weights.sha256
+        assert prediction.budget == BUDGET
+        record = json.loads(file.with_suffix(".json").read_text())
+        assert record == {"step": 6}
     assert entry.budget is not None
-    assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (
-        48,
-        0.1,
-        None,
-    )  # tiny
-    assert found(own) == set()
+    assert entry.budget.windows == 48
+    assert entry.budget.cpu_hours == 0.1
+    assert entry.budget.track is None  # tiny has none
+    assert failing_checks(own) == set()
     first, second = (run / "weights.pt" for run in runs)
     own.entry("drift").unlink()
     submitted(own, *runs, weights=(second, first))
@@ -183,30 +205,30 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     assert hashes(own) == [None, file_sha256(second)]
     for end in ("pt", "json"):
         (own.folder / f"{KEPT}.{end}").unlink()
-    assert found(own) == set()
+    assert failing_checks(own) == set()
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
     """Weights stay with their predictions, and go with them: an entry leaves none
     behind.
     """
-    before = lying(own)
+    before = kept_files(own)
     file = own.folder / f"{KEPT}.pt"
     assert json.loads(before["drift_0.json"]) == {"step": 6}
     for weights in ((), (file,)):  # those of the board, told or not, keep their record
         again = submitted(own, first, weights=weights, replace=True)
-        assert lying(own) == before
+        assert kept_files(own) == before
         assert again.removed == ()
-        assert found(own) == set()
+        assert failing_checks(own) == set()
     # new weights without a record leave none of the old
     (first / "training.json").unlink()
     assert submitted(own, first, replace=True).removed == (file.with_suffix(".json"),)
-    assert list(lying(own)) == ["drift_0.pt"]
-    assert found(own) == set()
+    assert list(kept_files(own)) == ["drift_0.pt"]
+    assert failing_checks(own) == set()
     later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
     assert later.removed == (file,)
-    assert lying(own) == {}
-    assert found(own) == set()
+    assert kept_files(own) == {}
+    assert failing_checks(own) == set()
 
 
 @pytest.mark.parametrize("damage", ["lost", "edited", "linked"])
@@ -220,7 +242,7 @@ def test_only_sound_weights_are_kept(own: BoardBench, first: Path, damage: str) 
         file.symlink_to(first / "weights.pt")
     submitted(own, first, weights=(), replace=True)
     assert hashes(own) == [None]
-    assert found(own) == set()
+    assert failing_checks(own) == set()
 
 
 def test_weights_of_another_are_not_kept(own: BoardBench, first: Path) -> None:
@@ -244,10 +266,10 @@ def test_a_new_name_takes_the_weights_along(own: BoardBench, first: Path) -> Non
     bytes.
     """
     own.edit(
-        "drift", lambda held: held.update(status="superseded", superseded_by="glide")
+        "drift", lambda entry: entry.update(status="superseded", superseded_by="glide")
     )
     submitted(own, first, method="glide")
-    assert found(own) == set()
+    assert failing_checks(own) == set()
 
 
 def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None:
@@ -267,10 +289,10 @@ def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None
     submitted(own, run, replace=True)
     (own.folder / "weights").rename(elsewhere / "weights")
     (own.folder / "weights").symlink_to(elsewhere / "weights")
-    lying = sorted(elsewhere.rglob("*.*"))
+    files_before = sorted(elsewhere.rglob("*.*"))
     with pytest.raises(UsageError):
         submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
-    assert sorted(elsewhere.rglob("*.*")) == lying
+    assert sorted(elsewhere.rglob("*.*")) == files_before
 
 
 def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> None:
@@ -298,12 +320,11 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
     """
     second = trained(own, 0, share=0.3)
     before = own.state()
-    (second / "training.json").write_text(
-        json.dumps({"step": 6, "note": "x" * (kept.MOST_LOG_BYTES - 100)})
-    )
-    room = 1000 + max(
-        path.stat().st_size for path in (own.folder / "scores").rglob("drift*")
-    )
+    long_note = "x" * (kept.MOST_LOG_BYTES - 100)
+    record = json.dumps({"step": 6, "note": long_note})
+    (second / "training.json").write_text(record)
+    score_files = (own.folder / "scores").rglob("drift*")
+    room = 1000 + max(path.stat().st_size for path in score_files)
     assert room < (second / "training.json").stat().st_size
     with largest_file(room), pytest.raises(WorkFailedError):
         submitted(own, second, replace=True)
@@ -365,7 +386,7 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
     target = own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
     claim(own, f"{GLIDE}.pt", source)
-    assert found(own) == {"weights"}
+    assert failing_checks(own) == {"weights"}
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:
@@ -396,11 +417,11 @@ def put(end: str, data: bytes) -> Callable[[BoardBench], object]:
 
 
 DAMAGE: dict[str, Callable[[BoardBench], object]] = {
-    "weights: edited": lambda b: put("pt", lying(b)["drift_0.pt"][:-1] + b"x")(b),
+    "weights: edited": lambda b: put("pt", kept_files(b)["drift_0.pt"][:-1] + b"x")(b),
     "weights: lost": lambda b: (b.folder / f"{KEPT}.pt").unlink(),
     "weights: those of another method": lambda b: b.edit(
         "drift",
-        lambda held: held["predictions"][0]["weights"].update(
+        lambda entry: entry["predictions"][0]["weights"].update(
             path="weights/cavity/tiny/a_0.pt"
         ),
     ),
@@ -413,22 +434,22 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "weights: record nested far deeper than one is": put("json", b"[" * 100_000),
     "weights: JSON that is no record": put("json", b"[1]"),
     "budget: track claimed": lambda b: b.edit(
-        "drift", lambda held: held["budget"].update(track="converged")
+        "drift", lambda entry: entry["budget"].update(track="converged")
     ),
     "budget: track claimed without a budget": lambda b: b.edit(
-        "noisy", lambda held: held.update(budget={"track": "equal compute"})
+        "noisy", lambda entry: entry.update(budget={"track": "equal compute"})
     ),
 }
 
 
+@pytest.mark.usefixtures("first")
 @pytest.mark.parametrize("name", DAMAGE)
 def test_what_the_check_finds(own: BoardBench, name: str) -> None:
     """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that
     no budget gives.
     """
-    submitted(own, trained(own, 0))
     DAMAGE[name](own)
-    assert found(own) == {name.partition(":")[0]}
+    assert failing_checks(own) == {name.partition(":")[0]}
 
 
 def test_what_is_no_record_is_not_copied(
@@ -439,17 +460,17 @@ def test_what_is_no_record_is_not_copied(
     """
     run = trained(own, 0)
     (run / "training.json").unlink()
-    for name, held in (
+    for name, record in (
         ("training.json", {"note": "x" * kept.MOST_LOG_BYTES}),
         ("weights.json", {"seconds_per_frame": 1.0}),
     ):
-        (run / name).write_text(json.dumps(held))
+        (run / name).write_text(json.dumps(record))
         submitted(own, run, replace=True)
-        assert list(lying(own)) == ["drift_0.pt"]
+        assert list(kept_files(own)) == ["drift_0.pt"]
         (run / name).unlink()
-    assert found(own) == set()
+    assert failing_checks(own) == set()
     monkeypatch.setattr(kept, "MOST_BYTES", 1000)
-    assert found(own) == {"weights"}
+    assert failing_checks(own) == {"weights"}
 
 
 def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
@@ -457,16 +478,16 @@ def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
     sound by itself.
     """
 
-    def shorten(held: dict[str, Any]) -> None:
-        held["predictions"][0]["budget"]["cpu_hours"] = held["budget"]["cpu_hours"] = (
-            0.05
-        )
+    def shorten(entry: dict[str, Any]) -> None:
+        entry["budget"]["cpu_hours"] = 0.05
+        prediction = entry["predictions"][0]
+        prediction["budget"]["cpu_hours"] = 0.05
 
     own.edit("drift", shorten)
-    assert found(own) == set()
+    assert failing_checks(own) == set()
     where = {"registry": own.registry, "root": own.data.root, "page": False}
     again = check_board(own.folder, predictions=[first / "predictions.nc"], **where)
-    assert {one.check for one in again.findings} == {"rescored"}
+    assert {finding.check for finding in again.findings} == {"rescored"}
 
 
 def test_seeds_that_come_later_make_the_entry_of_all_at_once(
@@ -480,11 +501,14 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     (runs[0] / "predictions.nc").rename(tmp_path / "gone.nc")
     for run in runs[1:]:
         result = submitted(own, run, add=True)
-    assert found(own) == set()
-    written = {f"drift{end}" for end in (".yaml", "_5.nc", "_5.pt", "_5.json")}
-    assert {
-        path.name for path in result.files
-    } == written  # the others stay as they lie
+    assert failing_checks(own) == set()
+    # the others stay as they lie
+    assert sorted(path.name for path in result.files) == [
+        "drift.yaml",
+        "drift_5.json",
+        "drift_5.nc",
+        "drift_5.pt",
+    ]
     assert not (own.folder / "scores/cavity/tiny/drift.nc").exists()
     (tmp_path / "gone.nc").rename(runs[0] / "predictions.nc")
     (tmp_path / "other").mkdir()
@@ -520,12 +544,12 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     own.predict(noisy, "drift", training=OURS).rename(many / "predictions.nc")
     assert "need numbers" in refused(many)
     file = own.folder / "scores/cavity/tiny/drift.nc"
-    held = file.read_bytes()
-    file.write_bytes(held + b"more")
+    content = file.read_bytes()
+    file.write_bytes(content + b"more")
     assert "score file" in refused(same)
-    file.write_bytes(held)
+    file.write_bytes(content)
     submitted(own, same, add=True)
-    assert found(own) == set()
+    assert failing_checks(own) == set()
 
 
 def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) -> None:
@@ -544,8 +568,8 @@ def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) ->
     assert entry.parameters == 1000
     assert entry.notes == "both"
     assert entry.hardware == "a GPU"
-    assert [made.seed for made in entry.predictions] == [0, 1]
-    assert found(own) == set()
+    assert [prediction.seed for prediction in entry.predictions] == [0, 1]
+    assert failing_checks(own) == set()
 
 
 def test_only_sound_active_entries_get_seeds(
@@ -556,12 +580,12 @@ def test_only_sound_active_entries_get_seeds(
     """
     runs = [trained(own, seed) for seed in (0, 3, 5)]
     submitted(own, runs[0])
-    held = lying(own)["drift_0.pt"]
-    put("pt", held + b"more")(own)
+    content = kept_files(own)["drift_0.pt"]
+    put("pt", content + b"more")(own)
     with pytest.raises(ChecksFailedError) as caught:
         submitted(own, runs[1], add=True)
     assert caught.value.where.endswith("leaderboard/weights/cavity/tiny/drift_0.pt")
-    put("pt", held)(own)
+    put("pt", content)(own)
     own.edit(
         "drift", lambda entry: entry.update(status="withdrawn", reason="a mistake")
     )
@@ -578,24 +602,22 @@ def test_only_sound_active_entries_get_seeds(
     monkeypatch.setattr(submitting, "score", meanwhile)
     submitted(own, runs[2], add=True)
     entry = read_entry(own.entry("drift"))
-    assert [made.seed for made in entry.predictions] == [0, 3, 5]
+    assert [prediction.seed for prediction in entry.predictions] == [0, 3, 5]
     assert entry.reason == "it was none"
-    assert found(own) == set()
+    assert failing_checks(own) == set()
 
 
 def test_each_seed_has_its_own_step_and_start(
     own: BoardBench, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Trainings that differ in these alone belong together, on the command line too."""
-    words = (
-        "cavity tiny train, recipe cavity/tiny, step {}, "
-        "started from cavity/mini, weights {}"
-    )
-    own.submit(
-        own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")),
-        name="My model",
-    )
-    added = own.predict(still, "mine", seed=1, training=words.format(8, "4567cdef"))
+    recipe = "cavity tiny train, recipe cavity/tiny"
+    start = "started from cavity/mini"
+    training = f"{recipe}, step 6, {start}, weights 0123abcd"
+    other_training = f"{recipe}, step 8, {start}, weights 4567cdef"
+    first = own.predict(nearer, "mine", seed=0, training=training)
+    own.submit(first, name="My model")
+    added = own.predict(still, "mine", seed=1, training=other_training)
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.registry.files["cavity"]))
     where = ["--board", own.folder, "--root", own.data.root, "--method", "mine"]
     result = run("submit", added, "--add", *where, "--command", "make both")

@@ -4,6 +4,8 @@ others that are named.
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 import os
 import shutil
@@ -26,6 +28,7 @@ from lagbench.data.limits import NEEDED, SUBSETS, Limit
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import LIMITS
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
@@ -131,9 +134,15 @@ def test_mini_and_tiny_are_small_relatives(split: str) -> None:
 Change = Callable[[dict[str, Any]], object]
 
 
+@functools.cache
+def our_registry() -> Any:
+    """Return what datasets.yaml says."""
+    return read_yaml(default_path())
+
+
 def edited(tmp_path: Path, change: Change) -> Path:
     """Write a copy of our registry after a function has changed it."""
-    data = read_yaml(default_path())
+    data = copy.deepcopy(our_registry())
     data.pop("measured", None)
     change(data["splits"])
     path = tmp_path / "datasets.yaml"
@@ -358,31 +367,37 @@ def test_a_solver_that_cannot_be_fed_is_refused_before_work(
     refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
 
 
+UNUSABLE = always("area_min", value="big")
+UNUSABLE_PARTS = ("size tiny", "generators.fluid can use", "area_min = 'big'")
+
+
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (
-            always("area_min", value="big"),
-            ("size tiny", "generators.fluid can use", "area_min = 'big'"),
-        ),
+        (UNUSABLE, UNUSABLE_PARTS),
         (
             renamed("fluid", "area_max", "aera_max"),
             ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
         ),
     ],
 )
-def test_a_scenario_that_cannot_be_drawn_is_refused_by_its_worker(
+def test_a_scenario_that_cannot_be_drawn_is_refused(
     change: Change, parts: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """Planning draws nothing, so a dry run passes; no file is left."""
     path = edited(tmp_path, change)
+    size = load(path).size("fluid", "tiny")
+    refused(path, parts, lambda: draw_initial_state(size, 0))
+
+
+def test_a_worker_refuses_a_scenario_that_cannot_be_drawn(tmp_path: Path) -> None:
+    """Planning draws nothing, so a dry run passes; no file is left."""
+    path = edited(tmp_path, UNUSABLE)
     root = tmp_path / "data"
     options = {"root": root, "registry": load(path), "workers": 1}
     generate("fluid", "tiny", dry_run=True, **options)
-    refused(path, parts, lambda: generate("fluid", "tiny", **options))
+    refused(path, UNUSABLE_PARTS, lambda: generate("fluid", "tiny", **options))
     assert not list(root.rglob("*.nc"))
     assert not list(root.rglob("manifest.json"))
-    refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
 
 
 def test_our_own_values_hold_with_room() -> None:
@@ -441,7 +456,7 @@ def theirs(tmp_path: Path) -> str:
     """A datasets.yaml of a split of one's own that also rewrites the cavity and its
     hash.
     """
-    data = read_yaml(default_path())
+    data = copy.deepcopy(our_registry())
     splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
     splits["cavity"]["title"] = "Hijacked"
     nothing = {

@@ -268,7 +268,7 @@ def test_same_bytes_every_time(
     assert str(bench.root) not in first
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("split", ["cavity", "multimaterial"])
 def test_undefined_and_huge_numbers_are_drawn_around(
     home: Path, tmp_path: Path, split: str
 ) -> None:

@@ -28,8 +28,10 @@ def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
     j = min(int(y), len(lattice) - 2)
 
     def dot(k: int, m: int) -> float:
-        slope = lattice[i + k, j + m]
-        return float(slope[0] * (x - i - k) + slope[1] * (y - j - m))
+        slope_x, slope_y = lattice[i + k, j + m]
+        offset_x = x - i - k
+        offset_y = y - j - m
+        return float(slope_x * offset_x + slope_y * offset_y)
 
     def fade(t: float) -> float:
         return 6 * t**5 - 15 * t**4 + 10 * t**3
@@ -49,12 +51,15 @@ def psi_by_hand(
 ) -> float:
     """The windowed stream function at one point, from its definition."""
     frequency = len(lattice) - 1
-    x, y = (position - LOW) / (HIGH - LOW)
-    value = scale * (HIGH - LOW) * noise_by_hand(x * frequency, y * frequency, lattice)
+    width = HIGH - LOW
+    x, y = (position - LOW) / width
+    value = noise_by_hand(x * frequency, y * frequency, lattice)
+    value *= scale * width
     for wall in (x, 1 - x, y, 1 - y):
         t = 2 * frequency * wall
         if t < 1:
-            value *= (15 * t - 10 * t**3 + 3 * t**5) / 8
+            ramp = 15 * t - 10 * t**3 + 3 * t**5
+            value *= ramp / 8
     return float(value)
 
 
@@ -101,7 +106,8 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     slope = np.stack([field.x, field.y], -1)
     np.testing.assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
-    np.testing.assert_allclose(np.hypot(*large.T), 1.0, rtol=3e-16)
+    length = np.hypot(*large.T)
+    np.testing.assert_allclose(length, 1.0, rtol=3e-16)
     assert len(np.unique(large, axis=0)) == 14 * 14
 
 
@@ -119,8 +125,9 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
     """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1
     on.
     """
-    t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
-    along_x, _ = noise.coordinates(t)
+    t = np.array([0.0, 1.0 - 1e-9, 1.0, 7.0])
+    position = np.stack([t, np.zeros(4)], axis=1)
+    along_x, _ = noise.coordinates(position)
     ramp = noise.ramp(along_x)
     np.testing.assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
     np.testing.assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
@@ -137,10 +144,12 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
     position = points(60, LOW + 0.001, HIGH - 0.001)
     psi = stream(position, lattice)
     for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
-        above = np.array([psi_by_hand(p + offset, lattice, 0.01) for p in position])
-        below = np.array([psi_by_hand(p - offset, lattice, 0.01) for p in position])
-        slope = (above - below) / (2 * step)
-        np.testing.assert_allclose(term, slope, atol=2e-9 * frequency)
+        slopes = []
+        for point in position:
+            above = psi_by_hand(point + offset, lattice, 0.01)
+            below = psi_by_hand(point - offset, lattice, 0.01)
+            slopes.append((above - below) / (2 * step))
+        np.testing.assert_allclose(term, slopes, atol=2e-9 * frequency)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -24,6 +25,15 @@ from lagbench.data import WALLS, registry
 from lagbench.errors import UsageError
 from lagbench.generators import draws
 from lagbench.generators.cavity import is_classic
+from lagbench.generators.split import InitialState
+
+
+def frequencies_of(states: Sequence[InitialState]) -> list[int]:
+    """Return the frequency of the noise of each scenario."""
+    frequencies = []
+    for state in states:
+        frequencies.append(int(state.parameters["frequency"]))
+    return frequencies
 
 
 def test_cavity_scenarios_draw_what_the_design_says() -> None:
@@ -47,7 +57,8 @@ def test_cavity_scenarios_draw_what_the_design_says() -> None:
         assert state.wall_velocity.shape == (frame_count, 4, 2)
         assert np.abs(state.wall_velocity).max() <= fastest
     assert len({state.start_frame for state in states}) > 30
-    assert len({drawn.parameters["reynolds"] for drawn in states}) == len(states)
+    reynolds_numbers = {state.parameters["reynolds"] for state in states}
+    assert len(reynolds_numbers) == len(states)
     speeds = [np.abs(state.wall_velocity).max() for state in states]
     assert max(speeds) > 0.98 * fastest
 
@@ -61,9 +72,12 @@ def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> Non
         for index, wall in enumerate(WALLS):
             if state.wall_velocity[:, index].any():
                 moving.add(wall)
-        assert moving == set(str(state.parameters["wall"]).split("+"))
+        stated = str(state.parameters["wall"]).split("+")
+        assert moving == set(stated)
         assert moving <= {"left", "right"} or moving <= {"bottom", "top"}
-        assert not state.wall_velocity[:, (0, 1, 2, 3), (0, 0, 1, 1)].any()
+        # left and right along x, bottom and top along y
+        normal = state.wall_velocity[:, (0, 1, 2, 3), (0, 0, 1, 1)]
+        assert not normal.any()
         if moving == {"bottom", "top"}:  # each has a program of its own
             bottom = state.wall_velocity[:, 2, 0]
             top = state.wall_velocity[:, 3, 0]
@@ -75,8 +89,11 @@ def test_shifted_cavities_lie_outside_train(size: str) -> None:
     """Half has a Reynolds number beyond train's, half two walls that meet in a corner
     and move as one belt around it.
     """
-    most = max(float(s.parameters["reynolds"]) for s in all_of("cavity", size))
-    usual = {state.parameters["wall"] for state in all_of("cavity", size)}
+    most = 0.0
+    usual = set()
+    for state in all_of("cavity", size):
+        most = max(most, float(state.parameters["reynolds"]))
+        usual.add(state.parameters["wall"])
     states = shifted("cavity", size)
     for state in states[::2]:
         assert float(state.parameters["reynolds"]) > 1.2 * most
@@ -86,21 +103,24 @@ def test_shifted_cavities_lie_outside_train(size: str) -> None:
     for state in states[1::2]:
         assert state.parameters["wall"] not in usual
         assert float(state.parameters["reynolds"]) <= most
-        along = state.wall_velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)] * turn
+        tangential = state.wall_velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)]
+        along = tangential * turn
         moving = np.flatnonzero(along.any(axis=0))
         assert len(moving) == 2
         assert set(moving) not in ({0, 1}, {2, 3})
-        np.testing.assert_array_equal(along[:, moving[0]], along[:, moving[1]])
-    assert len({state.parameters["wall"] for state in states[1::2]}) == 4
+        first, second = along[:, moving].T
+        np.testing.assert_array_equal(first, second)
+    corners = {state.parameters["wall"] for state in states[1::2]}
+    assert len(corners) == 4
 
 
 @pytest.mark.parametrize("size", ["full", "mini"])
 def test_shifted_frequencies_lie_outside_train(size: str) -> None:
     """One below and one above all of train, half of the scenarios each."""
-    usual = [state.parameters["frequency"] for state in all_of("curl-noise", size)]
-    shifts = [state.parameters["frequency"] for state in shifted("curl-noise", size)]
-    assert all(frequency < min(usual) for frequency in shifts[::2])
-    assert all(frequency > max(usual) for frequency in shifts[1::2])
+    usual = frequencies_of(all_of("curl-noise", size))
+    shifts = frequencies_of(shifted("curl-noise", size))
+    assert max(shifts[::2]) < min(usual)
+    assert min(shifts[1::2]) > max(usual)
 
 
 def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
@@ -122,7 +142,7 @@ def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
             expected = spline(np.arange(last))
             np.testing.assert_allclose(speed[:last], expected, atol=2.0**-20)
             signs = np.sign(knot_speeds)
-            assert (signs[1:] == -signs[:-1]).all()
+            np.testing.assert_array_equal(signs[1:], -signs[:-1])
             assert len(np.unique(knot_speeds)) == len(knots)
 
 
@@ -132,25 +152,29 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
     train has all walls.
     """
     tier = registry.load().size("cavity", size)
-    states = dict(zip(usual_ids(tier), all_of("cavity", size), strict=True))
+    states = zip(usual_ids(tier), all_of("cavity", size), strict=True)
     classic = {}
-    for i, state in states.items():
-        if state.parameters["motion"] == "constant":
+    for i, state in states:
+        has_constant_speed = state.parameters["motion"] == "constant"
+        assert is_classic(i) == has_constant_speed
+        if has_constant_speed:
             classic[i] = state
     assert len(classic) == expected
-    assert {i for i in states if is_classic(i)} == classic.keys()
     for state in classic.values():
         speed = np.abs(state.wall_velocity).max(axis=2)
         starts = np.argmax(speed > 0.0, axis=0)
         for wall in np.flatnonzero(speed.any(axis=0)):
             start = starts[wall]
             assert state.start_frame - 15 <= start <= state.start_frame + 5
-            assert (speed[start:, wall] == speed[-1, wall]).all()
+            last_speed = speed[-1, wall]
+            np.testing.assert_array_equal(speed[start:, wall], last_speed)
             speed_max = tier.value("speed_max")
-            assert 0.5 * speed_max <= speed[-1, wall] <= speed_max
+            assert 0.5 * speed_max <= last_speed <= speed_max
     if size == "full":
-        walls = [state.parameters["wall"] for i, state in classic.items() if i < 48]
-        train = Counter(walls)
+        train: Counter[object] = Counter()
+        for i, state in classic.items():
+            if i < 48:
+                train[state.parameters["wall"]] += 1
         assert sorted(train.values()) == [1] * 6
 
 
@@ -177,7 +201,7 @@ def test_curl_noise_frequencies_follow_the_thesis() -> None:
     """
     for size, count, least in (("full", 10, 4), ("mini", 3, 2), ("tiny", 2, 1)):
         states = all_of("curl-noise", size)
-        frequencies = [state.parameters["frequency"] for state in states]
+        frequencies = frequencies_of(states)
         ids = usual_ids(registry.load().size("curl-noise", size))
         assert frequencies == [i % count + least for i in ids]
     # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
@@ -189,7 +213,8 @@ def test_curl_noise_frequencies_follow_the_thesis() -> None:
             if parameters["frequency"] == frequency:
                 vorticities.append(float(parameters["initial_vorticity_rms"]))
         assert 0.08 < 0.1 * np.mean(vorticities) < 0.12
-    assert {state.parameters["scale"] for state in all_of("curl-noise")} == {0.0052}
+    for state in all_of("curl-noise"):
+        assert state.parameters["scale"] == 0.0052
 
 
 def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
@@ -197,7 +222,8 @@ def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
     trace, to the bit.
     """
     for state in all_of("curl-noise")[:10]:
-        assert (state.affine[:, 0, 0] + state.affine[:, 1, 1] == 0.0).all()
+        trace = np.trace(state.affine, axis1=1, axis2=2)
+        assert not trace.any()
         assert np.abs(state.affine).max() > 0.1
     state = state_of("curl-noise", "full", 0)
     distance, index = neighbours(state.position, 2)
@@ -207,19 +233,27 @@ def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
     change = state.velocity[nearest] - state.velocity
     residual = change - np.einsum("pij,pj->pi", middle, offset)
     assert distance.max() < 0.02
-    assert np.sqrt(np.mean(residual**2)) < 0.02 * np.sqrt(np.mean(change**2))
+    residual_rms = np.sqrt(np.mean(residual**2))
+    change_rms = np.sqrt(np.mean(change**2))
+    assert residual_rms < 0.02 * change_rms
 
 
 def test_curl_noise_energy_grows_with_frequency() -> None:
     """One velocity scale for all: energy goes about as frequency squared."""
     states = all_of("curl-noise")
-    energy = np.array([float(s.parameters["initial_kinetic_energy"]) for s in states])
-    for state, recorded in zip(states[:10], energy, strict=False):
-        square = np.sum(state.velocity**2, axis=1)
-        assert recorded == pytest.approx(0.5 * np.mean(square), rel=1e-12)
-    mean = energy[:70].reshape(7, 10).mean(axis=0)
-    assert (np.diff(mean) > 0).all()
-    slope = np.polyfit(np.log(np.arange(4, 14)), np.log(mean), 1)[0]
+    recorded = []
+    for state in states:
+        recorded.append(float(state.parameters["initial_kinetic_energy"]))
+    for state, energy in zip(states[:10], recorded, strict=False):
+        square_speed = np.sum(state.velocity**2, axis=1)
+        expected = 0.5 * np.mean(square_speed)
+        assert energy == pytest.approx(expected, rel=1e-12)
+
+    by_frequency = np.reshape(recorded[:70], (7, 10)).T
+    mean = by_frequency.mean(axis=1)
+    assert np.all(np.diff(mean) > 0)
+    frequency = np.arange(4, 14)
+    slope, _ = np.polyfit(np.log(frequency), np.log(mean), 1)
     assert 1.6 < slope < 2.4
 
 

@@ -463,19 +463,27 @@ def counted_registry() -> Registry:
     return Registry({"cavity": split}, {})
 
 
-@pytest.mark.usefixtures("as_shipped")
 def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
     tmp_path: Path, draw_log: Path, counted_registry: Registry
 ) -> None:
-    """Perturbed runs of test start from the same draw; the parent draws nothing."""
+    """The perturbed run of test starts from the same draw; the parent draws nothing."""
+    one_of_train_and_one_of_test = (0, 3)
     result = generate(
-        "cavity", SIZE, root=tmp_path / "data", workers=1, registry=counted_registry
+        "cavity",
+        SIZE,
+        scenarios=one_of_train_and_one_of_test,
+        root=tmp_path / "data",
+        workers=1,
+        registry=counted_registry,
     )
-    assert result.complete
-    lines = draw_log.read_text().splitlines()
-    processes = {line.split()[0] for line in lines}
-    drawn = sorted(int(line.split()[1]) for line in lines)
-    assert drawn == [0, 1, 2, 3, 4]
+    assert result.simulated == one_of_train_and_one_of_test
+    processes = set()
+    scenarios = []
+    for line in draw_log.read_text().splitlines():
+        process, scenario = line.split()
+        processes.add(process)
+        scenarios.append(int(scenario))
+    assert sorted(scenarios) == [0, 3]
     assert len(processes) == 1
     assert str(os.getpid()) not in processes
 
@@ -588,8 +596,13 @@ print(peak, sorted(heavy))
 """
 
 
+# One for each solver: curl noise has that of the cavity.
 @pytest.mark.parametrize(
-    ("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54), ("cavity", 50)]
+    ("split", "scenario"),
+    [
+        ("cavity", 50),
+        ("multimaterial", 54),
+    ],
 )
 def test_a_worker_stays_small(
     split: str, scenario: int, unmeasured_path: Path, tmp_path: Path

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -32,20 +34,28 @@ DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
 
 def score_of(*values: float, metric: str = "vorticity_mse", first: int = 0) -> Score:
     """Return a score with these values over consecutive scenarios."""
-    scenarios = tuple(range(first, first + len(values)))
+    count = len(values)
+    scenarios = tuple(range(first, first + count))
     x = np.array(values)
-    return Score(METRICS[metric], scenarios, (2,), x[:, None], x, (0,) * len(values))
+    missing = (0,) * count
+    return Score(METRICS[metric], scenarios, (2,), x[:, None], x, missing)
+
+
+def shifted_score(values: Sequence[float], shift: float) -> Score:
+    """Return a score whose values are all larger by a shift."""
+    return score_of(*(value + shift for value in values))
 
 
 def enumerated(differences: list[float]) -> float:
     """Return the p-value by going through all sign patterns."""
-    seen = abs(sum(differences))
-    signs = itertools.product((1, -1), repeat=len(differences))
-    sums = [
-        sum(s * d for s, d in zip(pattern, differences, strict=True))
-        for pattern in signs
-    ]
-    return sum(abs(total) >= seen for total in sums) / len(sums)
+    observed = abs(sum(differences))
+    patterns = list(itertools.product((1, -1), repeat=len(differences)))
+    extreme_count = 0
+    for pattern in patterns:
+        total = sum(map(operator.mul, pattern, differences))
+        if abs(total) >= observed:
+            extreme_count += 1
+    return extreme_count / len(patterns)
 
 
 @given(DIFFERENCES)
@@ -63,17 +73,13 @@ def test_ties_by_rounding_count() -> None:
     # |sum| of 0.1 0.2 0.3 -0.6 is 0 up to rounding: every pattern is as extreme
     assert sign_flip_p([0.1, 0.2, 0.3, -0.6]) == 1.0
     # 1, 2, 3 with signs: |sum| >= 6 in 2 of 8 patterns, whatever the scale
-    assert sign_flip_p([0.1, 0.2, 0.3]) == sign_flip_p([1.0, 2.0, 3.0]) == 0.25
-    for n in (
-        1,
-        2,
-        6,
-        13,
-        40,
-    ):  # of one sign only the pattern seen and its opposite are as extreme
-        assert sign_flip_p(np.linspace(1.0, 2.0, n)) == pytest.approx(
-            2.0 ** (1 - n), rel=1e-12
-        )
+    assert sign_flip_p([1.0, 2.0, 3.0]) == 0.25
+    assert sign_flip_p([0.1, 0.2, 0.3]) == 0.25
+    # of one sign only the pattern seen and its opposite are as extreme
+    for n in (1, 2, 6, 13, 40):
+        differences = np.linspace(1.0, 2.0, n)
+        expected = 2.0 ** (1 - n)
+        assert sign_flip_p(differences) == pytest.approx(expected, rel=1e-12)
 
 
 def test_losses_that_no_p_value_fits() -> None:
@@ -82,7 +88,8 @@ def test_losses_that_no_p_value_fits() -> None:
 
     It is no evidence: a p-value of 0 would be below the least there is.
     """
-    for differences in ([], [1.0] * 41, [1.0, math.nan], [1.0, math.inf]):
+    too_many = [1.0] * 41
+    for differences in ([], too_many, [1.0, math.nan], [1.0, math.inf]):
         with pytest.raises(UsageError):
             sign_flip_p(differences)
     plain = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
@@ -110,13 +117,15 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
         "rng": np.random.default_rng(2),
     }
     theirs = scipy.stats.bootstrap((x,), np.mean, **options).confidence_interval
-    stretch = (
-        math.sqrt(12 / 11) * scipy.stats.t.ppf(0.975, 11) / scipy.stats.norm.ppf(0.975)
-    )
-    expected = [
-        x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)
-    ]
-    assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
+    student = scipy.stats.t.ppf(0.975, 11)
+    normal = scipy.stats.norm.ppf(0.975)
+    stretch = math.sqrt(12 / 11) * student / normal
+    mean = x.mean()
+    tolerance = 0.05 * (high - low)
+    expected_low = mean + stretch * (theirs.low - mean)
+    expected_high = mean + stretch * (theirs.high - mean)
+    assert low == pytest.approx(expected_low, abs=tolerance)
+    assert high == pytest.approx(expected_high, abs=tolerance)
 
 
 @given(
@@ -125,7 +134,8 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
 )
 def test_quantiles_are_those_of_numpy(values: list[float], share: float) -> None:
     """Bit by bit: numbers in committed score files depend on them."""
-    assert quantile(np.sort(values), share) == np.quantile(values, share)
+    expected = np.quantile(values, share)
+    assert quantile(np.sort(values), share) == expected
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:
@@ -142,7 +152,8 @@ def test_the_two_way_bootstrap_of_a_closed_case() -> None:
     variance = seed_variance + scenario_variance
     assert resampling.mean == pytest.approx(2.0 + 5.0)
     assert resampling.error**2 == pytest.approx(variance)
-    assert np.var(resampling.deviations) == pytest.approx(variance, rel=0.03)
+    variance_of_draws = np.var(resampling.deviations)
+    assert variance_of_draws == pytest.approx(variance, rel=0.03)
 
     squares = seed_variance**2 / 2 + scenario_variance**2 / 5
     assert resampling.freedom == pytest.approx(variance**2 / squares)
@@ -181,8 +192,9 @@ def test_intervals_repeat_and_scale() -> None:
     assert bootstrap_interval(with_nan) == (low, high)
 
     for few in ([], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]):
-        interval = bootstrap_interval(few)
-        assert all(math.isnan(bound) for bound in interval)
+        low, high = bootstrap_interval(few)
+        assert math.isnan(low)
+        assert math.isnan(high)
 
 
 def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
@@ -250,7 +262,8 @@ def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
     """The corrected p-values are those of statsmodels' step-down method, with ties, 0
     and 1.
     """
-    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1].tolist())
+    _, corrected, *_ = multipletests(p, method="holm")
+    assert holm(p) == pytest.approx(corrected.tolist())
     # NaN is not counted as a comparison and stays
     *others, claimed_none = holm([*p, math.nan])
     assert others == holm(p)
@@ -267,9 +280,11 @@ def test_comparison_over_common_scenarios() -> None:
     assert found.interval == (-1.0, -1.0)
     assert found.p == 2.0**-5
     assert found.significant
-    assert compare(one, score_of(math.nan, 1.0)).scenarios == (1,)
+    gappy = score_of(math.nan, 1.0)
+    assert compare(one, gappy).scenarios == (1,)
     # its smallest p would be 0.0625
-    five = compare(score_of(*[1.0] * 5), score_of(*[2.0] * 5))
+    ones = score_of(*[1.0] * 5)
+    five = compare(ones, shifted_score([1.0] * 5, 1.0))
     assert math.isnan(five.p)
     assert not five.significant
     assert five.difference == -1.0
@@ -280,18 +295,21 @@ def test_direction_decides_who_is_better() -> None:
 
     Nothing is won by divergence of its own, and metrics do not mix.
     """
-    for metric, values, gain in (
-        ("vorticity_pearson", (0.9, 0.8), 0.1),
-        ("energy_ratio", (0.9, 1.3), 0.2),
+    for metric, value, worse_value, gain in (
+        ("vorticity_pearson", 0.9, 0.8, 0.1),
+        ("energy_ratio", 0.9, 1.3, 0.2),
     ):
-        better = compare(*(score_of(v, v, metric=metric) for v in values))
-        assert better.difference == pytest.approx(-gain)
-    for metric, other in (
+        score = score_of(value, value, metric=metric)
+        worse = score_of(worse_value, worse_value, metric=metric)
+        assert compare(score, worse).difference == pytest.approx(-gain)
+    for metric, other_metric in (
         ("energy_true", "energy_true"),
         ("vorticity_mse", "vorticity_mae"),
     ):
+        score = score_of(1.0, metric=metric)
+        other = score_of(1.0, metric=other_metric)
         with pytest.raises(UsageError):
-            compare(score_of(1.0, metric=metric), score_of(1.0, metric=other))
+            compare(score, other)
 
 
 def test_ranks_are_numbers_in_order() -> None:
@@ -303,19 +321,20 @@ def test_ranks_are_numbers_in_order() -> None:
     """
     a = [float(v) for v in range(1, 10)]
     scores = {
-        "d": score_of(*(v + 2.001 for v in a)),
-        "c": score_of(*(v + 2 for v in a)),
+        "d": shifted_score(a, 2.001),
+        "c": shifted_score(a, 2.0),
+        "b": score_of(*a[:7], 8.5, 9.5),
+        "a": score_of(*a),
     }
-    found = standings({**scores, "b": score_of(*a[:7], 8.5, 9.5), "a": score_of(*a)})
-    assert {name: place.rank for name, place in found.items()} == {
-        "a": 1,
-        "b": 2,
-        "c": 3,
-        "d": 4,
-    }
-    assert {name for name, place in found.items() if place.tied} == {"b"}
-    each = [found[name].p for name in "abcd"]
-    assert each == pytest.approx([math.nan, 0.5, 3 * 2.0**-8, 3 * 2.0**-8], nan_ok=True)
+    places = standings(scores)
+    assert list(places) == ["a", "b", "c", "d"]
+    assert [place.rank for place in places.values()] == [1, 2, 3, 4]
+    tied = [name for name, place in places.items() if place.tied]
+    assert tied == ["b"]
+    assert math.isnan(places["a"].p)
+    assert places["b"].p == pytest.approx(0.5)
+    assert places["c"].p == pytest.approx(3 * 2.0**-8)
+    assert places["d"].p == pytest.approx(3 * 2.0**-8)
 
 
 def test_ranks_without_significance_or_values() -> None:
@@ -331,20 +350,19 @@ def test_ranks_without_significance_or_values() -> None:
         "y": score_of(5.0, 5.0),
         "none": score_of(math.nan, math.nan),
     }
-    found = {
-        name: (place.rank, place.tied) for name, place in standings(scores).items()
-    }
-    assert list(found.items()) == [
-        ("x", (1, False)),
-        ("y", (2, True)),
-        ("none", (3, False)),
+    places = []
+    for name, place in standings(scores).items():
+        places.append((name, place.rank, place.tied))
+    assert places == [
+        ("x", 1, False),
+        ("y", 2, True),
+        ("none", 3, False),
     ]
     gappy = [score_of(1.0, math.nan), score_of(1.0, 4.0)]
+    even = [score_of(2.2, 2.2)]
     assert mean_loss(gappy) == 2.5
-    assert list(standings({"gappy": gappy, "even": [score_of(2.2, 2.2)]})) == [
-        "even",
-        "gappy",
-    ]
+    ranked = standings({"gappy": gappy, "even": even})
+    assert list(ranked) == ["even", "gappy"]
 
 
 def test_one_training_used_in_two_ways_is_paired() -> None:
@@ -359,9 +377,11 @@ def test_one_training_used_in_two_ways_is_paired() -> None:
         for by in (gains, 0 * gains)
     ]
     found = compare(*ways, paired=True)
-    assert found.p == pytest.approx(scipy.stats.ttest_1samp(-gains, 0.0).pvalue)
+    expected = scipy.stats.ttest_1samp(-gains, 0.0)
+    assert found.p == pytest.approx(expected.pvalue)
     assert found.difference == pytest.approx(-gains.mean())
-    assert found.interval[0] < found.difference < found.interval[1] < 0.0
+    low, high = found.interval
+    assert low < found.difference < high < 0.0
     assert compare(*ways).p > 0.5
 
 
@@ -369,7 +389,9 @@ def test_seeds_of_a_method_are_compared_together() -> None:
     """Two seeds against one: means over seeds, number of seeds stated, p of the two-way
     test.
     """
-    *seeds, other = (score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0, 10.0))
+    first = np.arange(1.0, 8.0).tolist()
+    seeds = [score_of(*first), shifted_score(first, 1.0)]
+    other = shifted_score(first, 10.0)
     found = compare(seeds, other)
     values = [score.values for score in seeds]
     assert found.seeds == (2, 1)
@@ -388,15 +410,18 @@ def test_ranges_of_ranks_are_those_of_all_draws() -> None:
     names = sorted(losses)
     values = np.array([losses[name] for name in names])  # shape [method, scenario]
     stretch = math.sqrt(6 / 5)
-    ranks = []
-    for draw in itertools.product(range(6), repeat=6):
-        middle = values.mean(axis=1)
-        means = middle + stretch * (values[:, draw].mean(axis=1) - middle)
-        ranks.append([1 + np.sum(means < mean) for mean in means])
+    middle = values.mean(axis=1)
+    draws = np.indices((6,) * 6).reshape(6, -1).T  # shape [draw, scenario]
+    deviation = values[:, draws].mean(axis=2) - middle[:, None]
+    means = middle[:, None] + stretch * deviation  # shape [method, draw]
+    is_better = means[None] < means[:, None]
+    ranks = 1 + is_better.sum(axis=1)
+    tail = int(0.025 * len(draws))
     expected = {}
-    for name, ranks_of_name in zip(names, np.sort(ranks, axis=0).T, strict=True):
-        tail = int(0.025 * len(ranks))
-        expected[name] = (ranks_of_name[tail], ranks_of_name[-1 - tail])
+    for name, ranks_of_name in zip(names, np.sort(ranks, axis=1), strict=True):
+        low = ranks_of_name[tail]
+        high = ranks_of_name[-1 - tail]
+        expected[name] = (low, high)
     assert expected == {"a": (1, 2), "b": (1, 2), "c": (3, 3)}
     tables = {name: [table[None]] for name, table in losses.items()}
     assert rank_ranges(tables) == expected
@@ -410,11 +435,20 @@ def test_ranges_of_ranks_know_ties_gaps_and_few_scenarios() -> None:
     """
     same = np.arange(1.0, 9.0)[None]
     nothing = np.full((1, 8), np.nan)
-    ranges = rank_ranges(
-        {"b": [same], "a": [same], "far": [9.0 + same], "none": [nothing]}
-    )
-    assert ranges == {"a": (1, 2), "b": (1, 2), "far": (3, 3), "none": (4, 4)}
-    assert rank_ranges({"a": [same[:, :5]], "b": [same[:, :5]]}) == {}
+    tables = {
+        "b": [same],
+        "a": [same],
+        "far": [9.0 + same],
+        "none": [nothing],
+    }
+    assert rank_ranges(tables) == {
+        "a": (1, 2),
+        "b": (1, 2),
+        "far": (3, 3),
+        "none": (4, 4),
+    }
+    few = [same[:, :5]]
+    assert rank_ranges({"a": few, "b": few}) == {}
 
     scatter = np.array([[-2.0], [0.0], [2.0]])
     sure = {"a": [same], "b": [same + 0.5]}

@@ -197,8 +197,10 @@ def test_ballistic_flight_is_a_parabola() -> None:
     fall = 0.5 * size.value("gravity") * time**2
     start = scattered(50, 0.4, 0.6)
     path = np.repeat(start[None], len(time), axis=0)
-    path[..., 0] += (0.1 * time)[:, None]
-    path[..., 1] += (0.8 * time - fall)[:, None]
+    distance = 0.1 * time
+    height = 0.8 * time - fall
+    path[..., 0] += distance[:, None]
+    path[..., 1] += height[:, None]
     positions = predicted("ballistic", given("fluid", path[:n]))
     np.testing.assert_allclose(positions, path[n:], atol=2e-6)
 
@@ -210,15 +212,18 @@ def test_a_frozen_rotation_stays_a_rotation() -> None:
     cos = math.cos(angle)
     sin = math.sin(angle)
     offset = scattered(4000, -0.4, 0.4)
-    before = centre + offset @ np.array([[cos, -sin], [sin, cos]])
-    frames = np.stack([*([before] * 5), centre + offset])
+    rotation = np.array([[cos, -sin], [sin, cos]])
+    before = centre + offset @ rotation
+    frames = np.stack([before] * 5 + [centre + offset])
     scenario = given("cavity", frames, wall=1e-9)
     positions = predicted("frozen-field", scenario)
 
     is_inner = np.hypot(*offset.T) < 0.25
     first = offset[is_inner]
     last = positions[-1][is_inner] - centre
-    np.testing.assert_allclose(np.hypot(*last.T), np.hypot(*first.T), rtol=2e-3)
+    first_radius = np.hypot(*first.T)
+    last_radius = np.hypot(*last.T)
+    np.testing.assert_allclose(last_radius, first_radius, rtol=2e-3)
     first_angle = np.arctan2(first[:, 1], first[:, 0])
     last_angle = np.arctan2(last[:, 1], last[:, 0])
     expected_turn = scenario.size.task.horizon * angle
@@ -232,8 +237,9 @@ def test_decay_of_an_exponential() -> None:
     Growing ones and rest do not decay.
     """
     step = scattered(20, -0.01, 0.01)
-    shrinking = np.cumsum([step * 0.9**k for k in range(6)], axis=0)
-    growing = np.cumsum([step * 1.1**k for k in range(6)], axis=0)
+    frame = np.arange(6)[:, None, None]
+    shrinking = np.cumsum(step * 0.9**frame, axis=0)
+    growing = np.cumsum(step * 1.1**frame, axis=0)
     at_rest = np.repeat(step[None], 6, axis=0)
     assert decay(shrinking, UNIT_SQUARE) == pytest.approx(0.9)
     assert decay(growing, UNIT_SQUARE) == 1.0
@@ -335,7 +341,8 @@ def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None
     near = distance(start, move(0.1, 0.0))
     elsewhere = distance(move(0.3, -0.2), move(0.4, -0.2))
     assert elsewhere == pytest.approx(near)
-    deviation = np.sqrt(scenario.last.var(axis=0).sum())
+    variance = scenario.last.var(axis=0)
+    deviation = np.sqrt(variance.sum())
     assert near == pytest.approx(0.1 / deviation, rel=0.01)
 
 
@@ -366,9 +373,12 @@ def test_unequal_clouds_are_assigned_evenly() -> None:
     """Fewer particles are taken more than once; of more some are left out."""
     points = scattered(90, 0.0, 1.0)
     liquid = np.zeros(90, np.int64)
-    fewer = assign_particles(points, points[:30], liquid, liquid[:30])
-    assert np.bincount(fewer, minlength=30).tolist() == [3] * 30
-    more = assign_particles(points[:30], points, liquid[:30], liquid)
+    few_points = points[:30]
+    few_liquid = liquid[:30]
+    fewer = assign_particles(points, few_points, liquid, few_liquid)
+    uses = np.bincount(fewer, minlength=30)
+    assert uses.tolist() == [3] * 30
+    more = assign_particles(few_points, points, few_liquid, liquid)
     assert len(set(more.tolist())) == 30
 
 
@@ -430,9 +440,10 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     positions = list(predict_with(scenario, size))
 
     fall = np.array([0.0, -0.5 * size.value("gravity") * interval])
+    mean_velocity = (frames[-1] - frames[-2]) / interval
     state = InitialState(
         position=frames[-1],
-        velocity=(frames[-1] - frames[-2]) / interval + fall,
+        velocity=mean_velocity + fall,
         affine=np.zeros((size.particles, 2, 2)),
         material=np.zeros(size.particles, np.int8),
         area=0.04,
@@ -454,9 +465,11 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     share = (lattice(18) + 0.5) / 18
     position = np.array([left, bottom]) + share * extent
     walls = np.zeros((frame_count, 4, 2))
-    lid_speed = 0.2 * np.random.default_rng(0).normal(size=frame_count)
+    rng = np.random.default_rng(0)
+    lid_speed = 0.2 * rng.normal(size=frame_count)
     walls[:, 3, 0] = lid_speed * size.frame_interval
-    scenario = given("cavity", np.stack([position] * n), area=float(np.prod(extent)))
+    at_rest = np.stack([position] * n)
+    scenario = given("cavity", at_rest, area=float(np.prod(extent)))
     scenario = replace(scenario, walls=walls, parameters={"viscosity": 1e-3})
     positions = list(predict_with(scenario, size))
 
@@ -469,7 +482,8 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
         wall_velocity=np.zeros((4, 2)),
         viscosity=1e-3,
     )
-    solver = compiled(replace(solver_constants(size), particles=len(position)))
+    constants = replace(solver_constants(size), particles=len(position))
+    solver = compiled(constants)
     solver.load([state])
     wall_velocities = walls[n:] / size.frame_interval
     for expected, wall_velocity in zip(positions, wall_velocities, strict=True):
@@ -591,8 +605,9 @@ def test_two_bodies_touch_when_they_are_a_radius_apart() -> None:
     right = scattered(60, 0.0, 0.1, seed=1) + np.array([0.3, 0.0])
     position = np.concatenate([left, right])
     body = label_bodies(position, 0.05)
-    assert set(body[:60].tolist()) == {body[0]}
-    assert set(body[60:].tolist()) == {1 - body[0]}
+    first_label = body[0]
+    assert np.all(body[:60] == first_label)
+    assert np.all(body[60:] == 1 - first_label)
     assert not bodies_touch(position, body, 0.05)
     position[60:, 0] -= 0.2
     assert bodies_touch(position, body, 0.05)
@@ -601,10 +616,13 @@ def test_two_bodies_touch_when_they_are_a_radius_apart() -> None:
 def test_a_flight_ends_when_a_tenth_of_the_particles_lie_on_the_floor() -> None:
     """A block that falls from 0.2 above the floor needs sqrt(2 h / g) for it."""
     size = load().size("fluid", "mini")
-    block = scattered(400, 0.0, 0.1) + np.array([0.4, size.bounds[1][0] + 0.2])
+    _, (floor, _) = size.bounds
+    corner = np.array([0.4, floor + 0.2])
+    block = corner + scattered(400, 0.0, 0.1)
     scenario = given("fluid", np.stack([block, block]), size="mini")
     fallen = 0.2 + 0.1 * 0.1  # a tenth of the block lies below a tenth of its height
-    expected = math.sqrt(2.0 * fallen / size.value("gravity")) / size.frame_interval
+    duration = math.sqrt(2.0 * fallen / size.value("gravity"))
+    expected = duration / size.frame_interval
     assert abs(frames_of_flight(scenario) - expected) < 2.0
 
 
@@ -643,21 +661,24 @@ def test_after_contact_the_particles_follow_their_analogs(
     """A body that starts on the floor, as no scenario does, follows train at once."""
     root, size = splash
     scenario, _ = opened(root, size, size.subsets["train"][0])
-    depth = scenario.last[:, 1].min() - size.bounds[1][0]
-    on_floor = scenario.position - np.array([0.0, depth])
+    _, (floor, _) = size.bounds
+    depth = scenario.last[:, 1].min() - floor
     # so deep that more than a tenth of the particles touch at once
-    on_floor[..., 1] = np.maximum(on_floor[..., 1] - 0.05, size.bounds[1][0])
+    on_floor = scenario.position - np.array([0.0, depth + 0.05])
+    on_floor[..., 1] = np.maximum(on_floor[..., 1], floor)
     resting = replace(scenario, position=on_floor)
     assert frames_of_flight(resting) == 0
-    library = state_library(size, root, np.unique(scenario.material).tolist())
+    materials = np.unique(scenario.material)
+    library = state_library(size, root, materials.tolist())
     choice = Choice(lag=0, analogs=2)
     positions = list(predict_positions(resting, choice, library=library))
     assert len(positions) == size.task.horizon
     assert scenario.box.contains(np.stack(positions)).all()
-    step = np.abs(positions[0] - resting.last).max()
-    assert step < 0.05
+    first_step = positions[0] - resting.last
+    assert np.abs(first_step).max() < 0.05
     without_train = list(predict_positions(resting, choice, library=None))
-    assert np.abs(positions[-1] - without_train[-1]).max() > 0.01
+    difference = positions[-1] - without_train[-1]
+    assert np.abs(difference).max() > 0.01
 
 
 def test_what_predicts_train_best_is_chosen(splash: tuple[Path, Size]) -> None:

@@ -212,11 +212,6 @@ def y_first(world: World, scenario: int) -> Floats:
     return world.truth(scenario)[..., ::-1]
 
 
-def one_frame_early(world: World, scenario: int) -> Floats:
-    """The last given frame first, then the truth."""
-    return world.truth(scenario, late=-1)
-
-
 def one_frame_late(world: World, scenario: int) -> Floats:
     """The truth without its first frame; the last one is repeated."""
     truth = world.truth(scenario)
@@ -247,7 +242,6 @@ def another_scenario(world: World, scenario: int) -> Floats:
     [
         mean_over_scenarios,
         noisy(0.01),
-        noisy(0.1),
         noisy(0.5),
         turned,
         twice_as_far,
@@ -256,7 +250,6 @@ def another_scenario(world: World, scenario: int) -> Floats:
         anywhere,
         in_one_point,
         y_first,
-        one_frame_early,
         one_frame_late,
         displacements,
         standardised,

@@ -81,7 +81,6 @@ def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult)
     return call
 
 
-@pytest.mark.usefixtures("as_shipped")
 def test_validating_and_scoring(
     commands: Run, bench: ScoreBench, tmp_path: Path
 ) -> None:
