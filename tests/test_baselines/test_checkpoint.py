@@ -55,14 +55,16 @@ def test_round_trip(tmp_path: Path) -> None:
     optimizer.step()
     stored = example(optimizer=optimizer.state_dict())
     save(tmp_path / "a.pt", stored)
-    found = load(tmp_path / "a.pt")
-    assert found.baseline == stored.baseline
-    assert found.options == stored.options
-    assert found.info == INFO
-    assert found.training == stored.training
-    assert torch.equal(found.weights["a"], stored.weights["a"])
+    loaded = load(tmp_path / "a.pt")
+    assert loaded.baseline == stored.baseline
+    assert loaded.options == stored.options
+    assert loaded.info == INFO
+    assert loaded.training == stored.training
+    assert torch.equal(loaded.weights["a"], stored.weights["a"])
     # Adam's first moment after one step: (1 - 0.9) x gradient.
-    assert found.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx([0.05, 0.2])
+    assert loaded.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx(
+        [0.05, 0.2]
+    )
 
 
 def test_rounding() -> None:
@@ -76,10 +78,10 @@ def test_rounding() -> None:
     )
     bits = model.weight.detach().numpy().view(np.uint32)
     expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
-    found = round_weights(model)
-    assert found["weight"].dtype is torch.bfloat16
-    assert np.array_equal(found["weight"].float().numpy().view(np.uint32), expected)
-    assert torch.equal(found["running_mean"], model.running_mean)
+    loaded = round_weights(model)
+    assert loaded["weight"].dtype is torch.bfloat16
+    assert np.array_equal(loaded["weight"].float().numpy().view(np.uint32), expected)
+    assert torch.equal(loaded["running_mean"], model.running_mean)
 
 
 class Bomb:
@@ -289,9 +291,9 @@ def test_data_of_another_version(
         ("curl-noise", root / "nowhere", "lagbench generate"),
         ("my-river", root, "where: a.pt"),  # a local split of another root
     ):
-        found = example(info=replace(INFO, split=split))
+        loaded = example(info=replace(INFO, split=split))
         with pytest.raises(DataError, match=words):
-            check_data(found, root=there, registry=unmeasured, where="a.pt")
+            check_data(loaded, root=there, registry=unmeasured, where="a.pt")
 
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(
@@ -368,9 +370,9 @@ def stored(baseline: str) -> Checkpoint:
 @pytest.mark.parametrize("baseline", list_names())
 def test_what_the_weights_fill_is_built(baseline: str) -> None:
     """Every baseline comes back with the numbers of its weights."""
-    found = stored(baseline)
-    model = restore(found)
-    for name, value in found.weights.items():
+    loaded = stored(baseline)
+    model = restore(loaded)
+    for name, value in loaded.weights.items():
         assert torch.equal(model.state_dict()[name], value), name
 
 

@@ -57,9 +57,9 @@ def adopted(folder: Path, runs: Runs, **options: Any) -> LocalSplit:
     )
 
 
-def stored(made: LocalSplit, number: int, name: str) -> NDArray[Any]:
+def stored(own_split: LocalSplit, number: int, name: str) -> NDArray[Any]:
     """Return an array of a scenario."""
-    size, root, _ = locate(str(made.folder))
+    size, root, _ = locate(str(own_split.folder))
     with read_scenario(size.path(root, number)) as file:
         return file.read(name)
 
@@ -82,18 +82,18 @@ def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None
 
     v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
     """
-    for subset, wanted in {
+    for subset, expected in {
         "train": runs[:4],
         "valid": runs[4:5],
         "test": runs[5:],
     }.items():
         with lagbench.open_split(str(own.folder), subset=subset) as data:
-            np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
+            np.testing.assert_array_equal(data["position"].values, np.stack(expected))
             assert data["time"].values[-1] == 11 * 0.25
     velocity = stored(own, 0, "velocity")
-    wanted = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
-    np.testing.assert_array_equal(velocity[1:], wanted)
-    np.testing.assert_array_equal(velocity[0], wanted[0])
+    expected = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
+    np.testing.assert_array_equal(velocity[1:], expected)
+    np.testing.assert_array_equal(velocity[0], expected[0])
 
 
 def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
@@ -123,9 +123,9 @@ def test_the_same_arrays_give_the_same_split(
 ) -> None:
     """Once in files of their own, once as one array of four dimensions."""
     np.save(tmp_path / "all.npy", np.stack(runs))
-    made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", test=1, **BASIC)
-    assert made.dataset_sha256 == own.dataset_sha256
-    assert (made.folder / "split.yaml").read_bytes() == (
+    own_split = adopt(tmp_path / "all.npy", output=tmp_path / "mine", test=1, **BASIC)
+    assert own_split.dataset_sha256 == own.dataset_sha256
+    assert (own_split.folder / "split.yaml").read_bytes() == (
         own.folder / "split.yaml"
     ).read_bytes()
 
@@ -154,16 +154,16 @@ def test_a_local_split_is_verified_templated_and_scored(
 
 def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
     """Each subset ends with all of its trajectories written, of as many."""
-    told: dict[str, Progress] = {}
+    last_reports: dict[str, Progress] = {}
     adopted(
         tmp_path,
         straight_runs(6),
         test=2,
-        progress=lambda news: told.update({news.stage: news}),
+        progress=lambda news: last_reports.update({news.stage: news}),
     )
     counts = {
         stage: (news.scenarios_done, news.scenarios, news.total)
-        for stage, news in told.items()
+        for stage, news in last_reports.items()
     }
     assert counts == {
         "writing train": (3, 3, 3),
@@ -179,19 +179,19 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
     for name in names:
         (tmp_path / name).write_bytes(b"1")
-    given = [tmp_path / name for name in names]
-    wanted = {
+    listed_paths = [tmp_path / name for name in names]
+    expected = {
         "train": ["run0", "run1", "run2"],
         "valid": ["run10"],
         "test": ["run11"],
     }
-    for paths in (given, [tmp_path]):
-        found = _divide_into_subsets(paths, valid=1, test=1)
+    for paths in (listed_paths, [tmp_path]):
+        subsets = _divide_into_subsets(paths, valid=1, test=1)
         assert {
-            subset: [path.stem for path, _ in rows] for subset, rows in found.items()
-        } == wanted
-    found = _divide_into_subsets(given[::-1], valid=1, test=1)
-    assert [path.stem for path, _ in found["test"]] == ["run0"]
+            subset: [path.stem for path, _ in rows] for subset, rows in subsets.items()
+        } == expected
+    subsets = _divide_into_subsets(listed_paths[::-1], valid=1, test=1)
+    assert [path.stem for path, _ in subsets["test"]] == ["run0"]
 
 
 @pytest.mark.parametrize("ending", ["npy", "npz", "nc"])
@@ -261,8 +261,8 @@ def test_exchanged_axes_are_refused_until_they_are_stated(
     with pytest.raises(DataError, match="look exchanged"):
         adopt(paths, output=tmp_path / "mine", **BASIC)
     axes = ("particle", "frame", "space")
-    made = adopt(paths, output=tmp_path / "mine", axes=axes, **BASIC)
-    np.testing.assert_array_equal(stored(made, 2, "position"), runs[2])
+    own_split = adopt(paths, output=tmp_path / "mine", axes=axes, **BASIC)
+    np.testing.assert_array_equal(stored(own_split, 2, "position"), runs[2])
     with pytest.raises(UsageError, match="no order of axes"):
         adopt(paths, output=tmp_path / "other", axes=("frame", "space"), **BASIC)
 
@@ -294,9 +294,9 @@ def test_test_has_enough_trajectories_for_a_p_value(
 ) -> None:
     """Six where train can spare them; with fewer a note says so."""
     np.save(tmp_path / "runs.npy", np.stack(straight_runs(count)))
-    made = adopt(tmp_path / "runs.npy", output=tmp_path / "mine", **BASIC)
-    assert made.scenarios["test"] == test_count
-    assert bool(made.notes) == (test_count < 6)
+    own_split = adopt(tmp_path / "runs.npy", output=tmp_path / "mine", **BASIC)
+    assert own_split.scenarios["test"] == test_count
+    assert bool(own_split.notes) == (test_count < 6)
 
 
 def test_without_bounds_the_extent_of_all_positions_is_fitted(tmp_path: Path) -> None:
@@ -304,8 +304,8 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(tmp_path: Path) ->
     runs = [8.0 * run - 5.0 for run in straight_runs(3)]
     paths = save_runs(tmp_path / "in", runs)
     basic = {**BASIC, "radius": 0.8}
-    made = adopt(paths, output=tmp_path / "mine", rescale=True, **basic)
-    size = locate(made.folder).size
+    own_split = adopt(paths, output=tmp_path / "mine", rescale=True, **basic)
+    size = locate(own_split.folder).size
     low = np.min([run.min(axis=(0, 1)) for run in runs], axis=0)
     high = np.max([run.max(axis=(0, 1)) for run in runs], axis=0)
     scale = 2.0 ** np.ceil(np.log2((high - low).max()))
@@ -326,13 +326,13 @@ def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
             velocity=motion(run),
             **named,
         )
-    made = adopt(
+    own_split = adopt(
         [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
     )
-    np.testing.assert_array_equal(stored(made, 2, "velocity"), motion(runs[2]))
-    np.testing.assert_array_equal(stored(made, 2, "material"), named["material"])
+    np.testing.assert_array_equal(stored(own_split, 2, "velocity"), motion(runs[2]))
+    np.testing.assert_array_equal(stored(own_split, 2, "material"), named["material"])
     np.testing.assert_array_equal(
-        stored(made, 2, "wall_velocity")[5], named["wall_velocity"]
+        stored(own_split, 2, "wall_velocity")[5], named["wall_velocity"]
     )
 
 
@@ -354,14 +354,14 @@ def test_netcdf(tmp_path: Path, runs: Runs) -> None:
         (tmp_path / "in" / subset).mkdir(parents=True)
         with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
             variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
-    made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
-    assert made.scenarios == {
+    own_split = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+    assert own_split.scenarios == {
         "train": 1,
         "valid": 1,
         "test": 1,
     }
-    wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
-    np.testing.assert_array_equal(stored(made, 2, "position"), wanted)
+    expected = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
+    np.testing.assert_array_equal(stored(own_split, 2, "position"), expected)
 
 
 def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
@@ -407,23 +407,23 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
         )[0]
         for f, p in shapes
     ]
-    made = adopted(tmp_path, ragged, test=2)
-    assert made.horizon == 12
-    assert made.particles == (25, 40)
-    with lagbench.open_split(str(made.folder), subset="train") as data:
+    own_split = adopted(tmp_path, ragged, test=2)
+    assert own_split.horizon == 12
+    assert own_split.particles == (25, 40)
+    with lagbench.open_split(str(own_split.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
         assert data["particle_count"].values.tolist() == [40, 30]
         np.testing.assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
-    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+    lagbench.template(str(own_split.folder), output=tmp_path / "p.nc")
     assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
 
 
 def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) -> None:
     """Each scenario has as many particles in its predictions as in its file."""
     ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
-    made = adopted(tmp_path, ragged, test=2, valid=1)
+    own_split = adopted(tmp_path, ragged, test=2, valid=1)
     path = tmp_path / "p.nc"
-    lagbench.template(str(made.folder), output=path)
+    lagbench.template(str(own_split.folder), output=path)
     assert lagbench.validate(path, root=tmp_path).valid
     with open_predictions(path) as predictions:
         first = predictions.header.frames[0]
@@ -436,18 +436,18 @@ def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) ->
 def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     """A box of 3 is divided by 4: times 4, every position is the source's."""
     wide = straight_runs(3, box=3.0)
-    made = adopted(
+    own_split = adopted(
         tmp_path,
         wide,
         radius=0.3,
         bounds=((0.0, 3.0), (0.0, 3.0)),
         rescale=True,
     )
-    size = locate(str(made.folder)).size
+    size = locate(str(own_split.folder)).size
     assert size.task.radius == 0.075
     assert size.bounds[0] == (0.0, 0.75)
     assert size.value("source_scale") == 4.0
-    np.testing.assert_array_equal(stored(made, 0, "position") * 4, wide[0])
+    np.testing.assert_array_equal(stored(own_split, 0, "position") * 4, wide[0])
 
 
 @pytest.mark.parametrize(
@@ -764,7 +764,7 @@ def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
     """
     paths = save_runs(tmp_path / "in", straight_runs(4))
     link = tmp_path / ("in/test/run9.npy" if way == "subsets" else "run9.npy")
-    given = {
+    paths_by_way = {
         "twice": [*paths, paths[0]],
         "folder": [tmp_path / "in", paths[2]],
         "link": [*paths, link],
@@ -776,8 +776,9 @@ def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
         link.symlink_to(tmp_path / "in/train/run0.npy")
     elif way == "link":
         link.symlink_to(paths[1])
+    sources = paths_by_way.get(way, [tmp_path / "in"])
     with pytest.raises(UsageError) as caught:
-        adopt(given.get(way, [tmp_path / "in"]), output=tmp_path / "mine", **BASIC)
+        adopt(sources, output=tmp_path / "mine", **BASIC)
     assert "run" in str(caught.value.where)
     assert not (tmp_path / "mine").exists()
 
@@ -800,12 +801,12 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
     types are refused.
     """
     paths = save_runs(tmp_path / "in", straight_runs(4))
-    told = tmp_path / "data.yaml"
+    description = tmp_path / "data.yaml"
     options = [
         "-o",
         tmp_path / "mine",
         "--describe",
-        told,
+        description,
         "--free-surface",
         "--horizon",
         "3",
@@ -820,10 +821,10 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
         f"horizon: {endless}",
     ]
     for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
-        told.write_text(line)
+        description.write_text(line)
         assert run(*words).exit_code == 2
     assert not (tmp_path / "mine").exists()
-    told.write_text(
+    description.write_text(
         "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
         "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: "
         "0.05\nfull_box: true\n"
@@ -859,10 +860,10 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
     assert caught.value.where is not None
     assert "along x" in caught.value.where
 
-    made = adopt(paths, output=tmp_path / "mine", periodic=["x", "y"], **options)
-    size = locate(str(made.folder)).size
+    own_split = adopt(paths, output=tmp_path / "mine", periodic=["x", "y"], **options)
+    size = locate(str(own_split.folder)).size
     assert size.box.periodic == (True, True)
-    velocity = stored(made, 0, "velocity") * size.frame_interval  # [length/frame]
+    velocity = stored(own_split, 0, "velocity") * size.frame_interval  # [length/frame]
     np.testing.assert_allclose(velocity[..., 0], 0.02, atol=1e-6)
     manifest = read_manifest(tmp_path, "mine", "full", 1)
     assert manifest is not None
@@ -888,7 +889,7 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
 
 def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
     """Straight flight across the boundary is what constant velocity predicts."""
-    made = adopt(
+    own_split = adopt(
         save_runs(tmp_path / "in", drifting_runs(3)),
         output=tmp_path / "mine",
         bounds=((0.0, 1.0), (0.0, 1.0)),
@@ -897,7 +898,7 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
         **BASIC,
     )
     target = tmp_path / "predictions.nc"
-    lagbench.template(str(made.folder), output=target)
+    lagbench.template(str(own_split.folder), output=target)
     card = lagbench.score(target, root=tmp_path, output_dir=tmp_path, workers=1)
     straight = card.scores["constant-velocity"]["position_rmse"]
     assert np.max(straight.per_frame) < 1e-5

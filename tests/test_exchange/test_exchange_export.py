@@ -133,13 +133,15 @@ def test_positions_are_those_stored(
     """Every trajectory has the stored bits, as float32, in the order of ids, once the
     origin is added.
     """
-    wanted = stored(generated.split, generated.root, "tiny")
+    expected = stored(generated.split, generated.root, "tiny")
     metadata = read_metadata(flows[form])
     files = files_of(flows[form])
     origin = np.array(metadata["lagbench"]["origin"], np.float32)
     for subset, trajectories in files.items():
-        assert len(trajectories) == len(wanted[subset])
-        for (position, kinds), truth in zip(trajectories, wanted[subset], strict=True):
+        assert len(trajectories) == len(expected[subset])
+        for (position, kinds), truth in zip(
+            trajectories, expected[subset], strict=True
+        ):
             assert position.dtype == np.float32
             np.testing.assert_array_equal(position + origin, truth)
             assert kinds.shape == (position.shape[1],)
@@ -466,14 +468,15 @@ def test_readers_see_the_lid_move(
     steps = np.diff(top, axis=0)
     assert (steps[..., 1] == 0).all()
     again = np.abs(steps[..., 0]) > 0.4
-    for frame, wanted in enumerate([0.07] * 9 + [-0.035] * 10):
+    for frame, expected in enumerate([0.07] * 9 + [-0.035] * 10):
         # At most 0.07 / 0.04 of a layer's particles, rounded up, come in again in one
         # frame.
         assert again[frame].sum() <= 6
-        np.testing.assert_allclose(steps[frame, ~again[frame], 0], wanted, atol=1e-6)
-        np.testing.assert_allclose(
-            steps[frame, again[frame], 0], wanted - np.copysign(0.8, wanted), atol=1e-6
-        )
+        within = steps[frame, ~again[frame], 0]
+        across = steps[frame, again[frame], 0]
+        jump = expected - np.copysign(0.8, expected)
+        np.testing.assert_allclose(within, expected, atol=1e-6)
+        np.testing.assert_allclose(across, jump, atol=1e-6)
     assert again.any()
     if form == "lagrangebench-h5":
         assert ((raw >= 0) & (raw < np.array(metadata["bounds"])[:, 1])).all()

@@ -51,7 +51,7 @@ def test_an_export_comes_back(
         output=tmp_path / "out",
         **options,
     )
-    made = import_split(tmp_path / "out", format=name, output=tmp_path / "back")
+    own_split = import_split(tmp_path / "out", format=name, output=tmp_path / "back")
     for subset in SUBSETS:
         with lagbench.open_split(
             "curl-noise",
@@ -60,16 +60,16 @@ def test_an_export_comes_back(
             root=generated.root,
         ) as data:
             np.testing.assert_array_equal(
-                positions(made.folder, subset), data["position"].values
+                positions(own_split.folder, subset), data["position"].values
             )
             mass = data["particle_mass"].values[0]
-    here = locate(str(made.folder)).size
+    here = locate(str(own_split.folder)).size
     there = unmeasured.size("curl-noise", "tiny")
     expected_task = there.task.model_copy(update={"effective_viscosity": None})
     assert here.task == expected_task
     assert here.bounds == there.bounds
     assert here.frame_interval == there.frame_interval
-    with lagbench.open_split(str(made.folder)) as data:
+    with lagbench.open_split(str(own_split.folder)) as data:
         assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
 
 
@@ -81,12 +81,12 @@ def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
     gns = form == "gns-npz"
     source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
     (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
-    made = import_split(source, format=form, output=tmp_path / "own")
+    own_split = import_split(source, format=form, output=tmp_path / "own")
     assert not (tmp_path / "trace").exists()
     read = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
-    np.testing.assert_array_equal(positions(made.folder), [run for run, _ in read])
+    np.testing.assert_array_equal(positions(own_split.folder), [run for run, _ in read])
     interval = 0.01 if gns else 0.05
-    assert locate(str(made.folder)).size.frame_interval == pytest.approx(interval)
+    assert locate(str(own_split.folder)).size.frame_interval == pytest.approx(interval)
 
 
 def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
     """
     hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
     source = write_gns(tmp_path / "in", straight_runs(3), **hints)
-    kept = import_split(source, format="gns-npz", output=tmp_path / "a")
+    first_split = import_split(source, format="gns-npz", output=tmp_path / "a")
     # None says nothing: metadata do
     options: dict[str, Any] = {
         "horizon": 3,
@@ -109,7 +109,8 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
         **options,
     )
     interest = [
-        locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)
+        locate(str(own_split.folder)).size.task.frames_of_interest
+        for own_split in (first_split, own)
     ]
     assert interest == [(10,), (8,)]
 
@@ -134,12 +135,12 @@ def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
         }
         np.lib.format.write_array_header_1_0(stream, header)
         pickle.dump(joint, stream, protocol=protocol)
-    made = import_split(source, format="gns-npz", output=tmp_path / "own")
-    assert made.scenarios["train"] == 2
+    own_split = import_split(source, format="gns-npz", output=tmp_path / "own")
+    assert own_split.scenarios["train"] == 2
     np.testing.assert_array_equal(
-        positions(made.folder), np.stack(runs[:2]).astype(np.float32)
+        positions(own_split.folder), np.stack(runs[:2]).astype(np.float32)
     )
-    with lagbench.open_split(str(made.folder), subset="train") as data:
+    with lagbench.open_split(str(own_split.folder), subset="train") as data:
         assert data["material"].values[:, 0].tolist() == [2, 1]
         assert data.attrs["material_property"] == 0.3
 
@@ -182,10 +183,10 @@ def test_a_crossing_of_a_periodic_boundary_is_a_short_step(tmp_path: Path) -> No
         "bounds": [[0, 1], [0, 1]],
     }
     source = write_h5(tmp_path / "in", runs, **periodic)
-    made = import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
-    size = locate(str(made.folder)).size
+    own_split = import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    size = locate(str(own_split.folder)).size
     assert size.box.periodic == (True, True)
-    with lagbench.open_split(str(made.folder), subset="valid") as data:
+    with lagbench.open_split(str(own_split.folder), subset="valid") as data:
         velocity = np.asarray(data["velocity"].values)[0, 5, 0]  # [length/s]
     assert velocity[0] * size.frame_interval == pytest.approx(0.004, rel=1e-3)
 

@@ -61,6 +61,11 @@ def stamps(folder: Path) -> dict[str, int]:
     return {name: (folder / name).stat().st_mtime_ns for name in FILES}
 
 
+def changed_files(before: dict[str, int], after: dict[str, int]) -> list[str]:
+    """Return the names of the files that were written between two looks."""
+    return [name for name in FILES if after[name] != before[name]]
+
+
 def label(file: Path, **labels: str) -> None:
     """Change attributes of a netCDF file."""
     with netCDF4.Dataset(file, "a") as data:
@@ -80,9 +85,9 @@ def test_what_is_there_is_what_was_asked_for(
     capsys.readouterr()
 
     assert reproduce(*ONLY, "--set", "training.steps=2") == 2
-    told = capsys.readouterr()
-    assert str(folder) in told.err
-    assert "supergat: no run" in told.out.lower(), (
+    output = capsys.readouterr()
+    assert str(folder) in output.err
+    assert "supergat: no run" in output.out.lower(), (
         "nothing of a run that was refused is drawn"
     )
 
@@ -90,22 +95,19 @@ def test_what_is_there_is_what_was_asked_for(
     assert reproduce(*ONLY, *steps) == 0
     assert str(folder / "scores.nc") in capsys.readouterr().err
     again = stamps(folder)
-    assert {name for name in FILES if again[name] != first[name]} == {"scores.nc"}
+    assert changed_files(first, again) == ["scores.nc"]
 
     label(folder / "predictions.nc", dataset_sha256="f" * 64)
     assert reproduce(*ONLY, *steps, "--dry-run") == 0
     assert "supergat-0: to predict and score" in capsys.readouterr().out
     assert reproduce(*ONLY, *steps) == 0
     again = stamps(folder)
-    assert {name for name in FILES if again[name] != first[name]} == {
-        "predictions.nc",
-        "scores.nc",
-    }
+    assert changed_files(first, again) == ["predictions.nc", "scores.nc"]
 
     record = folder / "training.json"
-    record.write_text(
-        json.dumps({**json.loads(record.read_text()), "dataset_sha256": "e" * 64})
-    )
+    content = json.loads(record.read_text())
+    content["dataset_sha256"] = "e" * 64
+    record.write_text(json.dumps(content))
     assert reproduce(*ONLY, *steps) == 4
 
 
@@ -142,24 +144,23 @@ def test_studies_are_what_was_asked_for(
     first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
     runs.make_studies(plan, "table_4_2")
     assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
-    known = read_studies([home], plan.hash(SPLIT))
-    held = known["mlp-4-2-1"]
-    assert held["train"] > 0.0
-    assert held["training"]["step"] == 1
-    (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
-    assert f"{held['valid']:.3g}" in row
+    studies = read_studies([home], plan.hash(SPLIT))
+    study = studies["mlp-4-2-1"]
+    assert study["train"] > 0.0
+    assert study["training"]["step"] == 1
+    (row,) = tables.studies_beside_thesis("table_4_2", "tiny", studies).tables[0].rows
+    assert f"{study['valid']:.3g}" in row
     assert read_studies([home], "f" * 64) == {}
-    stale = {**held, "training": {"dataset_sha256": "f" * 64}}
-    later = {**held, "train": 9.0}
-    for other, expected in ((stale, held), (later, later)):
+    stale = {**study, "training": {"dataset_sha256": "f" * 64}}
+    later = {**study, "train": 9.0}
+    for other, expected in ((stale, study), (later, later)):
         (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
         assert read_studies([home, tmp_path], plan.hash(SPLIT)) == {
             "mlp-4-2-1": expected
         }
+    more_steps = replace(plan, settings=("training.steps=2", "model.widths=[4]"))
     with pytest.raises(UsageError):
-        runs.make_studies(
-            replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2"
-        )
+        runs.make_studies(more_steps, "table_4_2")
 
 
 @pytest.fixture
@@ -170,8 +171,8 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "recipes"
     folder.mkdir()
     for name, recipe in (("gns", "tiny-short"), ("mlp", "tiny")):
-        held = {"format": 1, "recipes": {f"*/{recipe}": {"training": {"steps": 1}}}}
-        (folder / f"{name}.yaml").write_text(json.dumps(held))  # JSON is YAML
+        recipes = {"format": 1, "recipes": {f"*/{recipe}": {"training": {"steps": 1}}}}
+        (folder / f"{name}.yaml").write_text(json.dumps(recipes))  # JSON is YAML
     monkeypatch.setattr(catalogue, "RECIPES", folder)
     monkeypatch.setattr(command, "EXPECTED", {SPLIT: ("supergat", "mlp")})
 
@@ -186,17 +187,17 @@ def test_models_without_the_recipe_are_left_out(
     words = (*ONLY, "--split", SPLIT, "--recipe", "short", "--set", "model.latent=8")
     home = tmp_path / "runs" / SPLIT / "tiny-short"
     assert reproduce(*words, "--dry-run") == 0
-    told = capsys.readouterr()
+    output = capsys.readouterr()
     assert (
-        told.out
+        output.out
         == "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
     )
-    assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in told.err
+    assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in output.err
     assert not home.exists()
 
     assert reproduce(*words) == 0
-    told = capsys.readouterr()
-    assert "curl-noise tiny mlp: left out" in told.err
+    output = capsys.readouterr()
+    assert "curl-noise tiny mlp: left out" in output.err
     assert [folder.name for folder in home.iterdir()] == ["supergat-0"]
     assert reproduce(*words, "--dry-run") == 0
     assert capsys.readouterr().out == "curl-noise tiny supergat-0: there\n"
@@ -207,9 +208,9 @@ def test_a_recipe_that_no_model_has_is_a_mistake(
 ) -> None:
     """A misspelt recipe ends with exit code 2 and leaves nothing out."""
     assert reproduce(*ONLY, "--recipe", "shrt", "--dry-run") == 2
-    told = capsys.readouterr().err
-    assert "no recipe 'curl-noise/tiny-shrt'" in told
-    assert "left out" not in told
+    output = capsys.readouterr().err
+    assert "no recipe 'curl-noise/tiny-shrt'" in output
+    assert "left out" not in output
 
 
 def test_the_way_to_full_is_told_without_data(
@@ -229,23 +230,21 @@ def test_the_way_to_full_is_told_without_data(
     assert command.main([*places, "--recipe", "short", "--list"]) == 0
     assert "table_5_4" in capsys.readouterr().out
     assert command.main([*places, "--recipe", "short", "--dry-run"]) == 0
-    told = capsys.readouterr()
-    assert "cavity full gns-0: to train, cavity/full-short: 14,000 steps" in told.out
-    assert "fluid full mlp-0: to train, fluid/full-short: 1,500 steps" in told.out
-    assert "studies of table_4_2: left out" in told.err
-    assert (
-        command.main([*places, "--recipe", "short", "--dry-run", "--split", "cavity"])
-        == 0
-    )
-    told = capsys.readouterr()
-    assert "cavity full mlp-0: to train, cavity/full-short: 1,000 steps" in told.out
-    assert "cavity full var: left out" in told.err
+    output = capsys.readouterr()
+    assert "cavity full gns-0: to train, cavity/full-short: 14,000 steps" in output.out
+    assert "fluid full mlp-0: to train, fluid/full-short: 1,500 steps" in output.out
+    assert "studies of table_4_2: left out" in output.err
+    short_cavity = ["--recipe", "short", "--dry-run", "--split", "cavity"]
+    assert command.main([*places, *short_cavity]) == 0
+    output = capsys.readouterr()
+    assert "cavity full mlp-0: to train, cavity/full-short: 1,000 steps" in output.out
+    assert "cavity full var: left out" in output.err
     assert command.main([*places, "--dry-run", "--split", "fluid"]) == 0
-    told = capsys.readouterr()
-    assert "fluid full mlp-0: to train, fluid/full: 600 epochs" in told.out
-    assert "fluid full var-0: to train, fluid/full: closed form" in told.out
-    assert "studies of table_4_2\n" in told.out
-    assert "lagbench generate --split fluid --size full" in told.err
+    output = capsys.readouterr()
+    assert "fluid full mlp-0: to train, fluid/full: 600 epochs" in output.out
+    assert "fluid full var-0: to train, fluid/full: closed form" in output.out
+    assert "studies of table_4_2\n" in output.out
+    assert "lagbench generate --split fluid --size full" in output.err
     assert not list(tmp_path.iterdir())
 
 
@@ -255,7 +254,7 @@ def test_committed_weights_are_shown_without_training(
     """Their predictions are made on the spot, once, and are those of the run that the
     weights come from.
     """
-    made = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0"
+    run_folder = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0"
     weights = tmp_path / "weights" / SPLIT / "tiny"
     assert reproduce(*ONLY, "--set", "training.steps=1") == 0
     weights.mkdir(parents=True)
@@ -263,15 +262,15 @@ def test_committed_weights_are_shown_without_training(
         ("weights.pt", "supergat_3.pt"),
         ("training.json", "supergat_3.json"),
     ):
-        (made / source).rename(weights / target)
-    expected = read_statistics(made / "scores.nc").predictions_sha256
+        (run_folder / source).rename(weights / target)
+    expected = read_statistics(run_folder / "scores.nc").predictions_sha256
     shutil.rmtree(tmp_path / "runs")
     capsys.readouterr()
 
     words = (*ONLY, "--no-training", "--weights", str(tmp_path / "weights"))
     assert reproduce(*words) == 0
     assert "seeds 3; 1 x 2 steps" in capsys.readouterr().out
-    folder = made.with_name("supergat-3")
+    folder = run_folder.with_name("supergat-3")
     assert read_statistics(folder / "scores.nc").predictions_sha256 == expected
     first = stamps(folder)
     assert reproduce(*words) == 0
