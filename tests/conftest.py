@@ -106,10 +106,9 @@ def pytest_sessionfinish() -> None:
 def lasting_workers() -> Iterator[None]:
     """Simulate in one worker that outlives a generation.
 
-    For speed: Taichi takes seconds to start in every new worker. What a failed
-    generation leaves in the queue is forgotten, and a pool that it leaves at work is
-    closed. Generations that are killed or counted are started by their tests as
-    processes of their own.
+    For speed: Taichi takes seconds to start in every new worker. A pool that a failed
+    generation leaves at work is closed. Generations that are killed or counted are
+    started by their tests as processes of their own.
     """
     pools: dict[object, Pool] = {}
 
@@ -129,7 +128,6 @@ def lasting_workers() -> Iterator[None]:
         try:
             yield pool
         finally:
-            pool.discard_queued()
             if not pool.is_idle:
                 pools.pop(key).close()
 

@@ -198,10 +198,6 @@ class Pool:
         """Whether no item waits and no worker has one."""
         return not self._queue and not self._list_busy()
 
-    def discard_queued(self) -> None:
-        """Forget the items that no worker has begun."""
-        self._queue.clear()
-
     def process_ids(self) -> list[int]:
         """Return the process ids of the living workers."""
         return [worker.process.pid for worker in self._workers]

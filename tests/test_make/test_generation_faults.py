@@ -112,7 +112,6 @@ def test_a_disk_too_small_is_refused_at_once(
     assert files(small_disk) == []
 
 
-@pytest.mark.usefixtures("as_shipped")  # a worker that lasts holds the disk
 def test_a_disk_that_fills_up_leaves_whole_files_only(
     small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:

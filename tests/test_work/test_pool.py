@@ -145,26 +145,6 @@ def test_errors_of_ours_arrive_whole() -> None:
     assert error.exit_code == 4
 
 
-def test_a_worker_goes_on_after_an_error() -> None:
-    """What no worker had begun can be forgotten."""
-    refused = WorkItem(name="a", function=pool_tasks.refuse, arguments=())
-    squared = WorkItem(name="b", function=pool_tasks.square, arguments=(3,))
-    with Pool(1) as pool:
-        pool.submit(refused)
-        pool.submit(refused)
-        with pytest.raises(DataError):
-            list(pool.events())
-        workers = pool.process_ids()
-        assert not pool.is_idle
-        pool.discard_queued()
-        assert pool.is_idle
-
-        pool.submit(squared)
-        *_, last_event = pool.events()
-        assert last_event.value == 9
-        assert pool.process_ids() == workers
-
-
 def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> None:
     """Whatever else a task raises names the line that raised it.
 
