@@ -192,7 +192,8 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         bounds: box (low, high) along each axis [length].
 
     Raises:
-        UsageError: axes change places in a box whose sides differ.
+        UsageError: axes change places in a box whose sides differ, or the y axis does
+            so where a force acts on layers along it.
     """
     lengths = [high - low for low, high in bounds]
     swaps_axes = bool((matrix.diagonal(dim1=1, dim2=2) == 0.0).any())
@@ -218,11 +219,45 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         source = wall_permutation(matrix).argmax(dim=2)
         walls = _multiply(matrix[:, None, None], walls)
         walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
-    return replace(batch, position=position, wall_velocity=walls, origin=origin)
+    force = batch.body_force
+    if force is not None:
+        force = _mirror_force(force, matrix)
+    return replace(
+        batch,
+        position=position,
+        wall_velocity=walls,
+        origin=origin,
+        body_force=force,
+    )
+
+
+def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
+    """Return the mirror image of a force on layers along y.
+
+    Args:
+        force: shape [window, frame, layer, axis].
+        matrix: signed permutation of the axes for each window.
+
+    Raises:
+        UsageError: the y axis changes places with another one.
+    """
+    sign = matrix[:, 1, 1]
+    if bool((sign == 0.0).any()):
+        raise UsageError(
+            "a force acts on layers along y, which cannot change places with an axis",
+            where="symmetry",
+            expected="none or mirror",
+            fix="use symmetry: mirror",
+        )
+    image = _multiply(matrix[:, None, None], force)
+    is_upside_down = (sign < 0.0)[:, None, None, None]
+    return torch.where(is_upside_down, image.flip(2), image)
 
 
 def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Batch:
     """Return each window moved by a random way along the periodic axes of the box.
+
+    Where a force acts on layers along y, windows are not moved along y.
 
     Args:
         batch: windows.
@@ -236,6 +271,8 @@ def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Bat
     # The period of an axis with walls is infinite.
     is_periodic = box.period.isfinite()
     shift = torch.where(is_periodic, draws.to(box.period) * box.period, 0.0)
+    if batch.body_force is not None:
+        shift[:, 1] = 0.0
     by_particle = shift.to(batch.position)[batch.sample]
 
     position = box.wrap(batch.position + by_particle[:, None])

@@ -210,6 +210,7 @@ class NeuralMPM(Baseline):
             walls=self._coming_walls(given),
             context=position.new_zeros(given.windows, 0),
             viscosity=self._scaled_viscosity(given),
+            body_force=self._coming_force(given),
             rest_shape=self._rest_shape(given, layer),
         )
         if self.projection is not None:
@@ -229,6 +230,25 @@ class NeuralMPM(Baseline):
             return given.position.new_zeros(given.windows, 1, 2 * dimension, dimension)
         per_second = given.wall_velocity[:, given.frames - 1 :]
         return per_second * self.info.frame_interval
+
+    def _coming_force(self, given: Batch) -> Tensor | None:
+        """Return the force from the last frame on [length/frame^2], if it is seen.
+
+        Raises:
+            DataError: no force drives the flow.
+        """
+        if not self.options.body_force:
+            return None
+        if given.body_force is None:
+            raise DataError(
+                "no force drives the flow",
+                where=f"{self.info.split} {self.info.size}",
+                expected="body_force in each scenario file",
+                got="none",
+                fix="train without it: --set model.body_force=false",
+            )
+        per_second = given.body_force[:, given.frames - 1 :]
+        return per_second * self.info.frame_interval**2
 
     def _scaled_viscosity(self, given: Batch) -> Tensor:
         """Return the logarithm of the viscosity of each window, shape [window, 1].
@@ -335,6 +355,8 @@ class NeuralMPM(Baseline):
         parts = [fields, constant_fields]
         if self.options.wall_velocity:
             parts.append(self.encoder.forcing(state.walls))
+        if state.body_force is not None:
+            parts.append(self.encoder.force(state.body_force))
         return torch.cat(parts, dim=1)
 
     def _predict_mirror_averaged(self, inputs: Tensor) -> Tensor:
@@ -390,11 +412,15 @@ class NeuralMPM(Baseline):
         velocities = torch.cat([state.velocity, new_velocities], dim=1)
         last_wall_frame = state.walls.shape[1] - 1
         walls = state.walls[:, min(len(frames), last_wall_frame) :]
+        force = state.body_force
+        if force is not None:
+            force = force[:, min(len(frames), force.shape[1] - 1) :]
         return replace(
             state,
             position=last_position,
             velocity=velocities[:, -self.options.velocities :],
             walls=walls,
+            body_force=force,
         )
 
 

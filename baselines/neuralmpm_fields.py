@@ -45,6 +45,9 @@ class GridState:
     # logarithm of the given viscosity, in units of the U-Net, shape [window, 1]; no
     # column where the U-Net does not see it
     viscosity: Tensor
+    # force on layers along y from the last frame on [length/frame^2], shape [window,
+    # frame, layer, axis]; None where the U-Net does not see it
+    body_force: Tensor | None = None
     rest_shape: RestShape | None = None  # None where strain is not asked for
     projection: ProjectionState | None = None  # None without a projection
     coming: tuple[Tensor, ...] = ()  # predicted positions of the frames to come
@@ -100,7 +103,8 @@ class FieldEncoder(nn.Module):
     def forcing_channels(self) -> int:
         """Channels of :meth:`forcing`."""
         axes = self.grid.dimension
-        return axes * self.options.bundle * self.options.wall_velocity
+        kinds = int(self.options.wall_velocity) + int(self.options.body_force)
+        return axes * self.options.bundle * kinds
 
     def layers(self, material: Tensor, sample: Tensor) -> Tensor:
         """Return the layer of each particle: one for each window and material.
@@ -182,6 +186,25 @@ class FieldEncoder(nn.Module):
         )
         return forcing.flatten(1, 2)
 
+    def force(self, body_force: Tensor) -> Tensor:
+        """Return the force on the fluid in the coming frames, at every node.
+
+        ``body_force`` is that of :class:`GridState`; the result has shape [window,
+        channel, x node, y node].
+        """
+        layer_count = body_force.shape[2]
+        grid = self.grid
+        share = (grid.axis_y - grid.low[1]) / (grid.high[1] - grid.low[1])
+        layer = (share * layer_count).long().clamp(0, layer_count - 1)
+        frame = torch.arange(1, self.options.bundle + 1, device=body_force.device)
+        coming = body_force[:, frame.clamp(max=body_force.shape[1] - 1)]
+        # shape [window, frame, axis, y node]
+        along_y = coming[:, :, layer].transpose(2, 3) / self.acceleration_std
+        channels = along_y.flatten(1, 2).unsqueeze(2)
+        if grid.dimension == 3:
+            channels = channels.unsqueeze(4)
+        return channels.expand(*channels.shape[:2], *grid.shape)
+
     def mirror_fields(self, matrix: Tensor) -> list[Tensor]:
         """Return the blocks by which a mirror image changes the fields of a node."""
         per_material = [torch.ones(1, 1)]
@@ -194,6 +217,5 @@ class FieldEncoder(nn.Module):
 
     def mirror_forcing(self, matrix: Tensor) -> list[Tensor]:
         """Return the blocks by which a mirror image changes the forcing of a node."""
-        if not self.options.wall_velocity:
-            return []
-        return [matrix] * self.options.bundle
+        kinds = int(self.options.wall_velocity) + int(self.options.body_force)
+        return [matrix] * (self.options.bundle * kinds)

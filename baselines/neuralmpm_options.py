@@ -48,6 +48,8 @@ class NeuralMPMOptions(Options):
     materials: tuple[int, ...] = (0,)
     # whether the velocity of the walls in the coming frames is a channel
     wall_velocity: bool = False
+    # whether the force on layers of the fluid in the coming frames is a channel
+    body_force: bool = False
     # whether the given viscosity is a channel, the same at all nodes
     viscosity: bool = False
     # whether particles are damped towards the velocity of all materials together, as if

@@ -98,6 +98,9 @@ def select_window(batch: Batch, window: int) -> Batch:
     walls = batch.wall_velocity
     if walls is not None:
         walls = walls[window : window + 1]
+    force = batch.body_force
+    if force is not None:
+        force = force[window : window + 1]
     origin = batch.origin
     if origin is not None:
         origin = origin[is_inside]
@@ -113,6 +116,7 @@ def select_window(batch: Batch, window: int) -> Batch:
         frame=batch.frame[window : window + 1],
         origin=origin,
         viscosity=viscosity,
+        body_force=force,
     )
 
 
@@ -227,12 +231,15 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
         if "wall_velocity" in file.variables:
             # The forcing of all later frames too: a rollout from these knows it.
             walls = file.read("wall_velocity", slice(numbers.start, None))
+        force = None
+        if "body_force" in file.variables:
+            force = file.read("body_force", slice(numbers.start, None))
         scenario = file.header.key.scenario
         stated = file.header.viscosity
     if stated is not None:
         viscosity = stated
     window = copy_window(list(position), material, walls, scenario, numbers.start)
-    return tensors(window._replace(viscosity=viscosity))
+    return tensors(window._replace(viscosity=viscosity, body_force=force))
 
 
 def scenario_paths(

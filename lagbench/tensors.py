@@ -102,6 +102,10 @@ class TensorWindow(NamedTuple):
     # kinematic viscosity [length^2/s]: the scenario's, else that of the data set; None
     # where none is known
     viscosity: float | None = None
+    # acceleration of the fluid [length/s^2] in layers of equal height along y, lowest
+    # first, float32, shape [frame, layer, axis], of these frames and perhaps of later
+    # ones; None where no force drives the flow
+    body_force: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +128,10 @@ class Batch:
     # kinematic viscosity of each window [length^2/s], float32, shape [window]; None
     # where none is known
     viscosity: Tensor | None = None
+    # acceleration of the fluid [length/s^2] in layers of equal height along y, lowest
+    # first, shape [window, frame, layer, axis]: the forcing as wall_velocity is; None
+    # where no force drives the flow
+    body_force: Tensor | None = None
 
     @property
     def windows(self) -> int:
@@ -156,10 +164,14 @@ class Batch:
         wall_velocity = self.wall_velocity
         if wall_velocity is not None:
             wall_velocity = wall_velocity[:, first:]
+        body_force = self.body_force
+        if body_force is not None:
+            body_force = body_force[:, first:]
         return replace(
             self,
             position=self.position[:, frames],
             wall_velocity=wall_velocity,
+            body_force=body_force,
             frame=self.frame + first,
         )
 
@@ -181,11 +193,15 @@ class Batch:
         wall_velocity = self.wall_velocity
         if wall_velocity is not None:
             wall_velocity = wall_velocity[:, 1:]
+        body_force = self.body_force
+        if body_force is not None:
+            body_force = body_force[:, 1:]
         next_positions = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
         return replace(
             self,
             position=next_positions,
             wall_velocity=wall_velocity,
+            body_force=body_force,
             frame=self.frame + 1,
         )
 
@@ -194,10 +210,11 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
     """Put windows side by side.
 
     Raises:
-        UsageError: the windows differ in length, in whether walls move, or in whether
-            their viscosity is known.
+        UsageError: the windows differ in length, in whether walls move or a force
+            drives the flow, or in whether their viscosity is known.
     """
     wall_velocities = []
+    body_forces = []
     origins = []
     viscosities = []
     lengths = set()
@@ -205,13 +222,15 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         lengths.add(window.position.shape[1])
         if window.wall_velocity is not None:
             wall_velocities.append(window.wall_velocity)
+        if window.body_force is not None:
+            body_forces.append(window.body_force)
         if window.origin is not None:
             origins.append(window.origin)
         if window.viscosity is not None:
             viscosities.append(window.viscosity)
 
     all_or_none = {0, len(windows)}
-    counts = {len(wall_velocities), len(origins), len(viscosities)}
+    counts = {len(wall_velocities), len(body_forces), len(origins), len(viscosities)}
     is_uniform = counts <= all_or_none
     if len(lengths) != 1 or not is_uniform:
         raise UsageError(
@@ -219,24 +238,31 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             where="collate",
             expected="windows of one split and one length",
             got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
-            f"with moving walls, {len(origins)} with their first frame, "
+            f"with moving walls, {len(body_forces)} with a body force, "
+            f"{len(origins)} with their first frame, "
             f"{len(viscosities)} with a viscosity",
         )
 
     particle_counts = torch.tensor([len(window.material) for window in windows])
-    forcing = None
-    if wall_velocities:
-        shared_length = min(len(velocity) for velocity in wall_velocities)
-        forcing = torch.stack(
-            [velocity[:shared_length] for velocity in wall_velocities]
-        )
     return Batch(
         position=torch.cat([window.position for window in windows]),
         sample=torch.arange(len(windows)).repeat_interleave(particle_counts),
         material=torch.cat([window.material for window in windows]),
-        wall_velocity=forcing,
+        wall_velocity=_stack_forcing(wall_velocities),
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
         origin=torch.cat(origins) if origins else None,
         viscosity=torch.tensor(viscosities) if viscosities else None,
+        body_force=_stack_forcing(body_forces),
     )
+
+
+def _stack_forcing(forcings: Sequence[Tensor]) -> Tensor | None:
+    """Return the forcing of all windows as far as that of each is known.
+
+    The shape is [window, frame, wall or layer, axis]; None where nothing drives them.
+    """
+    if not forcings:
+        return None
+    shared_length = min(len(forcing) for forcing in forcings)
+    return torch.stack([forcing[:shared_length] for forcing in forcings])

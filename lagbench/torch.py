@@ -56,6 +56,9 @@ def tensors(window: ArrayWindow) -> Window:
     wall_velocity = None
     if window.wall_velocity is not None:
         wall_velocity = torch.from_numpy(window.wall_velocity)
+    body_force = None
+    if window.body_force is not None:
+        body_force = torch.from_numpy(window.body_force)
     origin = None
     if window.origin is not None:
         origin = torch.from_numpy(window.origin)
@@ -67,6 +70,7 @@ def tensors(window: ArrayWindow) -> Window:
         frame=window.frame,
         origin=origin,
         viscosity=window.viscosity,
+        body_force=body_force,
     )
 
 
@@ -256,7 +260,8 @@ Step = Callable[[Batch], Tensor]
 """A model: windows of given frames in, positions of the next frame out.
 
 The positions [length] have shape [particle, axis]. The slice
-``batch.wall_velocity[:, batch.frames]`` is the forcing on the way to the next frame.
+``batch.wall_velocity[:, batch.frames]`` is the forcing on the way to the next frame; so
+is ``batch.body_force[:, batch.frames]`` where a force drives the flow.
 """
 
 
@@ -277,10 +282,10 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
             [particle, axis].
     """
     # Beyond the known forcing a model would take the last known one.
-    if given.wall_velocity is None:
-        longest = max(1, frames)
-    else:
-        longest = given.wall_velocity.shape[1] - given.frames
+    longest = max(1, frames)
+    for forcing in (given.wall_velocity, given.body_force):
+        if forcing is not None:
+            longest = min(longest, forcing.shape[1] - given.frames)
     if not 1 <= frames <= longest:
         raise UsageError(
             "no such frames",
@@ -380,6 +385,9 @@ def predict(
         if wall_velocity is not None:
             forcing = torch.from_numpy(wall_velocity.copy())
         window = data[first]._replace(wall_velocity=forcing)
+        body_force = data.store.body_force(scenario)
+        if body_force is not None:
+            window = window._replace(body_force=torch.from_numpy(body_force.copy()))
         given = collate([window]).part(visible_frames).to(device)
         with torch.no_grad():
             positions = roll_out(step, given, task.horizon)

@@ -44,6 +44,7 @@ class _OpenScenario(NamedTuple):
     position: h5py.Dataset
     material: NDArray[np.int8]
     wall_velocity: Floats | None
+    body_force: Floats | None
     viscosity: float | None
 
 
@@ -142,6 +143,15 @@ class FrameStore:
         opened = self._open(scenario)
         return opened.material, opened.wall_velocity
 
+    def body_force(self, scenario: int) -> Floats | None:
+        """Return the force that drives the flow [length/s^2], if one does.
+
+        It is the acceleration of layers of equal height along y, lowest first, towards
+        each frame, shape [frame, layer, axis].
+        """
+        self._reset_after_fork()
+        return self._open(scenario).body_force
+
     def viscosity(self, scenario: int) -> float | None:
         """Return the kinematic viscosity that is given [length^2/s], if one is."""
         self._reset_after_fork()
@@ -197,9 +207,14 @@ class FrameStore:
         wall_velocity = None
         if "wall_velocity" in variables:
             wall_velocity = variables["wall_velocity"][...]
+        body_force = None
+        if "body_force" in variables:
+            body_force = variables["body_force"][...]
         stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
         viscosity = self._size.viscosity(stated)
-        return _OpenScenario(file, position, material, wall_velocity, viscosity)
+        return _OpenScenario(
+            file, position, material, wall_velocity, body_force, viscosity
+        )
 
     def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:
         """Refuse a file of another scenario, version or content."""
@@ -294,6 +309,10 @@ class Window(NamedTuple):
     # kinematic viscosity [length^2/s]: the scenario's, else that of the data set; None
     # where none is known
     viscosity: float | None = None
+    # acceleration of the fluid [length/s^2] in layers of equal height along y, lowest
+    # first, on the way to each frame, those to predict included, shape [frame, layer,
+    # axis]; None where no force drives the flow
+    body_force: NDArray[np.float32] | None = None
 
 
 class WindowReader:
@@ -432,6 +451,10 @@ class WindowReader:
             walls = walls[frame : frame + self.length]
         window = copy_window(frames, material, walls, scenario, frame)
         window = window._replace(viscosity=self.store.viscosity(scenario))
+        force = self.store.body_force(scenario)
+        if force is not None:
+            shown_frames = slice(frame, frame + self.length)
+            window = window._replace(body_force=force[shown_frames].copy())
         if not self.origin:
             return window
         first_frame = self.store.frames(scenario, 0, 1)[0]
@@ -464,7 +487,8 @@ def windows(
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, axis];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
     [frame, wall, axis], or None; the ids ``scenario`` and ``frame``; ``viscosity``
-    [length^2/s]. ``data.size`` is the description of the data set.
+    [length^2/s]; ``body_force`` [length/s^2], float32, shape [frame, layer, axis], or
+    None. ``data.size`` is the description of the data set.
     `lagbench.torch.WindowDataset` gives the same windows as tensors.
 
     Args:

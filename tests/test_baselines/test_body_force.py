@@ -1,0 +1,139 @@
+"""The force that drives a flow: in windows, in batches, and as input of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lagbench
+from lagbench.baselines.augmentation import mirror_batch, shift_batch
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.neuralmpm import NeuralMPM
+from lagbench.data.registry import load
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import DataError, UsageError
+from lagbench.make.generate import GenerationResult
+from lagbench.tensors import Batch, TensorBox
+from lagbench.torch import WindowDataset, collate, predict
+
+SPLIT = "poiseuille"
+SIZE = load().size(SPLIT, "tiny")
+GIVEN = 3
+
+
+@pytest.fixture(scope="module")
+def root(tiny_split: Callable[..., GenerationResult]) -> Path:
+    return tiny_split(SPLIT).root
+
+
+@pytest.fixture(scope="module")
+def batch(root: Path) -> Batch:
+    """Two windows of different scenarios, from different frames."""
+    data = WindowDataset(SPLIT, size="tiny", root=root, history=GIVEN, future=4)
+    return collate([data[2], data[-1]])
+
+
+def test_windows_hold_the_force_of_their_frames(root: Path) -> None:
+    """Row f is what acts from frame f-1 to f; of a cavity there is none."""
+    data = lagbench.windows(SPLIT, size="tiny", root=root, history=2)
+    window = data[5]
+    assert window.body_force is not None
+    with read_scenario(SIZE.path(root, window.scenario)) as file:
+        expected = file.read("body_force")[window.frame : window.frame + 3]
+    assert np.abs(expected).max() > 0.0
+    np.testing.assert_array_equal(window.body_force, expected)
+
+
+def test_the_force_goes_with_the_frames(batch: Batch) -> None:
+    """A part, and a window one frame later, begin with the force of their frames."""
+    force = batch.body_force
+    assert force is not None
+    assert force.shape == (2, GIVEN + 4, 2, 2)
+    torch.testing.assert_close(force[:, :, 1], -force[:, :, 0])
+    given = batch.part(slice(GIVEN))
+    assert given.body_force is not None
+    torch.testing.assert_close(given.body_force, force)
+    later = given.followed_by(given.position[:, -1])
+    assert later.body_force is not None
+    torch.testing.assert_close(later.body_force, force[:, 1:])
+
+
+def test_a_users_model_is_given_the_force_of_all_frames(root: Path) -> None:
+    """The last row that a rollout sees is that of the last predicted frame."""
+    seen: list[torch.Tensor] = []
+
+    def step(given: Batch) -> torch.Tensor:
+        assert given.body_force is not None
+        seen.append(given.body_force[0, given.frames])
+        return given.position[:, -1]
+
+    first, *_ = predict(step, SPLIT, size="tiny", root=root, history=2)
+    with read_scenario(SIZE.path(root, first[0])) as file:
+        force = file.read("body_force")
+    task = SIZE.task
+    frames = slice(task.input_frames, task.input_frames + task.horizon)
+    rows = torch.stack(seen[: task.horizon]).numpy()
+    np.testing.assert_array_equal(rows, force[frames])
+
+
+def test_images_of_the_force_fit_the_images_of_the_particles(batch: Batch) -> None:
+    """A mirror image in x drives the other way; upside down the layers change places;
+    axes do not; windows are not moved across the layers.
+    """
+    force = batch.body_force
+    assert force is not None
+    across_x = torch.diag(torch.tensor([-1.0, 1.0])).expand(2, 2, 2)
+    image = mirror_batch(batch, across_x, SIZE.bounds)
+    assert image.body_force is not None
+    torch.testing.assert_close(image.body_force, -force)
+
+    across_y = torch.diag(torch.tensor([1.0, -1.0])).expand(2, 2, 2)
+    image = mirror_batch(batch, across_y, SIZE.bounds)
+    assert image.body_force is not None
+    torch.testing.assert_close(image.body_force, force.flip(2))
+
+    swap = torch.tensor([[0.0, 1.0], [1.0, 0.0]]).expand(2, 2, 2)
+    with pytest.raises(UsageError) as caught:
+        mirror_batch(batch, swap, SIZE.bounds)
+    assert caught.value.where == "symmetry"
+
+    box = TensorBox(SIZE.box)
+    moved = shift_batch(batch, box, torch.Generator().manual_seed(1))
+    way = box.displacement(batch.position, moved.position)
+    assert float(way[..., 0].abs().min()) > 1e-3
+    assert float(way[..., 1].abs().max()) == 0.0
+
+
+def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) -> None:
+    """The lower half of the grid has that of the first layer, the upper half that of
+    the second; a model that sees it refuses data without it.
+    """
+    info = read_dataset_info(SPLIT, "tiny", root=root)
+    options = {"cells": 12, "width": 8, "velocities": 2, "bundle": 3}
+    model = NeuralMPM.build({**options, "body_force": True}, info)
+    given = batch.part(slice(GIVEN))
+    state = model.start(given)
+    assert state.body_force is not None
+    fields = model.encoder.force(state.body_force)
+    assert fields.shape == (2, 6, 12, 12)
+    assert batch.body_force is not None
+    unit = info.frame_interval**2 / model.change
+    coming = unit * batch.body_force[:, GIVEN : GIVEN + 3]
+    for layer, rows in enumerate((slice(0, 6), slice(6, 12))):
+        expected = coming[:, :, layer].flatten(1)[..., None, None]
+        torch.testing.assert_close(
+            fields[..., rows], expected.expand(-1, -1, 12, 6), atol=1e-6, rtol=1e-5
+        )
+    state, _ = model.call(state)
+    assert state.body_force is not None
+    torch.testing.assert_close(
+        state.body_force[:, 0], info.frame_interval**2 * batch.body_force[:, GIVEN + 2]
+    )
+
+    with pytest.raises(DataError):
+        model.start(replace(given, body_force=None))
