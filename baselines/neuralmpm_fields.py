@@ -194,7 +194,7 @@ class FieldEncoder(nn.Module):
         """
         layer_count = body_force.shape[2]
         grid = self.grid
-        share = (grid.axis_y - grid.low[1]) / (grid.high[1] - grid.low[1])
+        share = (grid.get_buffer("axis_y") - grid.low[1]) / (grid.high[1] - grid.low[1])
         layer = (share * layer_count).long().clamp(0, layer_count - 1)
         frame = torch.arange(1, self.options.bundle + 1, device=body_force.device)
         coming = body_force[:, frame.clamp(max=body_force.shape[1] - 1)]
