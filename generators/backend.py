@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import UsageError, require
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 from lagbench.work.machine import available_cores
 
 from .solver import Device
@@ -38,6 +38,9 @@ HARMLESS = frozenset(
 """Variables of Taichi that a user may set: they choose memory, places and cards,
 never arithmetic.
 """
+
+MEMORY_WORDS = "memory allocation"
+"""What Taichi says that finds no memory as it starts."""
 
 _started: list[tuple[bool, int]] = []
 
@@ -108,7 +111,15 @@ def _hidden_variables() -> Iterator[None]:
         os.environ.update(hidden)
 
 
-def _device_error(on_gpu: bool, error: RuntimeError) -> UsageError:
+def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
+    if MEMORY_WORDS in str(error):
+        return WorkFailedError(
+            "there is not enough memory",
+            where="Taichi",
+            expected="room for a gigabyte of addresses",
+            got=error,
+            fix="raise the limit (`ulimit -v unlimited`, or that of the batch system)",
+        )
     if on_gpu:
         return UsageError(
             "Taichi cannot use this device",

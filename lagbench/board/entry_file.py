@@ -34,6 +34,9 @@ MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it.
 """
 
+MOST_FILE_BYTES = 40_000_000
+"""Longest file of a board that is hashed [bytes]; all weights have no more."""
+
 MOST_ISSUES = 20  # issues of one file that are reported
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -286,6 +289,9 @@ def is_unchanged(folder: Folder, path: Path, sha256: str) -> bool:
     """Tell whether a file has the hash that its entry names, and is no link."""
     file = folder.path / path
     if not file.is_file() or folder.link_in(path) is not None:
+        return False
+    # Hashing a sparse file of a terabyte would take an hour.
+    if file.stat().st_size > MOST_FILE_BYTES:
         return False
     return file_sha256(file) == sha256
 

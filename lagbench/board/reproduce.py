@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.checksums import file_sha256
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
@@ -46,6 +45,7 @@ from .entry import (
     Reproduction,
     Verification,
 )
+from .entry_file import is_unchanged
 from .folder import Folder
 from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
 from .scores_compared import compare
@@ -228,9 +228,8 @@ def open_model(
     if prediction.weights is None:
         raise UsageError("the seed has no model", where=str(entry.yaml_path))
     path = folder.path / prediction.weights.path
-    if folder.link_in(Path(prediction.weights.path)) is not None or (
-        not path.is_file() or file_sha256(path) != prediction.weights.sha256
-    ):
+    place = Path(prediction.weights.path)
+    if not is_unchanged(folder, place, prediction.weights.sha256):
         raise ChecksFailedError(
             "the model is not the one that the entry names",
             where=str(path),

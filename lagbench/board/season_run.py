@@ -27,6 +27,7 @@ from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
+from lagbench.scoring.references import check_train
 from lagbench.scoring.scenario import measure_rows, predict_reference
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.score_layout import SUBMISSION
@@ -313,6 +314,7 @@ class _Run:
         reference = REFERENCES[data_set.reference]
         public = self.registry.size(data_set.split, data_set.size)
         metric = data_set.metric
+        check_train(public, self.root, [reference.name])
 
         def measure(scenario: int) -> Tally:
             with task.opened(scenario) as truth:

@@ -29,11 +29,11 @@ from lagbench.submission.issues import ValidationIssue
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
-from .entry_file import is_unchanged
+from .entry_file import MOST_FILE_BYTES, is_unchanged
 from .folder import Folder, Place, weights_path
 from .issues import make_issue
 
-MOST_BYTES = 40_000_000
+MOST_BYTES = MOST_FILE_BYTES
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
 good.
 """
@@ -413,6 +413,10 @@ def _check_weights_file(
         yield make_issue("weights", where, ascii(weights.path)[1:-1], expected=path)
     elif not file.is_file() or folder.link_in(path) is not None:
         yield make_issue("weights", where, "no such file", expected=path)
+    elif file.stat().st_size > MOST_FILE_BYTES:
+        length = f"{file.stat().st_size} bytes"
+        most = f"at most {MOST_FILE_BYTES} bytes"
+        yield make_issue("weights", path, length, expected=most)
     else:
         sha256 = file_sha256(file)
         if sha256 != weights.sha256:

@@ -7,7 +7,8 @@ from typing import Annotated
 
 from lagbench.data.local import locate_split
 from lagbench.data.registry import NO_GENERATOR
-from lagbench.errors import check_installed
+from lagbench.errors import WorkFailedError, check_installed
+from lagbench.work.machine import address_space_limit
 
 from .options import option
 
@@ -24,15 +25,29 @@ ThreadsOption = Annotated[
 PREDICTION_LIBRARIES = ("torch", "torch_geometric")
 TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES, "lightning_fabric")
 
+NEEDED_BYTES = 1280 << 20
+"""Least address space in which a model is trained [bytes]; tiny ones map 1,040 MiB."""
+
 
 def require_libraries(names: tuple[str, ...]) -> None:
     """Refuse to go on without the libraries of reference models.
 
     Raises:
         UsageError: one of them is not installed.
+        WorkFailedError: this process may not map as much memory as they need.
     """
     for name in names:
         check_installed(name, extra="baselines")
+    # OpenBLAS, which SciPy brings, tries for ever where it finds no memory.
+    limit = address_space_limit()
+    if limit is not None and limit < NEEDED_BYTES:
+        raise WorkFailedError(
+            "there is not enough memory",
+            where="the limit on the address space of this process",
+            expected=f"at least {NEEDED_BYTES >> 20} MiB, for PyTorch and SciPy",
+            got=f"{limit >> 20} MiB",
+            fix="raise the limit: `ulimit -v unlimited`, or that of the batch system",
+        )
 
 
 def root_option(split: str, root: Path | None) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, check_regular
 
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
@@ -108,17 +108,11 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
     """Return the plain Python value of a YAML file.
 
     Raises:
-        UnreadableFileError: the file is missing, too large, or not plain YAML.
+        UnreadableFileError: the file is missing, too large, no regular file, or not
+            plain YAML.
     """
+    check_regular(path, longest=MAX_BYTES, fix="name a YAML file")
     try:
-        length = path.stat().st_size
-        if length > MAX_BYTES:
-            raise UnreadableFileError(
-                "the YAML file is too large",
-                where=str(path),
-                expected=f"at most {MAX_BYTES} bytes",
-                got=f"{length} bytes",
-            )
         text = path.read_text(encoding="utf-8")
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)

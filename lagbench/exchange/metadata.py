@@ -38,7 +38,12 @@ from lagbench.atomic import write_atomically
 from lagbench.data import MATERIALS
 from lagbench.data.box import AXES
 from lagbench.data.registry import Size
-from lagbench.errors import UnreadableFileError, UsageError, suggest_name
+from lagbench.errors import (
+    UnreadableFileError,
+    UsageError,
+    check_regular,
+    suggest_name,
+)
 
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
@@ -481,14 +486,9 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
 def _read_json(path: Path) -> dict[str, Any]:
     """Return the JSON object of a file of at most MAX_BYTES."""
     where = str(path)
+    check_regular(path, longest=MAX_BYTES, fix="the metadata lie beside train")
     try:
-        with path.open("rb") as stream:
-            text = stream.read(MAX_BYTES + 1)
-        if len(text) > MAX_BYTES:
-            raise UnreadableFileError(
-                "the file is too large", where=where, expected=f"<= {MAX_BYTES} bytes"
-            )
-        values = json.loads(text)
+        values = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFileError(
             "cannot read the metadata", where=where, expected="a JSON object", got=error

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.contents import check_contents
 from lagbench.data.registry import Registry, Size, load
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
@@ -24,6 +25,7 @@ from lagbench.metrics.table import select
 from lagbench.references.predictor import ReferencePredictor, given_in
 from lagbench.references.shipped import ReferenceScores, correlation_of, shipped
 from lagbench.references.table import REFERENCES, references_of
+from lagbench.store.copy import update_working_copy
 from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
@@ -45,6 +47,18 @@ def measurable(size: Size, root: Path) -> tuple[str, ...]:
     """
     references = _with_data(size, root)
     return tuple(reference.name for reference in references if reference.counts)
+
+
+def check_train(size: Size, root: Path, references: Collection[str]) -> None:
+    """Fetch and hash train where a reference looks things up there.
+
+    Raises:
+        DataError: a scenario of train is not the recorded one.
+    """
+    if any(REFERENCES[name].reads_train for name in references):
+        scenarios = size.subsets["train"]
+        update_working_copy(size, root, scenarios)
+        check_contents(size, root, scenarios)
 
 
 def _with_data(size: Size, root: Path) -> list[ReferencePredictor]:
@@ -255,7 +269,8 @@ def measure(
 ) -> dict[str, ReferenceScores]:
     """Return the scores of references of a data set by name.
 
-    The scored subset must be there, and train for ``analog``.
+    The scored subset must be there, and train for ``analog``; the values of both are
+    hashed and compared with the recorded hashes.
 
     Args:
         size: the split and size, and the subset that it scores.
@@ -273,6 +288,7 @@ def measure(
         if names is None or reference.name in names:
             names_to_measure.append(reference.name)
     references = tuple(names_to_measure)
+    check_train(size, root, references)
     folder = saved_folder(size, root)
     jobs = {}
     for scenario in task.scenarios:

@@ -36,7 +36,7 @@ from .package_metrics import (
     package_metric_errors,
 )
 from .published_scores import read_scores
-from .references import measurable
+from .references import check_train, measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
@@ -141,6 +141,7 @@ def score(
     references: tuple[str, ...] = ()
     if not shipped_references:
         references = measurable(size, data_root)
+        check_train(size, data_root, references)
     measurement = _measure(
         functools.partial(
             score_scenarios,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -418,6 +419,9 @@ def put(end: str, data: bytes) -> Callable[[BoardBench], object]:
 
 DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "weights: edited": lambda b: put("pt", kept_files(b)["drift_0.pt"][:-1] + b"x")(b),
+    "weights: a sparse file of a terabyte": lambda b: os.truncate(
+        b.folder / f"{KEPT}.pt", 2**40
+    ),
     "weights: lost": lambda b: (b.folder / f"{KEPT}.pt").unlink(),
     "weights: those of another method": lambda b: b.edit(
         "drift",

@@ -188,6 +188,33 @@ def test_a_vanished_disk_and_full_memory_are_no_faults_of_lagbench(
     assert "unexpected" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "generate cavity --size tiny --scenarios 0 --workers 1",
+        "train cavity --baseline gns --size tiny",
+    ],
+)
+def test_a_limit_of_memory_is_told_as_that(line: str, tmp_path: Path) -> None:
+    """Taichi asks for a gigabyte of addresses; with less OpenBLAS tries for ever."""
+    script = (
+        "import resource, runpy, sys\n"
+        f"resource.setrlimit(resource.RLIMIT_AS, ({700_000 * 1024},) * 2)\n"
+        "runpy.run_module('lagbench', run_name='__main__')\n"
+    )
+    words = [*line.split(), "--root", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *words],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 5, done.stderr
+    assert "memory" in done.stderr
+    assert "fix: " in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_letters_that_a_stream_lacks_are_escaped() -> None:
     """The sign ÷ of a heading is no ASCII; the table is printed all the same."""
     board = Path(lagbench.__file__).parents[1] / "leaderboard"

@@ -1,6 +1,7 @@
 """YAML from strangers: what is read, what is refused, and how it is said."""
 
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,18 @@ def test_plain_values_are_read(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError) as caught:
         read_yaml(tmp_path / "absent.yaml")
     assert caught.value.where.endswith("absent.yaml")
+
+
+def test_a_pipe_and_a_device_are_not_read(tmp_path: Path) -> None:
+    """A pipe waits for ever, and a device fills the memory."""
+    pipe = tmp_path / "pipe.yaml"
+    os.mkfifo(pipe)
+    link = tmp_path / "link.yaml"
+    link.symlink_to("/dev/zero")
+    for path in (pipe, link):
+        with pytest.raises(UnreadableFileError) as caught:
+            read_yaml(path)
+        assert caught.value.where == str(path)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,13 @@ error says why not.
 from __future__ import annotations
 
 import math
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -885,6 +887,20 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
     )
     assert result.exit_code == 0, result.output
     assert locate(str(tmp_path / "told")).size.box == size.box
+
+
+def test_the_scorer_refuses_a_changed_train(own: LocalSplit, tmp_path: Path) -> None:
+    """Naive predictors look things up there: other values would be another skill."""
+    folder = tmp_path / "copy" / own.folder.name
+    shutil.copytree(own.folder, folder)
+    target = tmp_path / "predictions.nc"
+    lagbench.template(str(folder), output=target)
+    path = next(folder.rglob("train/*.nc"))
+    with h5py.File(path, "r+") as file:
+        file["position"][1, 0, 0] += np.float32(1e-3)
+    with pytest.raises(DataError) as caught:
+        lagbench.score(target, root=folder.parent, output_dir=tmp_path, workers=1)
+    assert str(path) in str(caught.value.where)
 
 
 def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:

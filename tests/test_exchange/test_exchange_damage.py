@@ -7,6 +7,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import json
+import os
 import resource
 import zipfile
 from collections.abc import Iterator
@@ -308,13 +309,23 @@ def test_numbers_that_do_not_compute(
     assert not (tmp_path / "own").exists()
 
 
+def test_metadata_that_are_a_pipe(tmp_path: Path) -> None:
+    """A pipe waits for ever."""
+    folder = write_gns(tmp_path / "in", straight_runs(3))
+    (folder / "metadata.json").unlink()
+    os.mkfifo(folder / "metadata.json")
+    with pytest.raises(UnreadableFileError) as caught:
+        imported(folder)
+    assert "metadata.json" in str(caught.value.where)
+
+
 @pytest.mark.parametrize(
     ("fault", "error", "words"),
     [
         (
             "no metadata",
             UnreadableFileError,
-            "cannot read the metadata",
+            "metadata.json",
         ),
         (
             "no json",

@@ -21,6 +21,7 @@ from cluster_bench import (
     everything,
     gone,
     local_cluster,
+    lonely_scheduler,
     scheduler_process,
     writers,
 )
@@ -30,6 +31,7 @@ from parallel_jobs import report_for_ever
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
+from lagbench.data.scenario import check_scenario
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make import generate as campaign
 from lagbench.make.generate import GenerationResult, generate
@@ -121,6 +123,40 @@ def test_a_lost_scheduler_is_an_error_and_resumed(
     result = generate(SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured)
     assert set(result.kept) >= {entry.scenario for entry in manifest.files}
     assert result.dataset_sha256 == generated.dataset_sha256
+
+
+@pytest.mark.slow
+def test_all_workers_killed_is_an_error(
+    tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SIGKILL of every worker in mid-scenario: the call ends, and leaves nothing half
+    written.
+    """
+    monkeypatch.setattr(cluster, "LOST_SECONDS", 3.0)
+    with lonely_scheduler(2) as (address, processes):
+
+        def kill_all_after_one(state: Progress) -> None:
+            if state.stage == "simulating" and state.scenarios_done == 1:
+                for process in processes:
+                    process.kill()
+
+        with pytest.raises(WorkFailedError) as caught:
+            generate(
+                SPLIT,
+                SIZE,
+                root=tmp_path,
+                scheduler=address,
+                progress=kill_all_after_one,
+                registry=unmeasured,
+            )
+    assert caught.value.exit_code == 5
+    assert "no worker" in str(caught.value)
+    manifest = read_manifest(tmp_path, SPLIT, SIZE, 2)
+    assert manifest is not None
+    for entry in manifest.files:
+        path = tmp_path / SPLIT / SIZE / "v2" / entry.path
+        check_scenario(path, entry.content_sha256)
+    assert writers(tmp_path) == {}
 
 
 def test_a_folder_that_workers_do_not_share(

@@ -177,7 +177,8 @@ def velocities_that_lie(path: Path, rng: np.random.Generator) -> None:
     def change(arrays: Arrays) -> None:
         steps = np.diff(arrays["position"], axis=0, prepend=arrays["position"][:1])
         factor = np.float32(factors[rng.integers(len(factors))])
-        arrays["velocity"] = steps * factor
+        with np.errstate(invalid="ignore"):
+            arrays["velocity"] = steps * factor
 
     _edit(path, change)
 
