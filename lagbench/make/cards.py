@@ -27,6 +27,10 @@ NOTES: Mapping[str, str] = {
         "of what is given: they "
         "are the forcing. `wall_velocity` at frame f is what acts from frame f-1 to f."
     ),
+    "cavity-3d": (
+        "The wall velocities of all frames, those to be predicted included, are part "
+        "of what is given. `wall_velocity` at frame f is what acts from frame f-1 to f."
+    ),
     "multimaterial": (
         "Pairs with snow come to rest first. `active_frames` of a file says for how "
         "many predicted frames "

@@ -14,7 +14,7 @@ from lagbench.baselines.train import train
 from lagbench.data.registry import load
 from lagbench.make.generate import GenerationResult
 
-SPLITS = ("poiseuille",)
+SPLITS = ("poiseuille", "cavity-3d")
 STEPS = 20
 
 

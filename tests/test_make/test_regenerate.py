@@ -16,7 +16,13 @@ from lagbench.make.verify import verify
 SPLITS = tuple(load().splits)
 
 # Each compiles kernels of its own, which takes seconds.
-OWN_KERNELS = ("decaying-vortices", "poiseuille", "curl-noise-3d", "fluid-3d")
+OWN_KERNELS = (
+    "decaying-vortices",
+    "poiseuille",
+    "curl-noise-3d",
+    "cavity-3d",
+    "fluid-3d",
+)
 OF_THIS_TURN = (
     *(name for name in SPLITS if name not in OWN_KERNELS),
     *of_this_turn(OWN_KERNELS, turns=len(OWN_KERNELS)),
