@@ -57,6 +57,8 @@ def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
     names = [name for name in ("mini", "full") if name in load().split(split).sizes]
     name = names[(turn() + SPLITS.index(split)) % len(names)]
     size = load().size(split, name)
+    if size.measured is None:
+        pytest.skip(f"no hash of {split} {name} is recorded")
     scenario = size.scenarios[turn() // 2 % len(size.scenarios)]
     result = generate(split, name, scenarios=(scenario,), root=tmp_path)
     assert result.simulated == (scenario,)
