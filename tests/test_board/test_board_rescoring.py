@@ -55,7 +55,7 @@ def checked(bench: BoardBench, **options: Any) -> CheckResult:
     return check_board(bench.folder, registry=bench.registry, isolated=False, **options)
 
 
-def found(bench: BoardBench) -> list[str]:
+def findings_of(bench: BoardBench) -> list[str]:
     """Return the names of the checks that find something without either."""
     return [finding.check for finding in checked(bench).findings]
 
@@ -88,21 +88,20 @@ def test_scoring_again_confirms_and_is_recorded(
     """
     result = rescored(own, predictions)
     assert not result.findings
-    (one,) = result.confirmed
-    assert one.entry == Path(PLACE, "noisy.yaml")
-    assert one.difference == 0.0
+    (confirmed,) = result.confirmed
+    assert confirmed.entry == Path(PLACE, "noisy.yaml")
+    assert confirmed.difference == 0.0
     assert not (own.folder / "verified.yaml").exists()
-    assert rescored(own, predictions, recording=True).recorded == (
-        f"{PLACE}/noisy.yaml",
-    )
+    result = rescored(own, predictions, recording=True)
+    assert result.recorded == (f"{PLACE}/noisy.yaml",)
     assert verified(own) == {"noisy"}
-    assert found(own) == []
+    assert findings_of(own) == []
     before = (own.folder / "verified.yaml").read_bytes()
     rescored(own, predictions, recording=True)
     assert (own.folder / "verified.yaml").read_bytes() == before
     reform(own, scale("vorticity_mse", 0.5))
     assert verified(own) == set()
-    assert found(own) == ["verified"]
+    assert findings_of(own) == ["verified"]
 
 
 def test_metrics_of_packages_decide_nothing(
@@ -119,10 +118,10 @@ def test_metrics_of_packages_decide_nothing(
         patch.setattr("lagbench.metrics.table.available", lambda: more)
         assert len(rescored(own, predictions).confirmed) == 1
         own.submit(predictions, replace=True)
-        with pytest.raises(
-            UsageError
-        ):  # the same predictions by another name, measured otherwise
-            own.submit(own.predict(noisy, "twin"))
+        # the same predictions by another name, measured otherwise
+        twin = own.predict(noisy, "twin")
+        with pytest.raises(UsageError):
+            own.submit(twin)
     assert len(rescored(own, predictions).confirmed) == 1
 
 
@@ -130,7 +129,8 @@ def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
     """One of two seeds confirms its score file, not the entry."""
     path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
     result = rescored(own, path, recording=True)
-    assert [one.score_file.name for one in result.confirmed] == ["damped_0.nc"]
+    (confirmed,) = result.confirmed
+    assert confirmed.score_file.name == "damped_0.nc"
     assert result.recorded == ()
     assert result.partly == (f"{PLACE}/damped.yaml",)
 
@@ -142,15 +142,17 @@ def test_scoring_again_finds_what_a_forger_hid(
     tell.
     """
     reform(own, scale("vorticity_mse", 0.5))
-    assert found(own) == []
+    assert findings_of(own) == []
     result = rescored(own, predictions, recording=True)
-    told = [(one.check, one.got) for one in result.findings]
-    assert told == [("rescored", "other vorticity_mse")]
+    (finding,) = result.findings
+    assert finding.check == "rescored"
+    assert finding.got == "other vorticity_mse"
     assert result.confirmed == ()
     assert result.recorded == ()
     own.entry("noisy").unlink()
     (own.folder / SCORES / "noisy.nc").unlink()
-    assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
+    (finding,) = rescored(own, predictions).findings
+    assert finding.check == "rescored"
 
 
 def test_what_is_said_beside_the_numbers_is_compared(
@@ -159,8 +161,13 @@ def test_what_is_said_beside_the_numbers_is_compared(
     """Flags and frozen scenarios are those that the scorer tells; so are the scores of
     floors.
     """
-    said = {"diverged_at": {0: 7}, "flags": [{"name": "physics"}]}
-    own.edit("noisy", lambda held: held["score"]["files"][0].update(said))
+
+    def change_flags(entry: dict[str, Any]) -> None:
+        file = entry["score"]["files"][0]
+        file["diverged_at"] = {0: 7}
+        file["flags"] = [{"name": "physics"}]
+
+    own.edit("noisy", change_flags)
     with netCDF4.Dataset(own.folder / PREDICTOR, "r+") as file:
         file.set_auto_maskandscale(False)
         scale("position_mse", 2.0)(file)
@@ -178,22 +185,23 @@ def test_pictures_and_statistics_are_compared(
     def repaint(file: Any) -> None:
         film = file["preview"]["film"]
         film.set_auto_maskandscale(False)
-        film[1] = np.clip(film[1].astype(np.int64) + 500, 0, 60_000).astype(np.uint16)
+        brighter = np.clip(film[1].astype(np.int64) + 500, 0, 60_000)
+        film[1] = brighter.astype(np.uint16)
 
     reform(own, repaint)
-    assert [finding.got for finding in rescored(own, predictions).findings] == [
-        "other film pictures"
-    ]
+    (finding,) = rescored(own, predictions).findings
+    assert finding.got == "other film pictures"
+
     with netCDF4.Dataset(own.folder / SCORES / "noisy.nc", "a") as file:
         names = file.statistics.split()
-        file.statistics = " ".join(
-            "made_up" if name == "velocity_mse" else name for name in names
-        )
+        names[names.index("velocity_mse")] = "made_up"
+        file.statistics = " ".join(names)
     own.rehash("noisy")
-    findings = rescored(own, predictions).findings
-    assert "velocity_mse" in next(
-        str(one.got) for one in findings if one.check == "rescored"
-    )
+    differences = []
+    for finding in rescored(own, predictions).findings:
+        if finding.check == "rescored":
+            differences.append(str(finding.got))
+    assert "velocity_mse" in differences[0]
 
 
 def test_broken_predictions_are_opened_in_the_child_only(
@@ -288,7 +296,7 @@ LISTED = "verified.yaml"
 
 def said(**keys: str) -> Callable[[BoardBench], object]:
     """Return what writes keys into the entry of noisy."""
-    return lambda bench: bench.edit("noisy", lambda held: held.update(keys))
+    return lambda bench: bench.edit("noisy", lambda entry: entry.update(keys))
 
 
 CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
@@ -358,7 +366,7 @@ def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
     """
     for setting in ("core.fsmonitor", "diff.external"):
         git(branch.folder.parent, "config", setting, f"touch {tmp_path}/ran; false")
-    branch.edit("noisy", lambda held: held.update(notes="other"))
+    branch.edit("noisy", lambda entry: entry.update(notes="other"))
     branch.entry("damped").unlink()
     assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
     assert not (tmp_path / "ran").exists()
@@ -418,7 +426,7 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
         f"{PLACE}/verified.yaml",
     ]
     assert (own.folder / "verified.yaml").read_text() == "{}\n"
-    assert found(own) == []
+    assert findings_of(own) == []
 
 
 def test_without_git_it_says_so(

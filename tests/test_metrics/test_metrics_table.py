@@ -59,9 +59,8 @@ def trajectories() -> tuple[Floats, Floats]:
 def pairs() -> list[FramePair]:
     """Return their frame pairs."""
     truth, prediction = trajectories()
-    return pairs_of(
-        scenario_of(truth, material=MATERIAL, materials=KINDS), truth, prediction
-    )
+    scenario = scenario_of(truth, material=MATERIAL, materials=KINDS)
+    return pairs_of(scenario, truth, prediction)
 
 
 def tallied(*pieces: FramePair) -> Tally:
@@ -69,12 +68,15 @@ def tallied(*pieces: FramePair) -> Tally:
     return tally(pieces or pairs(), ALL, CONFIG.predicted_frames)
 
 
-def same_bits(one: Tally, two: Tally) -> bool:
+def bytes_of(tally: Tally) -> list[bytes]:
+    """Return the bytes of all arrays of a tally."""
+    arrays = (tally.total, tally.weight, tally.undefined)
+    return [array.tobytes() for array in arrays]
+
+
+def same_bits(first: Tally, second: Tally) -> bool:
     """Tell whether two tallies hold the same bytes."""
-    fields = ("total", "weight", "undefined")
-    return all(
-        getattr(one, name).tobytes() == getattr(two, name).tobytes() for name in fields
-    )
+    return bytes_of(first) == bytes_of(second)
 
 
 def of_pearson(*values: float) -> Tally:
@@ -144,15 +146,16 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
 
     One good frame, then 89 at rest without a correlation: one stable frame, not 90.
     """
-    names = ("vorticity_pearson", "stable_frames")
-    found, stable = (
-        score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names
-    )
-    assert found.mean == pytest.approx(0.8)
-    assert found.undefined == (1,)
-    assert math.isnan(found.at(3)[0])
+    tallies = {3: of_pearson(1.0, math.nan, 0.6)}
+    correlation = score(METRICS["vorticity_pearson"], tallies)
+    assert correlation.mean == pytest.approx(0.8)
+    assert correlation.undefined == (1,)
+    assert math.isnan(correlation.at(3)[0])
+    stable = score(METRICS["stable_frames"], tallies)
     assert stable.mean == 1.0
-    still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *[math.nan] * 89)})
+
+    at_rest = [math.nan] * 89
+    still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *at_rest)})
     assert still.mean == 1.0
     assert still.undefined == (89,)
 
@@ -174,13 +177,15 @@ def test_means_over_frames_come_before_those_over_scenarios(
     """Undefined scenarios are left out; the interval is the bootstrap of the scenarios'
     values.
     """
-    found = score(
-        METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in values.items()}
-    )
-    assert found.scenarios == tuple(sorted(values))
-    assert found.undefined == undefined
-    assert found.mean == pytest.approx(mean)
-    np.testing.assert_equal(found.interval, bootstrap_interval(found.values))
+    tallies = {}
+    for scenario, correlations in values.items():
+        tallies[scenario] = of_pearson(*correlations)
+    correlation = score(METRICS["vorticity_pearson"], tallies)
+    assert correlation.scenarios == tuple(sorted(values))
+    assert correlation.undefined == undefined
+    assert correlation.mean == pytest.approx(mean)
+    interval = bootstrap_interval(correlation.values)
+    np.testing.assert_equal(correlation.interval, interval)
 
 
 @pytest.mark.parametrize("holes", [0, 3])
@@ -189,23 +194,24 @@ def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None
     rng = np.random.Generator(np.random.PCG64(5))
     values = 10.0 ** rng.uniform(-8, 8, (5, 1201))
     values[0, :holes] = math.nan
-    actual = score(
-        METRICS["vorticity_pearson"],
-        {i: of_pearson(*row) for i, row in enumerate(values)},
-    )
-    expected = [np.mean(row[~np.isnan(row)].copy()) for row in values]
-    np.testing.assert_array_equal(actual.values, expected)
+    tallies = {}
+    means = []
+    for scenario, row in enumerate(values):
+        tallies[scenario] = of_pearson(*row)
+        is_defined = ~np.isnan(row)
+        means.append(np.mean(row[is_defined].copy()))
+    correlation = score(METRICS["vorticity_pearson"], tallies)
+    np.testing.assert_array_equal(correlation.values, means)
 
 
 def test_a_horizon_beyond_the_series_is_undefined() -> None:
     """The mean of the first five of three frames does not exist; of the first two it
     does.
     """
-    found = [
-        first(np.arange(3.0))
-        for first in (FirstFrames(5), FirstFrames(2), FirstFrames(2, last))
-    ]
-    np.testing.assert_array_equal(found, [math.nan, 0.5, 1.0])
+    series = np.arange(3.0)
+    assert math.isnan(FirstFrames(5)(series))
+    assert FirstFrames(2)(series) == 0.5
+    assert FirstFrames(2, last)(series) == 1.0
 
 
 def test_tallies_add() -> None:
@@ -240,11 +246,12 @@ def scores(size: float) -> dict[str, Score]:
     truth = rollout(frames=54, side=40, speed=0.002)
     scattered = np.random.default_rng(7).standard_normal(truth.shape[1:])
     step = truth[1:] - truth[:-1]
-    wrong = 0.4 * step + 0.0001 * scattered + [2e-4, 1e-4] + 0.01 * (truth[:-1] - 0.4)
-    error = np.concatenate(
-        [np.zeros((2, *truth.shape[1:])), np.cumsum(wrong[1:], axis=0)]
-    )
-    found: dict[str, Score] = {}
+    drift = np.array([2e-4, 1e-4])
+    expansion = 0.01 * (truth[:-1] - 0.4)
+    wrong_step = 0.4 * step + 0.0001 * scattered + drift + expansion
+    error = np.zeros_like(truth)
+    error[2:] = np.cumsum(wrong_step[1:], axis=0)
+    scores_of_boxes: dict[str, Score] = {}
     for placement in Placement:  # no one box is full and has a surface
         task = {
             "materials": STATES,
@@ -254,13 +261,9 @@ def scores(size: float) -> dict[str, Score]:
         }
         scenario = scenario_of(truth, material=np.repeat(range(4), 400), **task)
         pairs = pairs_of(scenario, truth, truth + size * error)
-        found = (
-            aggregate(
-                MEASURED, {0: tally(pairs, MEASURED, scenario.config.predicted_frames)}
-            )
-            | found
-        )
-    return found
+        tallies = {0: tally(pairs, MEASURED, scenario.config.predicted_frames)}
+        scores_of_boxes = aggregate(MEASURED, tallies) | scores_of_boxes
+    return scores_of_boxes
 
 
 @pytest.mark.parametrize("name", NAMES)

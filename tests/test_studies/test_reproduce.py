@@ -69,28 +69,32 @@ def plan(cavity: ScoreBench, runs: Path, tmp_path: Path) -> Plan:
 
 def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     """Scores, hours, parameters and seconds are those of the files."""
-    found = plan.results(SPLIT)
-    assert list(found.models) == sorted(NOISE)
-    held = found.methods["gns"]
-    direct = read_statistics(held.trainings[0].path).scores()["vorticity_mse"]
-    assert held.at("vorticity_mse", 15) == pytest.approx(float(np.mean(direct.at(15))))
-    assert held.parameters == 123
-    assert held.trainings[0].cpu_hours == 2.0
-    assert held.cost is not None
-    assert held.cost.seconds_per_frame == 0.5
-    assert held.cost.speed_up is None
-    # 1 h, 3 h and none are 2 h; of none known there is no mean.
-    told: list[dict[str, float]] = [
+    curl_noise = plan.results(SPLIT)
+    assert list(curl_noise.models) == sorted(NOISE)
+    method = curl_noise.methods["gns"]
+    training = method.trainings[0]
+    score = read_statistics(training.path).scores()["vorticity_mse"]
+    mean = float(np.mean(score.at(15)))
+    assert method.at("vorticity_mse", 15) == pytest.approx(mean)
+    assert method.parameters == 123
+    assert training.cpu_hours == 2.0
+    assert method.cost is not None
+    assert method.cost.seconds_per_frame == 0.5
+    assert method.cost.speed_up is None
+
+
+def test_hours_per_seed_are_the_mean_of_those_that_are_recorded() -> None:
+    """1 h, 3 h and none are 2 h; of none known there is no mean."""
+    records: list[dict[str, float]] = [
         {"cpu_seconds": 3600.0},
         {"cpu_seconds": 10_800.0},
         {},
     ]
-    seeds = [
-        ScoredTraining(seed=i, scores={}, record=one, path=Path())
-        for i, one in enumerate(told)
-    ]
+    seeds = []
+    for seed, record in enumerate(records):
+        seeds.append(ScoredTraining(seed=seed, scores={}, record=record, path=Path()))
     assert Method(name="gns", trainings=tuple(seeds)).hours_per_seed == 2.0
-    assert Method(name="gns", trainings=tuple(seeds[2:])).hours_per_seed is None
+    assert Method(name="gns", trainings=(seeds[2],)).hours_per_seed is None
 
 
 def write_entry(board: Path, **changes: object) -> None:
@@ -181,14 +185,14 @@ def test_scores_of_other_data_are_left_out(runs: Path) -> None:
 
     class Elsewhere(Sources):
         def size(self, split: str, size: str) -> Size:
-            held = load().size(split, size)
-            assert held.measured is not None
-            measured = held.measured.model_copy(update={"dataset_sha256": "0" * 64})
-            return held.model_copy(update={"measured": measured})
+            ours = load().size(split, size)
+            assert ours.measured is not None
+            measured = ours.measured.model_copy(update={"dataset_sha256": "0" * 64})
+            return ours.model_copy(update={"measured": measured})
 
-    found = SplitResults(Elsewhere(board=None, runs=runs), SPLIT, SIZE)
-    assert not found.methods
-    assert len(found.stale) == len(NOISE)
+    elsewhere = SplitResults(Elsewhere(board=None, runs=runs), SPLIT, SIZE)
+    assert not elsewhere.methods
+    assert len(elsewhere.stale) == len(NOISE)
 
 
 def test_runs_of_another_recipe_are_a_variant(
@@ -197,16 +201,16 @@ def test_runs_of_another_recipe_are_a_variant(
     """What lies in tiny-short/ is gns-short beside the others, and gns where that
     recipe is asked for.
     """
-    shutil.copytree(
-        runs / SPLIT / SIZE / "gns-0", tmp_path / SPLIT / f"{SIZE}-short" / "gns-0"
-    )
-    for recipe, name in ((None, "gns-short"), ("short", "gns"), ("long", None)):
-        sources = Sources(
-            board=None, runs=tmp_path, recipe=recipe, registry=cavity.registry
-        )
-        assert list(SplitResults(sources, SPLIT, SIZE).methods) == (
-            [name] if name else []
-        )
+    short = tmp_path / SPLIT / f"{SIZE}-short"
+    shutil.copytree(runs / SPLIT / SIZE / "gns-0", short / "gns-0")
+    sources = Sources(board=None, runs=tmp_path, registry=cavity.registry)
+    for recipe, names in (
+        (None, ["gns-short"]),
+        ("short", ["gns"]),
+        ("long", []),
+    ):
+        variant = SplitResults(replace(sources, recipe=recipe), SPLIT, SIZE)
+        assert list(variant.methods) == names
 
 
 @pytest.fixture
@@ -225,15 +229,15 @@ def test_the_page_tells_what_there_is(sources: Sources) -> None:
     assert [row["model"] for row in rows[:3]] == ["SuperGAT", "GAT", "GNS"]
     assert rows[0]["skill"] == "-"  # no floor was scored
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
-    (learned,) = (
-        row for row in markdown_rows(page, "last doubling") if row["model"] == "GNS"
-    )
-    assert learned["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
-    heads = ("validation at 1/4", "1/2", "1", "last doubling")
-    assert [learned[head] for head in heads] == ["4", "2", "0.5", "75 %"]
-    assert {row["the first is"] for row in markdown_rows(page, "the first is")} == {
-        "too few scenarios"
-    }
+    by_model = {row["model"]: row for row in markdown_rows(page, "last doubling")}
+    training = by_model["GNS"]
+    assert training["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
+    assert training["validation at 1/4"] == "4"
+    assert training["1/2"] == "2"
+    assert training["1"] == "0.5"
+    assert training["last doubling"] == "75 %"
+    for row in markdown_rows(page, "the first is"):
+        assert row["the first is"] == "too few scenarios"
     assert page == results.render(sources, (SIZE,))
 
 
@@ -242,19 +246,32 @@ def test_studies_stand_beside_the_thesis(sources: Sources, tmp_path: Path) -> No
     other.
     """
     assert "Table 4.3 on" not in results.render(sources, (SIZE,))
-    training = {"parameters": 1234, "step": 7, "windows": 100, "cpu_seconds": 36.0}
-    training |= {"dataset_sha256": "f" * 64, "recipe": {"training": {"batch": 32}}}
-    held = {"training": training, "train": 0.25, "valid": 0.5, "seed": 0}
+    training = {
+        "parameters": 1234,
+        "step": 7,
+        "windows": 100,
+        "cpu_seconds": 36.0,
+        "dataset_sha256": "f" * 64,
+        "recipe": {"training": {"batch": 32}},
+    }
+    study = {"training": training, "train": 0.25, "valid": 0.5, "seed": 0}
     home = tmp_path / "studies" / "fluid" / SIZE
     home.mkdir(parents=True)
-    (home / "mlp_studies.json").write_text(json.dumps({"mlp-4-3-2": held}))
+    (home / "mlp_studies.json").write_text(json.dumps({"mlp-4-3-2": study}))
     page = results.render(replace(sources, studies=tmp_path / "studies"), (SIZE,))
     rows = markdown_rows(page, "train, thesis")
-    (ours,) = (row for row in rows if row["train, ours"] != "-")
-    heads = ("hidden layers", "parameters, ours", "steps x batch, ours")
-    assert [ours[head] for head in heads] == ["200 x 200 x 200", "1,234", "7 x 32"]
-    heads = ("train, thesis", "train, ours", "valid, thesis", "valid, ours")
-    assert [ours[head] for head in heads] == ["0.1147", "0.25", "0.1194", "0.5"]
+    (row,) = [row for row in rows if row["train, ours"] != "-"]
+    expected = {
+        "hidden layers": "200 x 200 x 200",
+        "parameters, ours": "1,234",
+        "steps x batch, ours": "7 x 32",
+        "train, thesis": "0.1147",
+        "train, ours": "0.25",
+        "valid, thesis": "0.1194",
+        "valid, ours": "0.5",
+    }
+    for heading, cell in expected.items():
+        assert row[heading] == cell
     assert len(rows) == 6  # the widths of Table 4.3
 
 
