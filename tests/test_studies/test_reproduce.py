@@ -69,9 +69,9 @@ def plan(cavity: ScoreBench, runs: Path, tmp_path: Path) -> Plan:
 
 def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     """Scores, hours, parameters and seconds are those of the files."""
-    curl_noise = plan.results(SPLIT)
-    assert list(curl_noise.models) == sorted(NOISE)
-    method = curl_noise.methods["gns"]
+    cavity_results = plan.results(SPLIT)
+    assert list(cavity_results.models) == sorted(NOISE)
+    method = cavity_results.methods["gns"]
     training = method.trainings[0]
     score = read_statistics(training.path).scores()["vorticity_mse"]
     mean = float(np.mean(score.at(15)))
