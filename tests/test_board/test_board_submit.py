@@ -148,7 +148,6 @@ def tree(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
-@pytest.mark.usefixtures("as_shipped")
 def test_predictions_are_submitted_once(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
