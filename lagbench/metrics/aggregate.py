@@ -260,21 +260,21 @@ class Resampling:
         lower = (1.0 - LEVEL) / 2.0
         normal = NormalDist().inv_cdf(upper)
         stretch = student_quantile(self.freedom, upper) / normal
-        low = quantile(self.deviations, lower)
-        high = quantile(self.deviations, upper)
+        ordered = np.sort(self.deviations)
+        low = quantile(ordered, lower)
+        high = quantile(ordered, upper)
         return (self.mean + stretch * low, self.mean + stretch * high)
 
 
-def quantile(values: Floats, share: float) -> float:
-    """Return a quantile of values, linear between two of them.
+def quantile(ordered: Floats, share: float) -> float:
+    """Return a quantile of ascending values, linear between two of them.
 
     Its bits are those of ``np.quantile``, which takes several times as long on the few
     thousand draws of a bootstrap.
     """
-    place = share * (len(values) - 1)
-    below = min(int(place), len(values) - 2)
+    place = share * (len(ordered) - 1)
+    below = min(int(place), len(ordered) - 2)
     part = place - below
-    ordered = np.partition(values, (below, below + 1))
     low, high = ordered[below : below + 2].tolist()
     gap = high - low
     if part < 0.5:

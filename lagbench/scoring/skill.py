@@ -342,8 +342,8 @@ def skill_gap(
         stretch = student_quantile(min(degrees), 0.975) / student_quantile(1e6, 0.975)
         first_ratio = ratios[0] * np.exp(stretch * deviations[0])
         second_ratio = ratios[1] * np.exp(stretch * deviations[1])
-        gaps = second_ratio - first_ratio
-        interval = (quantile(gaps, 0.025), quantile(gaps, 0.975))
+        ordered = np.sort(second_ratio - first_ratio)
+        interval = (quantile(ordered, 0.025), quantile(ordered, 0.975))
     return SkillGap(first=1.0 - ratios[0], second=1.0 - ratios[1], interval=interval)
 
 

@@ -52,6 +52,23 @@ def master(
     return bench
 
 
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory: pytest.TempPathFactory, master: ModelBoard) -> ModelBoard:
+    """A board with two entries of one model, a closed season and its scenarios."""
+    folder = tmp_path_factory.mktemp("twins")
+    shutil.copytree(master.folder, folder / "board")
+    root = folder / "data"
+    shutil.copytree(master.root, root)
+    bench = replace(master, folder=folder / "board", root=root)
+    for path in (Path(PATH), Path(f"scores/{NAME}.nc")):
+        target = bench.folder / path
+        shutil.copy(target, target.with_stem("twin"))
+    twin = bench.folder / Path(PATH).with_stem("twin")
+    bench.edit(twin, lambda content: content.update(method="twin"))
+    simulate(bench, close_season(bench, "twins"))
+    return bench
+
+
 @pytest.fixture
 def own(master: ModelBoard, tmp_path: Path) -> ModelBoard:
     """A copy of the leaderboard that the test may change; the data are shared."""
@@ -71,14 +88,14 @@ def close_season(bench: ModelBoard, name: str = SEASON, source: str = "") -> Sea
     )
 
 
-def simulate(bench: ModelBoard, season: Season, root: Path | None = None) -> None:
+def simulate(bench: ModelBoard, season: Season) -> None:
     """Simulate the blind scenarios of a season."""
     generate(
         "curl-noise",
         "tiny",
-        root=season_root(season.season, root or bench.root),
+        root=season_root(season.season, bench.root),
         registry=season_registry(season, load(), {}),
-        workers=2,
+        workers=1,
     )
 
 
@@ -163,20 +180,9 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
-def test_each_of_two_entries_with_one_model_is_predicted(
-    own: ModelBoard, tmp_path: Path
-) -> None:
+def test_each_of_two_entries_with_one_model_is_predicted(twins: ModelBoard) -> None:
     """Entries may run the same model in different ways, as means over mirror images."""
-    for path in (Path(PATH), Path(f"scores/{NAME}.nc")):
-        target = own.folder / path
-        shutil.copy(target, target.with_stem("twin"))
-    twin = own.folder / Path(PATH).with_stem("twin")
-    own.edit(twin, lambda content: content.update(method="twin"))
-    season = close_season(own, "twins")
-    root = tmp_path / "data"
-    shutil.copytree(own.root, root)
-    simulate(own, season, root)
-    result = run_season(own.folder, "twins", root=root)
+    result = run_season(twins.folder, "twins", root=twins.root)
     assert sorted(result.predicted) == [
         "curl-noise/tiny/gns, seed 0",
         "curl-noise/tiny/twin, seed 0",
@@ -245,7 +251,7 @@ def test_an_edited_season_is_found(
 
 
 def test_other_models_and_other_scenarios_are_refused(
-    own: ModelBoard, tmp_path: Path
+    own: ModelBoard, twins: ModelBoard, tmp_path: Path
 ) -> None:
     """A model that was exchanged, and blind scenarios of another seed."""
     weights = own.weights.read_bytes()
@@ -254,14 +260,12 @@ def test_other_models_and_other_scenarios_are_refused(
         run_again(own, again=True)
     own.weights.write_bytes(weights)
 
-    other = close_season(own, "other")
-    simulate(own, other, tmp_path)
     root = tmp_path / "data"
     shutil.copytree(own.root, root)
     shutil.rmtree(root / f"season.{SEASON}")
     with pytest.raises(DataError):
         run_again(replace(own, root=root))
-    shutil.move(tmp_path / "season.other", root / f"season.{SEASON}")
+    shutil.copytree(season_root("twins", twins.root), root / f"season.{SEASON}")
     with pytest.raises(DataError):
         run_again(replace(own, root=root))
 
