@@ -207,6 +207,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "neighbours": None,
         "viscosity": False,
         "shift": False,
+        "body_force": False,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.
