@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -160,6 +160,39 @@ def divide_evenly(distances: Floats, particle_count: int) -> list[NDArray[np.int
     return followers
 
 
+@dataclass(frozen=True, eq=False)
+class FollowedAnalog:
+    """An analog and the particles that follow it."""
+
+    distance: float  # of its state from ours, in units of features
+    members: NDArray[np.intp]  # our particles, shape [member]
+    paths: (
+        Floats  # of their partners, from the compared frame on, [frame, member, axis]
+    )
+    offset: Floats  # from partner to particle at that frame [length], [member, axis]
+
+    def positions(self, frames_on: int) -> Floats:
+        """Return the members' positions so many frames on [length], [member, axis]."""
+        path = self.paths[min(frames_on, len(self.paths) - 1)]
+        return np.asarray(path + self.offset * OFFSET_FADING**frames_on)
+
+
+Combination = Callable[[Given, Sequence[FollowedAnalog], int], Floats]
+"""From the analogs and the frames since the comparison to the positions of all
+particles [length], shape [particle, axis].
+"""
+
+
+def follow_own_analog(
+    given: Given, analogs: Sequence[FollowedAnalog], frames_on: int
+) -> Floats:
+    """Return positions of which each is that in the particle's own analog."""
+    position = np.empty_like(given.last)
+    for analog in analogs:
+        position[analog.members] = analog.positions(frames_on)
+    return position
+
+
 def predict_positions(
     given: Given,
     choice: Choice,
@@ -167,6 +200,7 @@ def predict_positions(
     library: StateLibrary | None,
     without: int | None = None,
     divide: Division = divide_evenly,
+    combine: Combination = follow_own_analog,
 ) -> Iterator[Floats]:
     """Yield positions of the predicted frames [length], each [particle, axis].
 
@@ -176,6 +210,7 @@ def predict_positions(
         library: states of train; without any the flight goes on.
         without: a scenario of train that may not be looked at.
         divide: which particles follow which analog.
+        combine: what the analogs say together.
     """
     horizon = len(given.predicted_frames)
     flown = min(horizon, frames_of_flight(given) + choice.lag)
@@ -190,26 +225,7 @@ def predict_positions(
         if not analogs:
             yield ballistic_positions(given, flown + frames_on)
             continue
-        position = np.empty_like(given.last)
-        for analog in analogs:
-            position[analog.members] = analog.positions(frames_on)
-        yield given.inside(position)
-
-
-@dataclass(frozen=True, eq=False)
-class FollowedAnalog:
-    """An analog and the particles that follow it."""
-
-    members: NDArray[np.intp]  # our particles, shape [member]
-    paths: (
-        Floats  # of their partners, from the compared frame on, [frame, member, axis]
-    )
-    offset: Floats  # from partner to particle at that frame [length], [member, axis]
-
-    def positions(self, frames_on: int) -> Floats:
-        """Return the members' positions so many frames on [length], [member, axis]."""
-        path = self.paths[min(frames_on, len(self.paths) - 1)]
-        return np.asarray(path + self.offset * OFFSET_FADING**frames_on)
+        yield given.inside(combine(given, analogs, frames_on))
 
 
 def _analogs_of(
@@ -237,7 +253,8 @@ def _analogs_of(
         return []
     distances = np.linalg.norm(library.features[states] - feature, axis=1)
     followed = []
-    for state, members in zip(states, divide(distances, len(position)), strict=True):
+    followers = divide(distances, len(position))
+    for state, distance, members in zip(states, distances, followers, strict=True):
         scenario = int(library.scenarios[state])
         frame = int(library.frames[state])
         motion = read_train_scenario(given.size.path(given.root, scenario))
@@ -253,7 +270,7 @@ def _analogs_of(
         stop = frame + 1 + len(given.predicted_frames)
         paths = mirror.positions(motion.position[frame:stop, partner])
         offset = given.box.displacement(paths[0], position[members])
-        followed.append(FollowedAnalog(members, paths, offset))
+        followed.append(FollowedAnalog(float(distance), members, paths, offset))
     return followed
 
 

@@ -9,13 +9,13 @@ from lagbench.data.registry import Size
 
 from . import (
     analog,
+    analog_barycentre,
     ballistic_analog,
     climatology,
     coarse_solver,
     extrapolation,
     frozen_field,
     projection,
-    weighted_analogs,
 )
 from .predictor import Kind, ReferencePredictor
 
@@ -29,7 +29,7 @@ _PREDICTORS = (
     ballistic_analog.PREDICTOR,
     *projection.PREDICTORS,
     *coarse_solver.PREDICTORS,
-    weighted_analogs.PREDICTOR,
+    analog_barycentre.PREDICTOR,
 )
 
 REFERENCES: Mapping[str, ReferencePredictor] = MappingProxyType(

@@ -464,12 +464,12 @@ def _array_targets() -> list[Target]:
             check=find_wrong_values,
         ),
         Target(
-            name="weighted-analogs: train",
+            name="analog-barycentre: train",
             source="analogs",
             victim="own/full/v1/train/0000.nc",
             mutations=(*BYTES, *PLACES),
             commands=[
-                ("compare", "p.nc", "weighted-analogs", "--root", ".", "-q"),
+                ("compare", "p.nc", "analog-barycentre", "--root", ".", "-q"),
                 ("score", "p.nc", "--split", "own/", "-o", "scores", "-q"),
             ],
             weight=2,

@@ -1,0 +1,130 @@
+"""Ballistic flight until contact, then the mean cloud of the most similar states.
+
+As :mod:`.ballistic_analog`, but every particle follows a partner in each of the states
+of train that are most like ours. Their clouds x_k are matched to that of the nearest
+one, anew in each frame, and averaged:
+
+    x_i = sum_k w_k x_k,m_k(i),     w_k = d_k^-s / sum d^-s,
+
+with d_k the distance of analog k from the state, and m_k the matching with the least
+sum of squared distances. This is one step towards the Wasserstein-2 barycentre of the
+clouds (Agueh and Carlier 2011), whose mean squared distance from them is least.
+
+Frames after contact, analogs and s are chosen on train, each scenario predicted from
+the others (``python benchmarks/naive_attempts.py --attempt barycentre``). The predictor
+applies where that was done: :data:`CHOSEN`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size
+
+from .assignment import assign_particles
+from .ballistic_analog import Choice, FollowedAnalog, predict_positions
+from .predictor import Floats, Given, Kind, Prediction, ReferencePredictor
+from .train_library import state_library
+
+LEAST_DISTANCE = 1e-12
+"""Least distance of an analog [length]: a state of train is its own analog."""
+
+
+@dataclass(frozen=True)
+class BarycentreChoice:
+    """What is chosen on train."""
+
+    flight: Choice  # frames after contact, and analogs
+    sharpness: float  # power s of the distance
+
+
+CHOSEN: Mapping[str, BarycentreChoice] = {
+    "fluid-mini-v3": BarycentreChoice(Choice(lag=0, analogs=5), sharpness=2.0),
+    "multimaterial-mini-v3": BarycentreChoice(Choice(lag=10, analogs=5), sharpness=2.0),
+}
+"""Choices by split, size and MAJOR version."""
+
+
+def key_of(size: Size) -> str:
+    """Return the key of a data set in :data:`CHOSEN`."""
+    return f"{size.split}-{size.name}-v{size.major}"
+
+
+def applies(size: Size) -> bool:
+    """Tell whether something was chosen for a data set."""
+    return key_of(size) in CHOSEN
+
+
+def follow_all(distances: Floats, particle_count: int) -> list[NDArray[np.intp]]:
+    """Return the followers of each analog: all particles follow each one."""
+    everybody = np.arange(particle_count)
+    return [everybody for _ in distances]
+
+
+def weights_of(distances: Floats, sharpness: float) -> Floats:
+    """Return the weights ``d^-s / sum d^-s`` of the analogs [1]."""
+    nearest = max(float(distances.min()), LEAST_DISTANCE)
+    relative = np.maximum(distances, LEAST_DISTANCE) / nearest
+    weights = relative**-sharpness
+    return np.asarray(weights / weights.sum())
+
+
+def mean_cloud(
+    given: Given,
+    analogs: Sequence[FollowedAnalog],
+    frames_on: int,
+    *,
+    sharpness: float,
+) -> Floats:
+    """Return the weighted mean of the analogs' clouds [length], [particle, axis].
+
+    Args:
+        given: what is given of the scenario.
+        analogs: analogs that all particles follow, nearest first.
+        frames_on: frames since the comparison.
+        sharpness: power s of the distance.
+    """
+    distances = np.array([analog.distance for analog in analogs])
+    weights = weights_of(distances, sharpness)
+    nearest = analogs[0].positions(frames_on)
+    mean = weights[0] * nearest
+    for weight, analog in zip(weights[1:], analogs[1:], strict=True):
+        cloud = analog.positions(frames_on)
+        partner = assign_particles(
+            nearest, cloud, given.material, given.material, given.box
+        )
+        mean = mean + weight * cloud[partner]
+    return np.asarray(mean)
+
+
+def predict(given: Given) -> Prediction:
+    """Yield positions on parabolas, and after contact the mean of the analogs."""
+    choice = CHOSEN[key_of(given.size)]
+    library = state_library(given.size, given.root, np.unique(given.material).tolist())
+    for position in predict_positions(
+        given,
+        choice.flight,
+        library=library,
+        divide=follow_all,
+        combine=functools.partial(mean_cloud, sharpness=choice.sharpness),
+    ):
+        yield position.astype("float32")
+
+
+PREDICTOR = ReferencePredictor(
+    name="analog-barycentre",
+    title="Ballistic, then mean cloud of analogs",
+    kind=Kind.NAIVE,
+    definition="Every particle falls freely until a tenth of them touch a wall or two"
+    " bodies meet. Then the five states of train, or their mirror images, that are most"
+    " like that are matched in each frame, and their clouds are averaged; nearer states"
+    " count more.",
+    applies=applies,
+    predict=predict,
+    reads_train=True,
+)

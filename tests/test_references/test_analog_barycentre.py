@@ -1,0 +1,73 @@
+"""The mean cloud of analogs: weights, means of known clouds, and how good it is."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lagbench.data.box import UNIT_SQUARE
+from lagbench.data.registry import load
+from lagbench.references import shipped
+from lagbench.references.analog_barycentre import (
+    CHOSEN,
+    follow_all,
+    mean_cloud,
+    weights_of,
+)
+from lagbench.references.ballistic_analog import FollowedAnalog
+
+
+@pytest.mark.parametrize("sharpness", [0.0, 1.0, 3.0])
+def test_weights_fall_with_the_distance(sharpness: float) -> None:
+    """Weights are d^-s over their sum; with s = 0 all are alike."""
+    distances = np.array([0.1, 0.15, 0.2, 0.4])
+    expected = distances**-sharpness / np.sum(distances**-sharpness)
+    assert weights_of(distances, sharpness) == pytest.approx(expected)
+
+
+def test_a_state_of_train_is_its_own_analog() -> None:
+    """An analog at distance 0 has all the weight, and nothing is divided by 0."""
+    assert weights_of(np.array([0.0, 0.2]), 3.0) == pytest.approx([1.0, 0.0])
+
+
+def test_the_mean_of_two_gaussian_clouds_has_the_closed_form() -> None:
+    """The barycentre of N(m, a^2 C) and N(n, b^2 C) is N((m + n)/2, ((a + b)/2)^2 C).
+
+    The clouds are one sample of N(0, C), moved and scaled, in another order; so the
+    mean cloud is that sample moved and scaled, and no particle's number matters.
+    """
+    rng = np.random.default_rng(5)
+    sample = rng.standard_normal((200, 2)) @ np.array([[0.05, 0.02], [0.0, 0.03]])
+    order = rng.permutation(200)
+    first = 0.4 + 0.5 * sample
+    second = (0.6 + 1.5 * sample)[order]
+    analogs = []
+    for cloud in (first, second):
+        everybody = np.arange(200)
+        analogs.append(FollowedAnalog(0.1, everybody, cloud[None], np.zeros((200, 2))))
+    given: Any = SimpleNamespace(material=np.zeros(200, np.int8), box=UNIT_SQUARE)
+    mean = mean_cloud(given, analogs, 0, sharpness=2.0)
+    assert mean == pytest.approx(0.5 + sample, abs=1e-12)
+
+
+def test_all_particles_follow_each_analog() -> None:
+    """Nobody is left out."""
+    for members in follow_all(np.array([0.1, 0.2]), 7):
+        np.testing.assert_array_equal(members, np.arange(7))
+
+
+def test_it_is_the_best_naive_predictor_where_it_was_chosen() -> None:
+    """Its mean is 5 % or more below that of the other naive predictors."""
+    for key in CHOSEN:
+        split, name, _ = key.rsplit("-", 2)
+        references = shipped(load().size(split, name))
+        assert references is not None
+        means = {}
+        for reference, scores in references.items():
+            means[reference] = scores.scores["cloud_distance"].mean
+        best = means["analog-barycentre"]
+        assert best < 0.95 * means["ballistic-analog"]
+        assert best < 0.95 * means["analog"]
