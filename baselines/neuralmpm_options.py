@@ -79,8 +79,8 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
 
     Raises:
         UsageError: a material is unknown or named twice, there are no mirror images to
-            average over, no wall moves, or an option knows flat boxes with walls only
-            and the box is none.
+            average over, no wall moves, or an option needs a two-dimensional box
+            without periodic axes and the box is another one.
     """
     check_moving_walls(options.wall_velocity, info)
     _check_box(options, info)
@@ -108,12 +108,12 @@ def _check_box(options: NeuralMPMOptions, info: DatasetInfo) -> None:
     box = info.box
     if box.dimension == 2 and not box.is_periodic:
         return
-    # They follow bodies over a grid, and know where the walls of a square are.
+    # These options need a square box with walls on all four sides.
     for name in ("conserve", "strain", "shape", "density"):
         value = getattr(options, name)
         if value:
             raise UsageError(
-                f"{name} knows boxes of two dimensions with walls only",
+                f"{name} needs a two-dimensional box without periodic axes",
                 where=f"model.{name}",
                 expected="the default",
                 got=value,

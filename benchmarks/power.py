@@ -164,13 +164,14 @@ PAGE = """\
 
 `python benchmarks/power.py --write` writes this page. The first rows assume how much
 methods and seeds scatter. A row of a data set is measured from the score files of its
-mini size in leaderboard/scores. A data set has a row if two of its methods are near
-each other and one of them has several seeds. Two methods of two seeds each are a rough
-measure.
+mini size in leaderboard/scores. A data set has a row if two of its methods have
+means within a factor of two and one of them has several seeds. From two methods of two
+seeds each the scatter is known only roughly.
 
-The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario +
-seed + rest). Two methods share the scenarios; the three other standard deviations are
-given below, relative to a method's mean. The last three columns say how often
+The value of seed s in scenario i is modelled as the mean times (1 + scenario +
+method-in-scenario + seed + rest), where the last four terms are random. The scenario
+term is the same for both methods. The standard deviations of the other three are given
+below, relative to a method's mean. The last three columns say how often
 `lagbench.metrics.differ` tells two methods apart at 5 %, with {seeds} seeds each, if
 one is better by 5, 10 and 20 % ({draws} draws).
 
@@ -183,18 +184,19 @@ more seeds do. A board that ranks by hundredths ranks by chance.
 
 ## Equal methods that are told apart
 
-Both sides are seeds of one method, so at most 5 % may differ (give or take 1.4, the
-error of so many draws). With one seed a side the test is the sign-flip test over
-scenarios. It is right about those weights. About the method it is wrong as often as the
-first column says, so such a row of the board says "these weights". So does a row of one
-seed beside one of several: the scatter of the single seed is unknown.
+Both sides are seeds of one method, so the test may tell them apart in at most 5 %
+of the draws (give or take 1.4 percentage points, the error of so many draws). With one
+seed a side the test is the sign-flip test over scenarios. Its answer is right for those
+weights. As an answer about the method it is wrong as often as the first column says, so
+the board then says "these weights". It says so too where one side has one seed and the
+other several: the scatter of the single seed is unknown.
 
 | case | 1 seed a side | 1 and {seeds} | 2 | 3 | 5 |
 |---|---|---|---|---|---|
 {false_rows}
 
-The score files have {pair_count} pairs of single seeds of one method; {differing_count}
-of them differ as weights.
+The score files hold {pair_count} pairs of two seeds of the same method. The test tells
+{differing_count} of these pairs apart, at 5 %, although the method is the same.
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))

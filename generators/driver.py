@@ -113,8 +113,11 @@ class Driver(ABC, Generic[Parameters]):
         """
 
     def load(self, states: Sequence[InitialState]) -> None:
-        """Start one scenario per state; one outside the solver's bounds is a
-        WorkFailedError.
+        """Start one scenario per state.
+
+        Raises:
+            UsageError: the number of states is wrong, or one is no initial state.
+            WorkFailedError: a state is outside the solver's bounds.
         """
         if len(states) != self.scenarios:
             raise UsageError(
@@ -125,6 +128,7 @@ class Driver(ABC, Generic[Parameters]):
 
         self._place(stack(states, "position"))
         carried = np.empty((self.scenarios, self.parameters.particles, 4), np.float32)
+        # what stands behind the velocity keeps its value at rest; its slopes are 0
         carried[...] = self._kernels.at_rest
         carried[..., : self.dimension] = stack(states, "velocity")
         self._kernels.carried.from_numpy(carried)
@@ -138,6 +142,7 @@ class Driver(ABC, Generic[Parameters]):
         self._volume = np.array(
             [state.area / self.parameters.particles for state in states]
         )
+        # volume of a particle in cells
         fill = self._volume * self.parameters.grid**self.dimension
         self._kernels.fill.from_numpy(fill.astype(np.float32))
         self._start(states)

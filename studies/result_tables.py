@@ -93,7 +93,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             " accurate than every classical solver here that costs no more per frame."
         )
     if open_sets:
-        sentences.append(f"On {_join(open_sets)} the interval contains 1: it is open.")
+        sentences.append(
+            f"On {_join(open_sets)} the interval contains 1: the question is open."
+        )
     if does_not_pay:
         sentences.append(
             f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"

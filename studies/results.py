@@ -65,8 +65,9 @@ chapter per data set with all models beside the numbers of the thesis (D. Dharma
 thesis, University of Leeds, 2025)."""
 
 SUMMARY_NOTE = """\
-Scores: less is better. In brackets stands what a frame costs on one core; the times of
-the learned models are brought to that machine by the time of our solver on both.
+Scores: less is better. The brackets hold the processor time of a frame on
+one core. Learned models were timed on another machine: their times are multiplied by
+the ratio of our solver's times on the two machines.
 `skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
 score of the best classical solver that costs no more per frame, with its 95 % interval:
 below 1 learning pays. A hybrid is a solver with a learned part."""
@@ -84,9 +85,9 @@ HOW_TO_READ = """\
   seeds too, so its intervals are wider where there are few seeds.
 - **Tests** are two-sided. Where both models have one seed, the test is the exact
   sign-flip test over scenarios. Else it is the two-way bootstrap over scenarios and
-  seeds. For one training that is used in two ways it takes the differences seed by
-  seed. The p-values are corrected for the number of rivals (Holm). With fewer than six
-  scenarios nothing is claimed.
+  seeds. If the two models are one training used in two ways (such as with and without
+  mirror averaging), the differences are tested seed by seed. The p-values are corrected
+  for the number of rivals (Holm). With fewer than six scenarios nothing is claimed.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
   GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
   orientation. At size `mini` (a quarter of the particles, half the grid) compare only
@@ -97,8 +98,9 @@ HOW_TO_READ = """\
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
 
 CLAIMS_NOTE = """\
-The answers use the ranking metric over the horizon. "Ahead" counts the better means.
-"Better" (yes) and "worse" (no) are significant at 5 %; everything else is open. Two
+The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means: a
+better mean than three of five models. "Yes" or "better" means significantly better at
+5 %, "no" or "worse" significantly worse, and "open" neither. Two
 models are compared over the seeds that both have, or over all seeds if they share none.
 A dash stands where an entry is missing. All weights of GNS and SuperGAT on cavity mini
 and curl-noise mini fail a [gate](baselines.md#gates): answers about them speak of

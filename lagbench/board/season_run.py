@@ -378,7 +378,11 @@ class _Run:
         data_set: SeasonDataSet,
         hashes: Mapping[int, str],
     ) -> dict[int, float]:
-        """Predict and score blind scenarios with a model of an entry."""
+        """Return the metric of an entry's model in each blind scenario.
+
+        Progress and errors call the model ``name``; its scores are saved under ``key``;
+        ``index`` is the number of its prediction in the entry.
+        """
         runner = open_model(
             self.folder,
             entry,

@@ -29,7 +29,7 @@ from lagbench.board.show import (
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, format_count
-from lagbench.scoring.references import measured_sizes
+from lagbench.scoring.references import sizes_with_test_files
 
 from .options import (
     DEFAULT_BOARD,
@@ -168,7 +168,7 @@ def _sizes_to_measure(root: Path, split: str | None, size: str | None) -> list[S
     Raises:
         DataError: there are none.
     """
-    sizes = measured_sizes(root, split=split, name=size)
+    sizes = sizes_with_test_files(root, split=split, name=size)
     if not sizes:
         raise DataError(
             "no test scenarios are there",

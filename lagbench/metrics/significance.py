@@ -180,8 +180,8 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
             then cancels, and the differences seed by seed are tested.
 
     Raises:
-        UsageError: the scores are of different metrics, or paired of different numbers
-            of seeds.
+        UsageError: the scores are of different metrics, or two paired methods have
+            different numbers of seeds.
     """
     first_scores = _as_sequence(first)
     second_scores = _as_sequence(second)

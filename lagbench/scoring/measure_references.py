@@ -36,7 +36,7 @@ from lagbench.references.shipped import (
 )
 from lagbench.references.table import REFERENCES, references_of
 
-from .references import measure, measured_sizes, saved_folder, time_references
+from .references import measure, saved_folder, sizes_with_test_files, time_references
 from .task import load_scored_task
 
 
@@ -124,8 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     root = resolve_root(options.root)
     try:
-        for tier in measured_sizes(root, split=options.split, name=options.size):
-            size = tier.scored_on(options.subset)
+        for any_size in sizes_with_test_files(
+            root, split=options.split, name=options.size
+        ):
+            size = any_size.scored_on(options.subset)
             if not options.costs:
                 measure_and_ship(
                     size, root, workers=options.workers, names=options.predictor

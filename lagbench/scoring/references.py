@@ -79,7 +79,7 @@ def _has_files(size: Size, root: Path, subset: str) -> bool:
     return bool(ids) and all(size.path(root, i).is_file() for i in ids)
 
 
-def measured_sizes(
+def sizes_with_test_files(
     root: Path,
     *,
     split: str | None = None,

@@ -170,7 +170,10 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> None:
 
 @contextmanager
 def partial_file_errors(partial: Path) -> Iterator[None]:
-    """Remove a temporary file after wrong data; keep it after a broken connection."""
+    """Remove a temporary file after wrong data; keep it after any other error.
+
+    An OSError here is one of the disk: those of the connection never arrive as such.
+    """
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         yield

@@ -80,8 +80,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials, at no more "
-    "steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
+    "Does NeuralMPM gain by one velocity grid for all materials, with as many steps "
+    "or fewer?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
     "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the "
     "first frames?": Claim("neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")),
     "Does NeuralMPM gain by shape matching and density projection?": Claim(
@@ -94,8 +94,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does it gain by grids for shape and density as fine as those of the size "
-    "full?": Claim(
+    "Does NeuralMPM with shape matching gain by grids for shape and density as fine "
+    "as those of the size full?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),
@@ -104,7 +104,7 @@ _CLAIMS = {
     ),
     "Is standing still better than VAR(1) (section 4.8.3: its forecast "
     "diverges)?": Claim("persistence", ("var",), metrics=("mse_end",)),
-    "Is the best naive baseline better than a model that learned?": Claim(""),
+    "Is the best naive baseline better than the learned models?": Claim(""),
 }
 
 CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())

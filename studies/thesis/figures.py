@@ -351,9 +351,11 @@ def case_curves(plan: Plan, item: ThesisItem) -> Sheet:
 
 
 def losses(plan: Plan, item: ThesisItem) -> Sheet:
-    """Return the losses of trainings, one curve per split and model.
+    """Return the losses of trainings over their steps.
 
-    The table has the loss, or its raw terms, at the end.
+    An item of several splits has one model in each: a curve per split, and a table of
+    the losses at the end. An item of one split has a curve per model, and a table of
+    the raw terms of the loss at the end. Both tables hold the thesis's values too.
     """
     has_several_splits = len(item.needs) > 1
     curves = {}

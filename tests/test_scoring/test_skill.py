@@ -32,9 +32,9 @@ from lagbench.scoring.references import (
     differences,
     measurable,
     measure,
-    measured_sizes,
     remeasure,
     saved_folder,
+    sizes_with_test_files,
 )
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.score_layout import SUBMISSION
@@ -439,7 +439,7 @@ def test_a_new_measurement_finds_a_forged_score(
 
 
 def test_sizes_that_lie_in_a_root_can_be_measured(bench: ScoreBench) -> None:
-    sizes = measured_sizes(bench.root, registry=bench.registry)
+    sizes = sizes_with_test_files(bench.root, registry=bench.registry)
     assert [size.name for size in sizes] == [bench.size.name]
 
 
