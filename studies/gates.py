@@ -46,7 +46,11 @@ LIMITS = {"one_step": 1.0, "free_flight": 0.02, "settled": 0.01, "densest_cell":
 
 FORMAT = 1  # of gates.json
 BOARD_WEIGHTS = Path("leaderboard/weights")
-METHODS = ("gns", "gns-pushforward", "supergat")  # graph networks that are measured by default
+METHODS = (
+    "gns",
+    "gns-pushforward",
+    "supergat",
+)  # graph networks that are measured by default
 FRAME_STEP = 20  # frames between the windows of a scenario
 ROLLOUT_STEP = 10  # frames between the states in which the fullest cell is sought
 FALL_TOLERANCE = 0.02  # of a window in free flight: mean acceleration off g, in g

@@ -2,7 +2,7 @@
 
 As :mod:`.ballistic_analog`, but every particle follows a partner in each of the states
 of train that are most like ours. Their clouds x_k are matched to that of the nearest
-one, anew in each frame, and averaged:
+one, anew in every tenth frame, and averaged:
 
     x_i = sum_k w_k x_k,m_k(i),     w_k = d_k^-s / sum d^-s,
 
@@ -17,7 +17,6 @@ applies where that was done: :data:`CHOSEN`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -30,6 +29,9 @@ from .assignment import assign_particles
 from .ballistic_analog import Choice, FollowedAnalog, predict_positions
 from .predictor import Floats, Given, Kind, Prediction, ReferencePredictor
 from .train_library import state_library
+
+MATCHED_EVERY = 10
+"""Frames from one matching of the clouds to the next: it takes most of the time."""
 
 LEAST_DISTANCE = 1e-12
 """Least distance of an analog [length]: a state of train is its own analog."""
@@ -74,32 +76,49 @@ def weights_of(distances: Floats, sharpness: float) -> Floats:
     return np.asarray(weights / weights.sum())
 
 
-def mean_cloud(
-    given: Given,
-    analogs: Sequence[FollowedAnalog],
-    frames_on: int,
-    *,
-    sharpness: float,
-) -> Floats:
-    """Return the weighted mean of the analogs' clouds [length], [particle, axis].
+class MeanCloud:
+    """The weighted mean of the analogs' clouds, frame after frame.
 
     Args:
-        given: what is given of the scenario.
-        analogs: analogs that all particles follow, nearest first.
-        frames_on: frames since the comparison.
         sharpness: power s of the distance.
     """
-    distances = np.array([analog.distance for analog in analogs])
-    weights = weights_of(distances, sharpness)
-    nearest = analogs[0].positions(frames_on)
-    mean = weights[0] * nearest
-    for weight, analog in zip(weights[1:], analogs[1:], strict=True):
-        cloud = analog.positions(frames_on)
-        partner = assign_particles(
-            nearest, cloud, given.material, given.material, given.box
-        )
-        mean = mean + weight * cloud[partner]
-    return np.asarray(mean)
+
+    def __init__(self, sharpness: float) -> None:
+        self._sharpness = sharpness
+        # particles of each further analog in the order of the nearest one
+        self._partners: list[NDArray[np.intp]] = []
+
+    def __call__(
+        self, given: Given, analogs: Sequence[FollowedAnalog], frames_on: int
+    ) -> Floats:
+        """Return the mean cloud [length], shape [particle, axis].
+
+        Args:
+            given: what is given of the scenario.
+            analogs: analogs that all particles follow, nearest first.
+            frames_on: frames since the comparison, ascending from call to call.
+        """
+        distances = np.array([analog.distance for analog in analogs])
+        weights = weights_of(distances, self._sharpness)
+        clouds = [analog.positions(frames_on) for analog in analogs]
+        if not self._partners or frames_on % MATCHED_EVERY == 0:
+            self._match(given, clouds)
+
+        mean = weights[0] * clouds[0]
+        for weight, cloud, partner in zip(
+            weights[1:], clouds[1:], self._partners, strict=True
+        ):
+            mean = mean + weight * cloud[partner]
+        return np.asarray(mean)
+
+    def _match(self, given: Given, clouds: Sequence[Floats]) -> None:
+        """Match the clouds to the first one."""
+        self._partners = []
+        for cloud in clouds[1:]:
+            partner = assign_particles(
+                clouds[0], cloud, given.material, given.material, given.box
+            )
+            self._partners.append(partner)
 
 
 def predict(given: Given) -> Prediction:
@@ -111,7 +130,7 @@ def predict(given: Given) -> Prediction:
         choice.flight,
         library=library,
         divide=follow_all,
-        combine=functools.partial(mean_cloud, sharpness=choice.sharpness),
+        combine=MeanCloud(choice.sharpness),
     ):
         yield position.astype("float32")
 
@@ -122,8 +141,7 @@ PREDICTOR = ReferencePredictor(
     kind=Kind.NAIVE,
     definition="Every particle falls freely until a tenth of them touch a wall or two"
     " bodies meet. Then the five states of train, or their mirror images, that are most"
-    " like that are matched in each frame, and their clouds are averaged; nearer states"
-    " count more.",
+    " like that are matched, and their clouds are averaged; nearer states count more.",
     applies=applies,
     predict=predict,
     reads_train=True,

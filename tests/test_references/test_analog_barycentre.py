@@ -13,8 +13,8 @@ from lagbench.data.registry import load
 from lagbench.references import shipped
 from lagbench.references.analog_barycentre import (
     CHOSEN,
+    MeanCloud,
     follow_all,
-    mean_cloud,
     weights_of,
 )
 from lagbench.references.ballistic_analog import FollowedAnalog
@@ -49,7 +49,7 @@ def test_the_mean_of_two_gaussian_clouds_has_the_closed_form() -> None:
         everybody = np.arange(200)
         analogs.append(FollowedAnalog(0.1, everybody, cloud[None], np.zeros((200, 2))))
     given: Any = SimpleNamespace(material=np.zeros(200, np.int8), box=UNIT_SQUARE)
-    mean = mean_cloud(given, analogs, 0, sharpness=2.0)
+    mean = MeanCloud(2.0)(given, analogs, 1)
     assert mean == pytest.approx(0.5 + sample, abs=1e-12)
 
 
