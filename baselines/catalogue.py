@@ -59,7 +59,11 @@ def find(name: str) -> CatalogueEntry:
     points = _find_points()
     if name not in points:
         raise UsageError(
-            f"no baseline {name!r}", where="--baseline", fix=suggest_name(name, points)
+            f"no baseline {name!r}",
+            where="--baseline",
+            expected="the name of a reference model",
+            got=repr(name),
+            fix=suggest_name(name, points),
         )
     try:
         return _load_entry(points[name])

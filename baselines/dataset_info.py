@@ -34,7 +34,13 @@ def read_dataset_info(
     update_working_copy(tier, root_folder)
     manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
     if manifest is None:
-        raise DataError("the data set is not generated", where=str(folder), fix=hint)
+        raise DataError(
+            "the data set is not generated",
+            where=str(folder),
+            expected="a manifest and scenario files",
+            got="no manifest",
+            fix=hint,
+        )
     dataset_sha256 = _find_hash(manifest, tier)
     if dataset_sha256 is None:
         raise DataError("the data set is not complete", where=str(folder), fix=hint)

@@ -542,6 +542,8 @@ def _check_options(
         raise error_class(
             f"unknown key {key!r}",
             where=where,
+            expected="a key of a recipe",
+            got=repr(key),
             fix=suggest_name(str(detail["loc"][-1]), known_keys),
         )
 

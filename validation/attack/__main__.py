@@ -8,7 +8,8 @@ fork of this process. A case fails if the command shows a traceback, ends with a
 undocumented exit code, leaves something half-written, takes more than 60 s or 4 GB,
 accepts a file that must have other bytes, or scores a changed prediction as the old
 one. Prints a table of targets and counts, and the number of every failed case;
-``--only N`` repeats one of them. Exit code 0: no case failed; 1: some did.
+``--only N`` repeats one of them. ``--valid`` runs every command on the valid files,
+which must succeed. Exit code 0: no case failed; 1: some did.
 
 With the same seed, case N is the same whatever the number of cases is.
 """
@@ -58,6 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     valid = work / "valid"
     make_valid_files(valid, options.root, REPOSITORY / "leaderboard")
     targets = list_targets(valid)
+    if options.valid:
+        return _try_valid_files(targets, valid, work)
     plan = _plan(targets, options.seed)
 
     numbers: Sequence[int] = range(options.first, options.first + options.cases)
@@ -91,6 +94,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", type=int, nargs="+", help="numbers of cases")
     parser.add_argument("--root", type=Path, required=True, help="data, tiny")
     parser.add_argument("--work", type=Path, required=True, help="scratch folder")
+    parser.add_argument(
+        "--valid", action="store_true", help="run the commands on the valid files"
+    )
     parser.add_argument("--verbose", action="store_true", help="print every case")
     return parser
 
@@ -119,17 +125,38 @@ def _plan(targets: Sequence[Target], seed: int) -> list[Target]:
     return [plan[i] for i in rng.permutation(len(plan))]
 
 
+def _try_valid_files(targets: Sequence[Target], valid: Path, work: Path) -> int:
+    """Run every command once on files that are not mutated: all must succeed."""
+    exit_code = 0
+    for target in targets:
+        for command in dict.fromkeys(target.commands):
+            folder = _copy_valid_files(valid / target.source, work)
+            outcome = run_command(command, folder, work)
+            sys.stdout.write(f"{target.name}: `{' '.join(command)}`: {outcome.code}\n")
+            if outcome.code != 0:
+                exit_code = 1
+                sys.stdout.write(f"{outcome.output[:3000]}{outcome.errors[:3000]}\n")
+            sys.stdout.flush()
+    return exit_code
+
+
+def _copy_valid_files(source: Path, work: Path) -> Path:
+    """Return the working folder of a case, with nothing but the valid files."""
+    folder = work / "case"
+    if folder.exists():
+        allow_removal(folder)
+        shutil.rmtree(folder)
+    copy_tree(source, folder)
+    return folder
+
+
 def _run_case(number: int, target: Target, seed: int, valid: Path, work: Path) -> Case:
     """Mutate the valid files of a target and run a command on them."""
     rng = np.random.Generator(np.random.PCG64([seed, number]))
     mutation = target.mutations[rng.integers(len(target.mutations))]
     command = target.commands[rng.integers(len(target.commands))]
-    folder = work / "case"
-    if folder.exists():
-        allow_removal(folder)
-        shutil.rmtree(folder)
     source = valid / target.source
-    copy_tree(source, folder)
+    folder = _copy_valid_files(source, work)
     victim = folder / target.victim
     mutation(victim, rng)
 
