@@ -91,7 +91,13 @@ def choose_split(argument: str | None, option: str | None) -> str:
     fix = "name one, as in --split cavity; `lagbench list` shows all splits"
     names = {name for name in (argument, option) if name is not None}
     if not names:
-        raise UsageError("no split is named", where="--split", fix=fix)
+        raise UsageError(
+            "no split is named",
+            where="--split",
+            expected="the name of a split, or the folder of a local one",
+            got="nothing",
+            fix=fix,
+        )
     if len(names) > 1:
         raise UsageError(
             "two splits are named",
