@@ -264,7 +264,11 @@ def _unsafe(file: Path, got: str) -> UnreadableFileError:
 
 def _unreadable(file: Path, expected: str, got: str) -> UnreadableFileError:
     return UnreadableFileError(
-        "not a checkpoint of lagbench", where=str(file), expected=expected, got=got
+        "not a checkpoint of lagbench",
+        where=str(file),
+        expected=expected,
+        got=got,
+        fix="name weights.pt or checkpoint.pt of a run, or an ONNX file",
     )
 
 
