@@ -25,6 +25,7 @@ from .columns import (
     value_of,
 )
 from .entry import Entry, EntryFlag, Verification
+from .folder import weights_path
 from .model import BoardRow, ReferenceRow, Tab, Value
 
 MOST_REASONS = 4
@@ -309,12 +310,14 @@ def _links_of(entry: Entry) -> Iterator[tuple[str, str]]:
     models = []
     for prediction in entry.predictions:
         if prediction.weights:
-            models.append((prediction.seed, prediction.weights.path))
+            # the place follows from the entry, its own words are not believed
+            path = weights_path(entry.place, prediction.seed, prediction.weights.path)
+            models.append((prediction.seed, path))
     for seed, path in models:
         label = f"weights {seed}"
         if len(models) == 1:
             label = "weights"
-        yield label, path
+        yield label, path.as_posix()
 
 
 def chips_of(row: BoardRow) -> Iterator[Chip]:
