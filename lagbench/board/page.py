@@ -259,7 +259,7 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
             clauses.append(f"{counts[level]} {level}")
     if not clauses:
         return "All entries stand as submitted: nobody has scored them again yet."
-    sentence = f"Followed by the maintainers: {', '.join(clauses)}"
+    sentence = f"Run again by the maintainers: {', '.join(clauses)}"
     if machines:
         sentence += f" (on {', '.join(sorted(machines))})"
     return f"{sentence}; the others stand as submitted."
