@@ -445,8 +445,8 @@ class GraphNetwork(Baseline):
     ) -> dict[str, Tensor]:
         """Return the terms of one step to a frame of the batch.
 
-        With ``recovery`` the target is the true velocity and the way back to the true
-        path.
+        With ``recovery`` the target is the true velocity plus the velocity that leads
+        back to the true path.
         """
         target_position = batch.position[:, frame]
         true_position = batch.position[:, frame - 1]

@@ -33,8 +33,12 @@ def examine(path: str) -> dict[str, Any]:
     except LagbenchError as error:
         parts = [error.what, error.got]
         words = [str(part) for part in parts if part is not None]
-        return {"refused": ": ".join(words)[:300]}
-    return {"refused": None}
+        return {"refused": ": ".join(words)[:300], "fix": error.fix}
+    # options and statistics of a stranger may break a model in any way
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        return {"refused": f"{type(error).__name__}: {reason}"[:300], "fix": None}
+    return {"refused": None, "fix": None}
 
 
 def check_in_child(path: Path) -> None:
@@ -52,13 +56,16 @@ def check_in_child(path: Path) -> None:
         memory=MEMORY,
     )
     reason = answers.stopped
+    fix = None
     if answers.values:
         reason = answers.values[0]["refused"]
+        fix = answers.values[0]["fix"]
     if reason is not None:
         raise UnreadableFileError(
             "the weights are refused",
             where=str(path),
             expected="weights of a registered architecture with their recipe",
             got=reason,
-            fix="write them with lagbench.models.registered.export_safetensors",
+            fix=fix
+            or "write them with lagbench.models.registered.export_safetensors",
         )

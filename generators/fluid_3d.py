@@ -11,7 +11,7 @@ Each scenario draws sizes, places and velocities. All particles of a scenario st
 the same volume. The walls are free-slip. Expected behaviour: a sheet along the floor or
 a crown around the impact, jets up the walls, sloshing.
 
-The column that breaks fills the cube along one horizontal axis, which goes by the id.
+The column that breaks fills the cube along one horizontal axis, which the id decides.
 It is the dam break of Martin and Moyce (1952) between two glass walls.
 """
 

@@ -97,7 +97,8 @@ class LiquidStress3D:
         self.weights = [ti.Vector.field(4, ti.f32) for _ in _AXES]
         # offset from the middle node [cells], and the bits of the lowest node's number
         self.spot = ti.Vector.field(4, ti.f32)
-        # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
+        # largest velocity component, smallest and largest J, largest abs(v) + abs(A o)
+        # since the
         # advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         # smallest and largest J since the start

@@ -65,8 +65,8 @@ def export_onnx(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: torch, onnx or onnxruntime is missing, the model cannot be traced,
-            or its file predicts something else.
+        UsageError: torch, onnx or onnxruntime is missing, a force drives the flow, the
+            model cannot be traced, or its file predicts something else.
         UnreadableFileError: the file holds what an entry may not carry.
     """
     check_installed("onnx", extra="onnx")
@@ -74,6 +74,14 @@ def export_onnx(
         split, subset="test", size=size, root=root, future=0, registry=registry
     )
     window = collate([data[data.starts[0]]])
+    if window.body_force is not None:
+        raise UsageError(
+            "an ONNX model is not given the force that drives the flow",
+            where=f"export_onnx, {split}",
+            expected="a split without a body force",
+            got="body_force",
+            fix="hand in weights.pt or safetensors, see docs/submitting.md",
+        )
     frames = window.frames
     wrapped = _Exported(
         step,

@@ -61,8 +61,8 @@ def export_safetensors(
 
     Raises:
         UsageError: the file has another suffix.
-        UnreadableFileError: weights are not finite, or the model is of another
-            architecture.
+        UnreadableFileError: weights are not finite, the model is of another
+            architecture, or the file is longer than an entry may carry.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -71,6 +71,7 @@ def export_safetensors(
             where="path",
             expected=f"a name that ends with {SUFFIX}",
             got=target.name,
+            fix=f"name it {target.stem}{SUFFIX}",
         )
     checkpoint = Checkpoint(
         baseline=baseline,
@@ -83,6 +84,11 @@ def export_safetensors(
         },
     )
     restore(checkpoint, where=str(target))
-    save(target, checkpoint)
-    load(target)
+    temporary = target.with_name(f".{target.stem}.exporting{SUFFIX}")
+    try:
+        save(temporary, checkpoint)
+        load(temporary)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
     return target

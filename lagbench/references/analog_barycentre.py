@@ -11,8 +11,9 @@ sum of squared distances. This is one step towards the Wasserstein-2 barycentre 
 clouds (Agueh and Carlier 2011), whose mean squared distance from them is least.
 
 Frames after contact, analogs and s are chosen on train, each scenario predicted from
-the others (``python benchmarks/naive_attempts.py --attempt barycentre``). The predictor
-applies where that was done: :data:`CHOSEN`.
+the others (``python benchmarks/naive_attempts.py --attempt barycentre``, which matches
+the clouds in every compared frame). The predictor applies where that was done:
+:data:`CHOSEN`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ MATCHED_EVERY = 10
 """Frames from one matching of the clouds to the next: it takes most of the time."""
 
 LEAST_DISTANCE = 1e-12
-"""Least distance of an analog [length]: a state of train is its own analog."""
+"""Least distance of an analog, in units of features.
+
+A state of train is at distance 0 of itself.
+"""
 
 
 @dataclass(frozen=True)

@@ -121,14 +121,18 @@ def _read_reference(file: h5py.File) -> tuple[str | None, NDArray[np.float64]]:
         return None, np.empty(0)
     values = np.asarray(file["best_floor_value"][...], np.float64)
     has_right_shape = values.shape == file["scenario"].shape
-    if name not in NAIVE or not has_right_shape or np.isinf(values).any():
+    is_known = isinstance(name, str) and name in NAIVE
+    if not is_known or not has_right_shape or np.isinf(values).any():
         raise ValueError("not the scores of a reference")
     return str(name), values
 
 
 def _read_tallies(file: h5py.File) -> dict[int, Tally]:
     """Return the statistics of each scenario."""
-    names = tuple(str(read_attribute(file, "statistics")).split())
+    statistics = read_attribute(file, "statistics")
+    if not isinstance(statistics, str):
+        raise ValueError("statistics is no text")
+    names = tuple(statistics.split())
     frames = tuple(file["frame"][...].tolist())
     scenarios = file["scenario"][...].tolist()
     # shape [statistic, scenario, frame]

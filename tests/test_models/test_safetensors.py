@@ -45,7 +45,7 @@ def test_weights_and_recipe_come_back(sound: Path, generated: GenerationResult) 
     assert restored.options == model.options
     for name, value in model.state_dict().items():
         assert torch.equal(restored.state_dict()[name], value), name
-    assert examine(str(sound)) == {"refused": None}
+    assert examine(str(sound)) == {"refused": None, "fix": None}
 
 
 @pytest.mark.parametrize("spoil", HOSTILE, ids=lambda spoil: spoil.__name__)
