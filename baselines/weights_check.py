@@ -66,6 +66,5 @@ def check_in_child(path: Path) -> None:
             where=str(path),
             expected="weights of a registered architecture with their recipe",
             got=reason,
-            fix=fix
-            or "write them with lagbench.models.registered.export_safetensors",
+            fix=fix or "write them with lagbench.models.registered.export_safetensors",
         )

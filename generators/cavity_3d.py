@@ -1,16 +1,17 @@
 """Lid-driven cavity in three dimensions: a cube of which one wall or two slide.
 
 Every moving wall follows smooth random programs (:mod:`.programs`), one along each of
-its two axes, of the other sign at each knot. So the direction turns, and the frozen
-flow does not do for an answer. Which walls move goes by id, so that every subset holds
-all six choices alike. Two walls that move lie opposite, because two that meet at an
-edge would tear the fluid there. The Reynolds number is (U/2) L / nu: U/2 is the mean
-absolute speed of a wall along an axis, L = 1 the side of the cube.
+its two axes, of the other sign at each knot. So the direction turns, and a predictor
+that keeps the flow frozen fails. The id decides which walls move: every subset of mini
+holds all six choices alike. Two walls that move lie opposite, because two that meet at
+an edge would tear the fluid there. The Reynolds number is (U/2) L / nu: U/2 is the mean
+absolute speed along an axis at the knots of a program (over time it is about 0.35 U),
+L = 1 the side of the cube.
 
 Where a sliding wall meets the wall beside it the velocity jumps and the pressure of an
 incompressible fluid has no bound. There J departs from 1 by an amount that goes with
 the square of the Mach number and, at small Reynolds numbers, with nu U / (dx c^2). The
-speed of sound is therefore twice that of the other full boxes.
+speed of sound is therefore about twice that of the other full boxes.
 
 Expected behaviour: vortices grow from the moving walls, end at the walls beside them,
 where the fluid turns back, and turn with the walls; the flow never settles.

@@ -4,7 +4,8 @@ The equations stand in :mod:`.liquid_stress_3d`. The walls are free-slip and lie
 ``wall`` and its mirror image along each axis; gravity acts along the second one.
 
 The solver is valid while no particle crosses more than a cell per substep along an
-axis, max abs(v_i) dt <= dx (checked), and while sound does not either (:func:`.free_surface.courant`).
+axis, max abs(v_i) dt <= dx (checked), and while sound does not either
+(:func:`.free_surface.courant`).
 """
 
 from collections.abc import Sequence

@@ -98,8 +98,7 @@ class LiquidStress3D:
         # offset from the middle node [cells], and the bits of the lowest node's number
         self.spot = ti.Vector.field(4, ti.f32)
         # largest velocity component, smallest and largest J, largest abs(v) + abs(A o)
-        # since the
-        # advance began
+        # since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         # smallest and largest J since the start
         self.ratio_range = ti.Vector.field(2, ti.f32)

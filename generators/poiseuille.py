@@ -12,8 +12,8 @@ as in :mod:`.decaying_vortices`. The force of all frames is given to predictors.
 
 Expected behaviour: the parallel flow follows the force with a lag; viscosity smooths
 its kinks at y = 0 and y = 1/2. It shears the eddies, and feeds them where its profile
-has inflections. The total momentum stays zero. The Reynolds number is U L / nu, with U
-the drawn speed of the eddies and L = 1.
+has inflections. The force adds no momentum in all. The Reynolds number is U L / nu,
+with U the drawn speed of the eddies and L = 1.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 Every file states its Mach numbers, the range of J and the particles that reached a
 numerical bound (:mod:`lagbench.generators.soundness`); the manifest repeats them.
-Files of full boxes state the extremes of J and the largest speed of any particle at any
-substep.
+Files of full boxes state the extremes of J and the largest velocity component of any
+particle or node at any substep.
 
 Exit code 0: every scenario of a free surface has a Mach number of at most 0.3 for 99.9
 % of its particles and frames, a J of at least 0.9 for 99.9 % of liquid particles and

@@ -2,9 +2,10 @@
 
 A value is ``zero + step * level``, or the exponential of that, with integer levels. An
 array is stored as the differences of its rows, which are small where rows are frames;
-differences wrap around at 16 bits. They are stored as 0, -1, 1, -2, 2, ... are counted,
-so that small ones have an upper byte of 0, and all lower bytes stand before all upper
-ones: that compresses to four fifths. page/data.js reads all of it.
+differences wrap around at 16 bits. Each difference is replaced by its place in the
+sequence 0, -1, 1, -2, 2, ..., so that small ones have an upper byte of 0. All lower
+bytes stand before all upper bytes, which compresses to four fifths. page/data.js reads
+all of it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SMALLEST_TOP = sys.float_info.min / SMALLEST_SHARE
 """Smaller tops have no logarithmic range: its ends may read back as zero."""
 
 DIGITS = 9  # most digits of a zero
-STEP_DIGITS = 6  # 4000 steps are then off by less than a hundredth of one
+STEP_DIGITS = 6  # 4000 steps are then off by at most a fiftieth of one
 
 GZIP = 16 + zlib.MAX_WBITS  # window bits that mean gzip
 

@@ -18,7 +18,8 @@ def check_contents(size: Size, root: Path, scenarios: Iterable[int]) -> None:
     """Compare the content hash of scenarios with the recorded one.
 
     Values are hashed, unless this machine has hashed the same file before. The recorded
-    hash is that of datasets.yaml; where it has none, that of the manifest.
+    hash is that of datasets.yaml, or of the manifest for a size that has none there. A
+    scenario without any recorded hash is only read.
 
     Args:
         size: the data set.

@@ -269,8 +269,8 @@ def measure(
 ) -> dict[str, ReferenceScores]:
     """Return the scores of references of a data set by name.
 
-    The scored subset must be there, and train for ``analog``; the values of both are
-    hashed and compared with the recorded hashes.
+    The scored subset must be there, and train for those that look things up there; the
+    values of both are hashed and compared with the recorded hashes.
 
     Args:
         size: the split and size, and the subset that it scores.

@@ -18,6 +18,7 @@ from lagbench.references.analog_barycentre import (
     weights_of,
 )
 from lagbench.references.ballistic_analog import FollowedAnalog
+from lagbench.references.table import NAIVE
 
 
 @pytest.mark.parametrize("sharpness", [0.0, 1.0, 3.0])
@@ -53,6 +54,24 @@ def test_the_mean_of_two_gaussian_clouds_has_the_closed_form() -> None:
     assert mean == pytest.approx(0.5 + sample, abs=1e-12)
 
 
+def test_clouds_are_matched_in_every_tenth_frame() -> None:
+    """The partners are kept up to the ninth frame and sought anew in the tenth."""
+    start = np.array([[0.2, 0.2], [0.6, 0.6]])
+    swapped = start[::-1]
+    nearest = np.tile(start, (11, 1, 1))
+    other = np.concatenate([nearest[:5], np.tile(swapped, (6, 1, 1))])
+    everybody = np.arange(2)
+    analogs = []
+    for paths in (nearest, other):
+        analogs.append(FollowedAnalog(0.1, everybody, paths, np.zeros((2, 2))))
+    given: Any = SimpleNamespace(material=np.zeros(2, np.int8), box=UNIT_SQUARE)
+    combine = MeanCloud(2.0)
+    for frame in range(1, 5):
+        assert combine(given, analogs, frame) == pytest.approx(start)
+    assert combine(given, analogs, 9) == pytest.approx(np.full((2, 2), 0.4))
+    assert combine(given, analogs, 10) == pytest.approx(start)
+
+
 def test_all_particles_follow_each_analog() -> None:
     """Nobody is left out."""
     for members in follow_all(np.array([0.1, 0.2]), 7):
@@ -67,7 +86,7 @@ def test_it_is_the_best_naive_predictor_where_it_was_chosen() -> None:
         assert references is not None
         means = {}
         for reference, scores in references.items():
-            means[reference] = scores.scores["cloud_distance"].mean
-        best = means["analog-barycentre"]
-        assert best < 0.95 * means["ballistic-analog"]
-        assert best < 0.95 * means["analog"]
+            if reference in NAIVE:
+                means[reference] = scores.scores["cloud_distance"].mean
+        best = means.pop("analog-barycentre")
+        assert best < 0.95 * min(means.values())

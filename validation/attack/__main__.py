@@ -153,8 +153,8 @@ def _copy_valid_files(source: Path, work: Path) -> Path:
 def _run_case(number: int, target: Target, seed: int, valid: Path, work: Path) -> Case:
     """Mutate the valid files of a target and run a command on them."""
     rng = np.random.Generator(np.random.PCG64([seed, number]))
-    mutation = target.mutations[rng.integers(len(target.mutations))]
-    command = target.commands[rng.integers(len(target.commands))]
+    mutation = target.mutations[int(rng.integers(len(target.mutations)))]
+    command = target.commands[int(rng.integers(len(target.commands)))]
     source = valid / target.source
     folder = _copy_valid_files(source, work)
     victim = folder / target.victim

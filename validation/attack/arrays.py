@@ -149,11 +149,14 @@ def wrong_materials(path: Path, rng: np.random.Generator) -> None:
 
     def change(arrays: Arrays) -> None:
         material = arrays["material"]
-        choices = (material + 99, material - 1, material[:-1], material + 0.5, None)
-        if choices[kind] is None:
-            arrays["material"] = np.array("liquid")
-        else:
-            arrays["material"] = choices[kind]
+        choices = (
+            material + 99,
+            material - 1,
+            material[:-1],
+            material + 0.5,
+            np.array("liquid"),
+        )
+        arrays["material"] = choices[kind]
 
     _edit(path, change)
 

@@ -6,6 +6,7 @@ generator that it is given.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import stat
@@ -228,8 +229,11 @@ def _edit_yaml(
     places = _leaves(content)
     place = places[rng.integers(len(places))]
     edit(_holder(content, place), place[-1])
-    # YAML is a superset of JSON only where keys are texts and numbers are finite.
-    path.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+    if path.suffix == ".json":
+        text = json.dumps(content, ensure_ascii=False, default=str)
+    else:
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    path.write_text(text)
 
 
 def remove_a_key(path: Path, rng: np.random.Generator) -> None:
@@ -403,7 +407,7 @@ def exchange_axes(path: Path, rng: np.random.Generator) -> None:
 
 
 def one_particle_everywhere(path: Path, rng: np.random.Generator) -> None:
-    """Put all particles of a frame into one point."""
+    """Put all particles of all frames but the first into one point."""
 
     def change(position: Array) -> Array:
         position[:, 1:] = position[:, 1:, :1]

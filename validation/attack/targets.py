@@ -35,7 +35,7 @@ from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
 from .running import run_command
 
 SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise", "fluid")
-"""Splits of which the root must hold ``tiny``."""
+"""Splits of which ``tiny`` is generated below the root where it is missing."""
 
 COMMITTED_ENTRIES = ("gns", "hybrid-projection")
 """Entries of the committed leaderboard, cavity mini, whose records are attacked."""
@@ -150,7 +150,7 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
 
     Args:
         folder: where they are written.
-        root: folder of all data sets, with ``tiny`` of all splits.
+        root: folder of all data sets, where ``tiny`` of these splits is generated.
         leaderboard: the committed leaderboard, of which some entries are copied.
 
     Raises:
@@ -206,7 +206,7 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
 
 
 def _make_board(folder: Path, run: Callable[..., str]) -> None:
-    """Make a leaderboard of two entries with models, and a season of both."""
+    """Make a leaderboard of an entry with a model, and a season of it."""
     board = folder / "board"
     board.mkdir()
     (board / "meta.yaml").write_text(META)
@@ -464,12 +464,12 @@ def _array_targets() -> list[Target]:
             check=find_wrong_values,
         ),
         Target(
-            name="analog-barycentre: train",
+            name="ballistic-analog: train",
             source="analogs",
             victim="own/full/v1/train/0000.nc",
             mutations=(*BYTES, *PLACES),
             commands=[
-                ("compare", "p.nc", "analog-barycentre", "--root", ".", "-q"),
+                ("compare", "p.nc", "ballistic-analog", "--root", ".", "-q"),
                 ("score", "p.nc", "--split", "own/", "-o", "scores", "-q"),
             ],
             weight=2,
