@@ -408,16 +408,26 @@ def test_rollout_losses_pass_gradients_through_all_steps() -> None:
     assert difference > 0.1 * float(detached_gradient.norm())
 
 
-def test_training_leaves_the_batch_alone() -> None:
+@pytest.mark.parametrize(
+    ("symmetry", "is_forced"), [("square", False), ("mirror", True)]
+)
+def test_training_leaves_the_batch_alone(symmetry: str, is_forced: bool) -> None:
     """Noise and mirror images change no stored bit."""
     window = batch(swirl(0, 7), swirl(1, 7), walls=True)
     origin = window.position[:, 0].clone()
     viscosity = torch.full((window.windows,), 1e-3)
     window = replace(window, origin=origin, viscosity=viscosity)
+    if is_forced:
+        # on two layers, shape [window, frame, layer, axis]
+        force = torch.full((window.windows, 7, 2, 2), 0.1)
+        window = replace(window, body_force=force)
     before = {}
     for field in fields(Batch):
-        before[field.name] = getattr(window, field.name).clone()
-    model = network(awake=True, noise_std=1e-3, symmetry="square", wall_velocity=True)
+        value = getattr(window, field.name)
+        if value is not None:
+            before[field.name] = value.clone()
+    assert ("body_force" in before) is is_forced
+    model = network(awake=True, noise_std=1e-3, symmetry=symmetry, wall_velocity=True)
     model(window, seeded(1))
     for name, value in before.items():
         assert torch.equal(getattr(window, name), value)
