@@ -39,7 +39,7 @@ def batch(root: Path) -> Batch:
 
 
 def test_windows_hold_the_force_of_their_frames(root: Path) -> None:
-    """Row f is what acts from frame f-1 to f; of a cavity there is none."""
+    """Row f is what acts from frame f-1 to f."""
     data = lagbench.windows(SPLIT, size="tiny", root=root, history=2)
     window = data[5]
     assert window.body_force is not None

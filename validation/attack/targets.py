@@ -34,7 +34,7 @@ from .models import WEIGHTS as WEIGHT_MUTATIONS
 from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
 from .running import run_command
 
-SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise", "fluid")
+SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise")
 """Splits of which ``tiny`` is generated below the root where it is missing."""
 
 COMMITTED_ENTRIES = ("gns", "hybrid-projection")
