@@ -2,7 +2,8 @@
 
 Speed and vorticity take maps of matplotlib that stay apart under every common colour
 vision deficiency. All colours, with the blends that smooth edges, fit the 256 colours
-of one palette: PNG and GIF files use it, stay small, and show each colour as drawn.
+of a palette: PNG and GIF files use it, stay small, and show each colour as drawn.
+Pictures of three dimensions, where far particles are pale, have a palette of their own.
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ BLENDS = (
     (WALL, 3),
     *((colour, 4) for colour in MATERIAL_COLOURS),
 )
+
+FADES = (0.85, 0.7, 0.55, 0.4)
+"""Shares of their own colour that far particles keep; paper is the rest."""
 
 _STYLE = {
     # ships with matplotlib, so that text has the same pixels everywhere
@@ -116,6 +120,27 @@ def build_palette() -> NDArray[np.uint8]:
     return np.concatenate([palette, filling])
 
 
+@functools.cache
+def build_solid_palette() -> NDArray[np.uint8]:
+    """Return the 256 colours of pictures of three dimensions, shape [256, 3].
+
+    Particles by speed are paler the farther they are. No vorticity has a sign there.
+    """
+    paper = parse_rgb(PAPER).astype(float)
+    speeds = _exact_colours(build_speed_map())
+    tables = [paper[None], speeds]
+    for share in FADES:
+        tables.append(_blend(speeds[::2], paper, share=share))
+    for colour, blend_count in BLENDS[:2]:
+        pure = parse_rgb(colour).astype(float)
+        for number in range(1, blend_count + 1):
+            tables.append(_blend(pure[None], paper, share=number / blend_count))
+
+    palette = np.concatenate(tables).round().astype(np.uint8)
+    filling = np.repeat(palette[:1], PALETTE_SIZE - len(palette), axis=0)
+    return np.concatenate([palette, filling])
+
+
 def colour_bytes(colour_map: ListedColormap) -> NDArray[np.uint8]:
     """Return the colours of a map as RGB bytes, shape [level, 3]."""
     return _exact_colours(colour_map).round().astype(np.uint8)
@@ -133,12 +158,23 @@ def _blend(
     return share * colours + (1.0 - share) * paper
 
 
-def reduce_colours(image: Image) -> Image:
-    """Return an RGB image with the nearest colour of the palette in each pixel."""
+def choose_palette(image: Image) -> NDArray[np.uint8]:
+    """Return that of both palettes which comes nearer to an RGB image, [256, 3]."""
+    exact = np.asarray(image, np.float64)
+    palettes = (build_palette(), build_solid_palette())
+    errors = []
+    for palette in palettes:
+        reduced = np.asarray(reduce_colours(image, palette).convert("RGB"), np.float64)
+        errors.append(float(np.sum((reduced - exact) ** 2)))
+    return palettes[int(np.argmin(errors))]
+
+
+def reduce_colours(image: Image, palette: NDArray[np.uint8]) -> Image:
+    """Return an RGB image with the nearest colour of a palette in each pixel."""
     images = require("PIL.Image", extra="plots")
-    palette = images.new("P", (1, 1))
-    palette.putpalette(build_palette().tobytes())
-    return image.quantize(palette=palette, dither=images.Dither.NONE)
+    holder = images.new("P", (1, 1))
+    holder.putpalette(palette.tobytes())
+    return image.quantize(palette=holder, dither=images.Dither.NONE)
 
 
 @contextmanager
@@ -191,7 +227,8 @@ def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
 def png_bytes(drawn: Figure) -> bytes:
     """Return the figure as a PNG file in 256 colours, without date or software."""
     images = require("PIL.Image", extra="plots")
-    image = reduce_colours(images.fromarray(pixels_of(drawn)))
+    exact = images.fromarray(pixels_of(drawn))
+    image = reduce_colours(exact, choose_palette(exact))
     with io.BytesIO() as buffer:
         image.save(buffer, format="PNG", optimize=True)
         return buffer.getvalue()

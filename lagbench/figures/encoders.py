@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError, require
 
-from .canvas import reduce_colours
+from .canvas import choose_palette, reduce_colours
 
 # appends one frame: RGB bytes, shape [row, column, 3]
 WriteFrame = Callable[[NDArray[np.uint8]], object]
@@ -92,15 +92,20 @@ def encode_mp4(
 def encode_gif(path: Path, *, rate: float) -> Iterator[WriteFrame]:
     """Yield a function that appends a frame to a GIF file that repeats for ever.
 
-    All frames share one palette. Rates are rounded to hundredths of a second.
+    All frames share the palette of the first. Rates are rounded to hundredths of a
+    second.
     """
     images = require("PIL.Image", extra="plots")
     plugin = require("PIL.GifImagePlugin", extra="plots")
     delay = max(SHORTEST_DELAY, 10 * round(100.0 / rate))
+    palettes: list[NDArray[np.uint8]] = []
     with path.open("wb") as file:
 
         def write(frame: NDArray[np.uint8]) -> None:
-            image = reduce_colours(images.fromarray(frame))
+            exact = images.fromarray(frame)
+            if not palettes:
+                palettes.append(choose_palette(exact))
+            image = reduce_colours(exact, palettes[0])
             is_first = file.tell() == 0
             if is_first:
                 header, _ = plugin.getheader(image, info={"loop": 0})

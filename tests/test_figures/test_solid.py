@@ -5,9 +5,18 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from lagbench.data.box import Box
+from lagbench.figures.canvas import (
+    build_palette,
+    build_speed_map,
+    build_vorticity_map,
+    choose_palette,
+    colour_bytes,
+    reduce_colours,
+)
 from lagbench.figures.solid import PALEST, RIM, View, shade
 
 BOXES = {
@@ -66,3 +75,30 @@ def test_the_farthest_particle_is_the_palest() -> None:
     colours = np.zeros((2, 3))
     shaded = shade(colours, np.array([0.0, 1.0]), np.ones(3))
     np.testing.assert_allclose(shaded, [[0.0] * 3, [1.0 - PALEST] * 3])
+
+
+def test_pale_particles_keep_their_hue() -> None:
+    """Speeds that fade into the paper are nearly the colours of the file."""
+    speeds = colour_bytes(build_speed_map()).astype(float)
+    paper = build_palette()[0].astype(float)
+    rows = []
+    for share in np.linspace(PALEST, 1.0, 25):
+        rows.append(share * speeds + (1.0 - share) * paper)
+    exact = np.array(rows).round().astype(np.uint8)
+    image = PIL.Image.fromarray(exact)
+    palette = choose_palette(image)
+    assert not np.array_equal(palette, build_palette())
+    reduced = np.asarray(reduce_colours(image, palette).convert("RGB"))
+    difference = reduced.astype(float) - exact
+    assert np.abs(difference).max() <= 24
+    assert np.sqrt(np.mean(difference**2)) <= 7
+
+
+def test_flat_pictures_keep_their_palette() -> None:
+    """A picture with signed vorticity has the palette that holds its colours."""
+    colours = colour_bytes(build_vorticity_map())[None]
+    image = PIL.Image.fromarray(colours)
+    palette = choose_palette(image)
+    np.testing.assert_array_equal(palette, build_palette())
+    reduced = np.asarray(reduce_colours(image, palette).convert("RGB"))
+    assert np.abs(reduced.astype(float) - colours).max() <= 8
