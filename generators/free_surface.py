@@ -13,11 +13,12 @@ the splits.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .driver import Driver, stack
+from .driver import Driver, Kernels, stack
 from .particle_stress import ParticleStress
 from .solver import Health
 from .soundness import sound_speeds
@@ -60,7 +61,47 @@ class Energy:
         return self.kinetic + self.gravitational + self.elastic
 
 
-class FreeSurface(Driver[FreeSurfaceParameters]):
+class ExtremeKernels(Kernels, Protocol):
+    """Kernels that keep the extremes of each particle."""
+
+    extremes: Any  # largest speed, smallest and largest J, largest abs(v) + abs(A o)
+    reach_bound: float  # of abs(v) + abs(A o), what sums have room for [length/s]
+
+
+class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
+    """What solvers of free surfaces share: extremes, and the bound of their sums."""
+
+    _kernels: ExtremeKernels
+
+    def health(self) -> list[Health]:
+        """Return what each scenario went through during the last advance."""
+        extremes = self._read(self._kernels.extremes)
+        # largest abs(v) + abs(A o) of each scenario
+        self._reach = extremes[:, :, 3].max(axis=1)
+        # The kernels keep a huge number where they saw something that is none.
+        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
+        healths = []
+        for extreme in extremes:
+            health = Health(
+                finite=bool(np.isfinite(extreme).all()),
+                max_speed=float(extreme[:, 0].max()),
+                jacobian_min=float(extreme[:, 1].min()),
+                jacobian_max=float(extreme[:, 2].max()),
+            )
+            healths.append(health)
+        return healths
+
+    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
+        reach = self._reach[index]
+        bound = self._kernels.reach_bound
+        quantity = "abs(v) + abs(A o)"
+        if bound < reach < _LARGEST:
+            name = f"fixed-point sums: {quantity} <= {bound:.6g}"
+            return {name: f"{quantity} = {reach:.6g}"}
+        return {}
+
+
+class FreeSurface(FreeSurfaceDriver):
     """Solver of a free surface; its methods are those of :class:`.Solver`."""
 
     _kernels: ParticleStress
@@ -167,30 +208,3 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
                 psi = psi * hardening
             density = np.where(self._material == material, psi, density)
         return np.asarray(density)
-
-    def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
-        extremes = self._read(self._kernels.extremes)
-        # largest abs(v) + abs(A o) of each scenario
-        self._reach = extremes[:, :, 3].max(axis=1)
-        # The kernels keep a huge number where they saw something that is none.
-        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
-        healths = []
-        for extreme in extremes:
-            health = Health(
-                finite=bool(np.isfinite(extreme).all()),
-                max_speed=float(extreme[:, 0].max()),
-                jacobian_min=float(extreme[:, 1].min()),
-                jacobian_max=float(extreme[:, 2].max()),
-            )
-            healths.append(health)
-        return healths
-
-    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        reach = self._reach[index]
-        bound = self._kernels.reach_bound
-        quantity = "abs(v) + abs(A o)"
-        if bound < reach < _LARGEST:
-            name = f"fixed-point sums: {quantity} <= {bound:.6g}"
-            return {name: f"{quantity} = {reach:.6g}"}
-        return {}

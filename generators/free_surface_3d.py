@@ -15,16 +15,12 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .driver import Driver
-from .free_surface import Energy
+from .free_surface import Energy, FreeSurfaceDriver
 from .liquid_stress_3d import LiquidStress3D
-from .solver import Health
-from .split import FreeSurfaceParameters, InitialState, Material
-
-_LARGEST = 1e30  # extremes beyond this stand for what is not a number
+from .split import InitialState, Material
 
 
-class FreeSurface3D(Driver[FreeSurfaceParameters]):
+class FreeSurface3D(FreeSurfaceDriver):
     """Solver of a liquid in a cube; its methods are those of :class:`.Solver`."""
 
     _kernels: LiquidStress3D
@@ -76,33 +72,6 @@ class FreeSurface3D(Driver[FreeSurfaceParameters]):
             gravitational=p.gravity * mass * height.sum(axis=-1),
             elastic=self._volume * elastic_density.sum(axis=-1),
         )
-
-    def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
-        extremes = self._read(self._kernels.extremes)
-        # largest abs(v) + abs(A o) of each scenario
-        self._reach = extremes[:, :, 3].max(axis=1)
-        # The kernels keep a huge number where they saw something that is none.
-        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
-        healths = []
-        for extreme in extremes:
-            health = Health(
-                finite=bool(np.isfinite(extreme).all()),
-                max_speed=float(extreme[:, 0].max()),
-                jacobian_min=float(extreme[:, 1].min()),
-                jacobian_max=float(extreme[:, 2].max()),
-            )
-            healths.append(health)
-        return healths
-
-    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        reach = self._reach[index]
-        bound = self._kernels.reach_bound
-        quantity = "abs(v) + abs(A o)"
-        if bound < reach < _LARGEST:
-            name = f"fixed-point sums: {quantity} <= {bound:.6g}"
-            return {name: f"{quantity} = {reach:.6g}"}
-        return {}
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
