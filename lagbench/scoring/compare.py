@@ -441,8 +441,8 @@ def _no_such_name(
             where=str(first),
             expected=second,
             got=f"scores of {present}",
-            fix="a scores.nc has the best reference only: compare predictions.nc or "
-            "scores.json",
+            fix="name one of these; a scores.nc has the best one only, scores.json and "
+            "predictions.nc have all of the data set",
         )
     split = contestant.identity["split"]
     size = contestant.identity["size"]
