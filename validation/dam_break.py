@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, WorkFailedError
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.constants import free_surface_walls, solver_constants
 from lagbench.generators.draws import quantise
 from lagbench.generators.solver import build
@@ -119,7 +119,12 @@ def run(size: str, split: str = "fluid") -> DamBreak:
     width = WIDTH[split]
     constants = solver_constants(tier)
     if not isinstance(constants, FreeSurfaceParameters):
-        raise TypeError(f"{split} has no free surface")
+        raise UsageError(
+            "a dam breaks on a free surface only",
+            where="--split",
+            expected=", ".join(sorted(WIDTH)),
+            got=split,
+        )
     state = column(constants, tier.box.bounds, width)
     constants = replace(constants, particles=len(state.position))
     solver = build(constants)
