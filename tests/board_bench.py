@@ -84,7 +84,11 @@ class ReportBench:
     def card(self, path: Path) -> ScoreCard:
         """Return the score card of a submission."""
         return score(
-            path, root=self.root, registry=self.registry, workers=1, write=False
+            path,
+            root=self.root,
+            registry=self.registry,
+            workers=1,
+            write=False,
         )
 
     def report(self, folder: Path, files: Mapping[str, Method]) -> Path:
@@ -96,7 +100,11 @@ class ReportBench:
             paths.append(path)
         cards = [self.card(path) for path in paths]
         return write_report(
-            folder / "report", cards, paths, root=self.root, registry=self.registry
+            folder / "report",
+            cards,
+            paths,
+            root=self.root,
+            registry=self.registry,
         )
 
 
@@ -312,7 +320,11 @@ class BoardBench:
         return self.data.submit(path, method, name, **labels)
 
     def submit(
-        self, *paths: Path, replace: bool = False, add: bool = False, **keys: Any
+        self,
+        *paths: Path,
+        replace: bool = False,
+        add: bool = False,
+        **keys: Any,
     ) -> SubmitResult:
         """Submit predictions."""
         description: dict[str, Any] = {
@@ -322,7 +334,12 @@ class BoardBench:
         }
         meta = Meta(**(description | keys))
         return submit(
-            paths, meta, replace=replace, add=add, new_board=True, **self.where
+            paths,
+            meta,
+            replace=replace,
+            add=add,
+            new_board=True,
+            **self.where,
         )
 
     @property
@@ -462,7 +479,10 @@ def set_mean(content: dict[str, Any], factor: float = 0.9) -> None:
 
 
 def reform(
-    bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True
+    bench: BoardBench,
+    change: Callable[[Any], object],
+    *,
+    whole: bool = True,
 ) -> None:
     """Change the values of a score file; its hash and the aggregates follow."""
     with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:

@@ -35,7 +35,11 @@ FAULTS: dict[str, Fault] = {}
 
 
 def fault(
-    check: str, exit_code: int = 1, *, hostile: bool = False, says: str = ""
+    check: str,
+    exit_code: int = 1,
+    *,
+    hostile: bool = False,
+    says: str = "",
 ) -> Callable[[Callable[[Bench], Path]], Callable[[Bench], Path]]:
     """Register a function that makes a faulty file."""
 
@@ -47,7 +51,11 @@ def fault(
 
 
 def simple(
-    check: str, name: str, change: Callable[[h5py.File], object], *, says: str = ""
+    check: str,
+    name: str,
+    change: Callable[[h5py.File], object],
+    *,
+    says: str = "",
 ) -> None:
     """Register a fault that changes an open copy of the valid file."""
 
@@ -64,7 +72,11 @@ def simple(
 
 
 def replace(
-    file: h5py.File, name: str, dims: tuple[str, ...], data: Any = None, **options: Any
+    file: h5py.File,
+    name: str,
+    dims: tuple[str, ...],
+    data: Any = None,
+    **options: Any,
 ) -> h5py.Dataset:
     """Replace a variable by another of the same name, with dimension scales
     attached.
@@ -132,7 +144,11 @@ def built(
 
 
 def rows(
-    bench: Bench, name: str, scenarios: list[int], frames: list[int], pick: Any
+    bench: Bench,
+    name: str,
+    scenarios: list[int],
+    frames: list[int],
+    pick: Any,
 ) -> Path:
     """Write a selection of the valid positions under other coordinates."""
     with h5py.File(bench.valid) as valid:
@@ -143,7 +159,12 @@ def rows(
 
 
 def attribute(
-    name: str, attribute: str, value: Any, *, check: str = "format", says: str = ""
+    name: str,
+    attribute: str,
+    value: Any,
+    *,
+    check: str = "format",
+    says: str = "",
 ) -> None:
     """Register a fault that sets a global attribute, or removes it where the value is
     None.

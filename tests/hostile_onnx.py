@@ -40,7 +40,10 @@ def save_model(
     for domain, version in (opsets or {"": 18}).items():
         imports.append(helper.make_opsetid(domain, version))
     model = helper.make_model(
-        graph, opset_imports=imports, functions=functions or [], ir_version=10
+        graph,
+        opset_imports=imports,
+        functions=functions or [],
+        ir_version=10,
     )
     path.write_bytes(model.SerializeToString())
     return path

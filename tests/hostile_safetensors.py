@@ -19,7 +19,11 @@ def small_model(generated: GenerationResult) -> Any:
     """Return a small graph network for the tiny curl noise that moves particles."""
     torch.manual_seed(3)
     model: Any = build_registered(
-        "gns", split="curl-noise", size="tiny", options=SMALL, root=generated.root
+        "gns",
+        split="curl-noise",
+        size="tiny",
+        options=SMALL,
+        root=generated.root,
     )
     torch.nn.init.normal_(model.network.decoder[-1].weight, std=0.1)
     return model

@@ -51,7 +51,10 @@ def rollout(frames: int = 8, side: int = 20, speed: float = 0.01) -> Floats:
 
 
 def scenario_of(
-    positions: Floats, *, material: ArrayLike | None = None, **changes: Any
+    positions: Floats,
+    *,
+    material: ArrayLike | None = None,
+    **changes: Any,
 ) -> Scenario:
     """Return the scenario whose given frames are the first two; ``changes`` go to the
     config.

@@ -43,7 +43,11 @@ def write_swirl(
     tier = registry.load().size(split, size)
     subset = tier.subset_of(scenario)
     key = ScenarioKey(
-        split=split, size=size, version=tier.version, scenario=scenario, subset=subset
+        split=split,
+        size=size,
+        version=tier.version,
+        scenario=scenario,
+        subset=subset,
     )
     count = tier.particles
     start = disc(count, 0.4) - 0.5

@@ -43,7 +43,11 @@ def turn() -> int:
     folder = Path(__file__).parent
     try:
         done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, check=True
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
         )
     except (OSError, subprocess.CalledProcessError):
         return 0
@@ -115,7 +119,9 @@ def digest(state: InitialState) -> str:
 
 
 def neighbours(
-    position: NDArray[np.float64], count: int, among: NDArray[np.float64] | None = None
+    position: NDArray[np.float64],
+    count: int,
+    among: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return distance and index of the nearest points, by SciPy's k-d tree.
 

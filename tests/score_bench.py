@@ -60,7 +60,11 @@ class ScoreBench:
     def evaluate(self, path: Path, **options: Any) -> ScoreCard:
         """Return the score card of a submission."""
         return score(
-            path, root=self.root, registry=self.registry, write=False, **options
+            path,
+            root=self.root,
+            registry=self.registry,
+            write=False,
+            **options,
         )
 
     def score(self, path: Path, **options: Any) -> ScoreCard:

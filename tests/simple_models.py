@@ -197,7 +197,9 @@ def info_of(scenarios: Sequence[Floats]) -> DatasetInfo:
 
 
 def side_by_side(
-    windows: Sequence[NDArray[Any]], kinds: Sequence[Tensor], walls: Tensor | None
+    windows: Sequence[NDArray[Any]],
+    kinds: Sequence[Tensor],
+    walls: Tensor | None,
 ) -> Batch:
     """Return windows of shape [frame, particle, 2] as a batch, with the materials of
     each.
@@ -241,7 +243,11 @@ def batch(*windows: NDArray[np.float64] | Floats, walls: bool = False) -> Batch:
 
 
 def rotations(
-    scenarios: int, *, frames: int = 40, particles: int = 12, seed: int = 0
+    scenarios: int,
+    *,
+    frames: int = 40,
+    particles: int = 12,
+    seed: int = 0,
 ) -> list[Floats]:
     """Return one lopsided cloud that turns about the centre of the box, from other
     angles.
@@ -256,7 +262,11 @@ def rotations(
 
 
 def train(
-    model: Baseline, scenarios: Sequence[Floats], *, steps: int, batch: int = 32
+    model: Baseline,
+    scenarios: Sequence[Floats],
+    *,
+    steps: int,
+    batch: int = 32,
 ) -> None:
     """Take Adam steps on random windows, as little as it needs."""
     rng = np.random.default_rng(0)
@@ -294,7 +304,11 @@ def rolled(model: Baseline, given: Batch, frames: int) -> Tensor:
 
 
 def share_of_persistence(
-    model: Baseline, scenario: Floats, *, frames: int, given: int = 2
+    model: Baseline,
+    scenario: Floats,
+    *,
+    frames: int,
+    given: int = 2,
 ) -> float:
     """Return the rollout's squared error over that of standing still, both in
     positions.
@@ -343,7 +357,10 @@ def info(**changes: object) -> DatasetInfo:
 
 
 def jittered(
-    seed: int, side: int = 16, low: float = 0.0625, high: float = 0.9375
+    seed: int,
+    side: int = 16,
+    low: float = 0.0625,
+    high: float = 0.9375,
 ) -> NDArray[np.float64]:
     """Return a jittered lattice of side^2 particles in a square, shape [particle,
     2].
@@ -356,7 +373,9 @@ def jittered(
 
 
 def swirl(
-    seed: int, frames: int, speeds: Sequence[float] = (0.05, -0.03)
+    seed: int,
+    frames: int,
+    speeds: Sequence[float] = (0.05, -0.03),
 ) -> NDArray[np.float64]:
     """Return particles on circles about the middle, from one angle per frame to
     another.

@@ -52,7 +52,10 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
 def found(bench: BoardBench, *, page: bool = False) -> list[str]:
     """Return the names of the checks that found something."""
     result = check_board(
-        bench.folder, registry=bench.registry, page=page, isolated=False
+        bench.folder,
+        registry=bench.registry,
+        page=page,
+        isolated=False,
     )
     for finding in result.findings:
         assert finding.check in CHECKS

@@ -132,7 +132,11 @@ def test_machines_are_answered_in_json(run: Run) -> None:
     ],
 )
 def test_errors_have_their_codes(
-    run: Run, words: list[str], code: int, message: str, tmp_path: Path
+    run: Run,
+    words: list[str],
+    code: int,
+    message: str,
+    tmp_path: Path,
 ) -> None:
     """One message on stderr, no traceback, the code of docs/scoring.md, nothing
     written.

@@ -33,7 +33,10 @@ def tab() -> Tab:
 def point(seconds: float, error: float, kind: str = "entry") -> CostPoint:
     """Return a point named after its place."""
     return CostPoint(
-        name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind
+        name=f"{seconds:g} {error:g}",
+        seconds=seconds,
+        error=error,
+        kind=kind,
     )
 
 

@@ -220,7 +220,11 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
     ],
 )
 def test_a_sentence_says_whether_learning_pays(
-    board: Board, low: float, ratio: float, high: float, beginning: str
+    board: Board,
+    low: float,
+    ratio: float,
+    high: float,
+    beginning: str,
 ) -> None:
     """It follows from the best ratio of any active entry that learns."""
     row = board.tabs[0].rows[0]
@@ -428,7 +432,11 @@ def test_hostile_text_stays_text(board: Board) -> None:
     """Whatever a name holds, the page has the same elements as without it."""
     first = board.tabs[0].rows[0]
     bad = with_entry(
-        first, name=HOSTILE, authors=(HOSTILE,), affiliation=HOSTILE, command=HOSTILE
+        first,
+        name=HOSTILE,
+        authors=(HOSTILE,),
+        affiliation=HOSTILE,
+        command=HOSTILE,
     )
     page = with_rows(board, bad)
     names = [element.name for element in read_html(page).elements]

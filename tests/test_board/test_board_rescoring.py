@@ -111,7 +111,10 @@ def test_metrics_of_packages_decide_nothing(
     submitter's.
     """
     own_metric = replace(
-        available()["position_mse"], name="other", of=(), statistic=lambda pair: 1.0
+        available()["position_mse"],
+        name="other",
+        of=(),
+        statistic=lambda pair: 1.0,
     )
     more = {**available(), "other": own_metric}
     with monkeypatch.context() as patch:
@@ -205,7 +208,10 @@ def test_pictures_and_statistics_are_compared(
 
 
 def test_broken_predictions_are_opened_in_the_child_only(
-    own: BoardBench, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    own: BoardBench,
+    predictions: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Whatever is wrong with the file is found before this process opens it; other
     findings remain.

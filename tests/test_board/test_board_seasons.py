@@ -102,7 +102,11 @@ def simulate(bench: ModelBoard, season: Season) -> None:
 def run_again(bench: ModelBoard, *, again: bool = False) -> SeasonResult:
     """Run the season and compare its scores with those on the board."""
     return run_season(
-        bench.folder, SEASON, root=bench.root, comparing=True, again=again
+        bench.folder,
+        SEASON,
+        root=bench.root,
+        comparing=True,
+        again=again,
     )
 
 
@@ -238,7 +242,10 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
     ],
 )
 def test_an_edited_season_is_found(
-    own: ModelBoard, file: str, old: str, new: str
+    own: ModelBoard,
+    file: str,
+    old: str,
+    new: str,
 ) -> None:
     """Seeds, names, scenarios and models follow from the frozen models."""
     path = own.folder / "seasons" / SEASON / file

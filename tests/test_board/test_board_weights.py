@@ -348,7 +348,10 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
     ],
 )
 def test_weights_are_those_of_the_predictions(
-    own: BoardBench, training: str | None, parameters: int | None, fits: bool
+    own: BoardBench,
+    training: str | None,
+    parameters: int | None,
+    fits: bool,
 ) -> None:
     """Training in words and parameters are those of the weights; the number tells GNS
     from SuperGAT.
@@ -563,7 +566,11 @@ def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) ->
     files = [own.predict(nearer, "mine", seed=0), own.predict(still, "mine", seed=1)]
     budget = EntryBudget(epochs=10.0, gpu_hours=2.5)
     own.submit(
-        files[0], parameters=1000, budget=budget, notes="first", hardware="a GPU"
+        files[0],
+        parameters=1000,
+        budget=budget,
+        notes="first",
+        hardware="a GPU",
     )
     files[0].unlink()
     own.submit(files[1], add=True, notes="both")
@@ -612,7 +619,9 @@ def test_only_sound_active_entries_get_seeds(
 
 
 def test_each_seed_has_its_own_step_and_start(
-    own: BoardBench, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    own: BoardBench,
+    run: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Trainings that differ in these alone belong together, on the command line too."""
     recipe = "cavity tiny train, recipe cavity/tiny"

@@ -298,7 +298,9 @@ def test_clean_may_remove_leftovers_only(run: Run, copied: Callable[[], Path]) -
 
 
 def test_a_dry_run_of_clean_removes_nothing_and_takes_no_lock(
-    run: Run, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    copied: Callable[[], Path],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     root = copied()
     add_strange_files(root)

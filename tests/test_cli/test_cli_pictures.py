@@ -41,7 +41,12 @@ def test_python_draws_the_same_picture(
     pictures = [tmp_path / "split.png", tmp_path / "file.png", tmp_path / "command.png"]
     options = {"frame": 5, "kind": "speed"}
     lagbench.plot(
-        SPLIT, size=SIZE, root=generated.root, output=pictures[0], scenario=4, **options
+        SPLIT,
+        size=SIZE,
+        root=generated.root,
+        output=pictures[0],
+        scenario=4,
+        **options,
     )
     file = generated.folder / "test" / "0004.nc"
     lagbench.plot(file, output=pictures[1], **options)
@@ -99,7 +104,10 @@ def test_a_named_file_that_cannot_be_read_exits_3(
     ],
 )
 def test_a_misspelt_folder_is_refused_and_not_made(
-    words: tuple[str, ...], run: Run, generated: GenerationResult, tmp_path: Path
+    words: tuple[str, ...],
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
 ) -> None:
     folder = tmp_path / "lost"
     command, *options = (word.format(folder) for word in words)

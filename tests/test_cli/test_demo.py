@@ -30,7 +30,12 @@ NAIVE_NAMES = [
 ]
 
 SOLVER_BENCH = SolverBench(
-    split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5
+    split=SPLIT,
+    size=SIZE,
+    particles=1,
+    substeps=1,
+    frames=1,
+    seconds_per_frame=0.5,
 )
 
 
@@ -45,7 +50,10 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 @pytest.fixture
 def small_registry(
-    run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    unmeasured_path: Path,
+    tmp_path: Path,
 ) -> Registry:
     """A registry of two splits, of which one has a size tiny; the demo uses it.
 
@@ -167,7 +175,9 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(
 @pytest.mark.usefixtures("small_registry")
 @pytest.mark.slow
 def test_a_training_of_another_version_is_trained_anew(
-    copied: Callable[[], Path], run: Run, monkeypatch: pytest.MonkeyPatch
+    copied: Callable[[], Path],
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A damaged checkpoint, and one of another recipe, are no errors."""
     root = copied()

@@ -42,12 +42,18 @@ IDENTITY["parameters"] = {"dt": 0.002, "grid": 16, "name": "ä"}
 
 
 def digest(
-    values: NDArray[Any], *, name: str = "position", dims: tuple[str, ...] | None = None
+    values: NDArray[Any],
+    *,
+    name: str = "position",
+    dims: tuple[str, ...] | None = None,
 ) -> str:
     """Return the hash of values given in one piece."""
     values = np.asarray(values)
     hasher = VariableHasher(
-        name, values.dtype, dims or tuple("abcdef"[: values.ndim]), values.shape
+        name,
+        values.dtype,
+        dims or tuple("abcdef"[: values.ndim]),
+        values.shape,
     )
     hasher.update(values)
     return hasher.hexdigest()

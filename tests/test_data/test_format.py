@@ -43,7 +43,9 @@ def written(tmp_path: Path) -> tuple[Path, str]:
 
 
 def assert_refused(
-    path: Path, *parts: str, check: Callable[[Path], object] = check_scenario
+    path: Path,
+    *parts: str,
+    check: Callable[[Path], object] = check_scenario,
 ) -> None:
     """Assert that the error of a check has the name of the file and these parts."""
     with pytest.raises(DataError) as caught:
@@ -228,7 +230,10 @@ def test_changed_attributes_are_found(
     ],
 )
 def test_attributes_that_change_the_meaning_are_refused(
-    written: tuple[Path, str], variable: str, name: str, value: object
+    written: tuple[Path, str],
+    variable: str,
+    name: str,
+    value: object,
 ) -> None:
     """The values are the same, yet readers that follow CF would read others."""
     path, content = written
@@ -393,7 +398,9 @@ def _external_link(file: h5py.File) -> None:
     ],
 )
 def test_members_that_other_readers_would_follow_or_show_are_damage(
-    written: tuple[Path, str], change: Callable[[h5py.File], None], words: str
+    written: tuple[Path, str],
+    change: Callable[[h5py.File], None],
+    words: str,
 ) -> None:
     """Links and virtual data sets are not followed, and the members are counted."""
     path, _ = written
@@ -439,7 +446,9 @@ def test_an_unknown_variable_is_an_error(written: tuple[Path, str]) -> None:
 
 
 def write_with_parameters(
-    path: Path, first: dict[str, Any], last: dict[str, Any]
+    path: Path,
+    first: dict[str, Any],
+    last: dict[str, Any],
 ) -> str | None:
     """Write a scenario with parameters before and after its frames."""
     with open_writer(path, frames=4, parameters=first) as file:
@@ -475,7 +484,10 @@ FRAME = np.zeros((8, 2), np.float32)
     ],
 )
 def test_wrong_frames_are_refused(
-    tmp_path: Path, position: Any, velocity: Any, words: str
+    tmp_path: Path,
+    position: Any,
+    velocity: Any,
+    words: str,
 ) -> None:
     """No file appears, not even a temporary one, and an old file survives."""
     path, content = write_scenario(tmp_path, KEY)

@@ -66,7 +66,10 @@ def expansion(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     [(rotation, 0.6, 0.0), (shear, -0.7, 0.0), (expansion, 0.0, 2.0)],
 )
 def test_linear_flows_have_their_rates(
-    placement: Placement, flow: Flow, vorticity: float, divergence: float
+    placement: Placement,
+    flow: Flow,
+    vorticity: float,
+    divergence: float,
 ) -> None:
     """Both are exact to rounding on a lattice; the signs are not swapped."""
     grid = Grid(20, placement)
@@ -265,7 +268,11 @@ def test_the_mask_of_the_truth_decides_for_a_prediction() -> None:
     x = lattice(grid)
     truth = fields_of(x, x, grid)
     prediction = gridding.fields(
-        0.5 * x, x, grid, full=truth.full, counted=truth.counted
+        0.5 * x,
+        x,
+        grid,
+        full=truth.full,
+        counted=truth.counted,
     )
     np.testing.assert_array_equal(
         np.isnan(prediction.vorticity), np.isnan(truth.vorticity)

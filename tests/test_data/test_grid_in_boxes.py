@@ -192,7 +192,10 @@ def test_slopes_of_a_wave_have_no_seam_along_a_periodic_axis() -> None:
     # Central differences of sin(k x) are cos(k x) sin(k h) / h.
     for axis, wave in enumerate(waves):
         slope = slope_along(
-            np.sin(wave * x[..., axis]), axis - 3, grid.spacing, is_periodic=True
+            np.sin(wave * x[..., axis]),
+            axis - 3,
+            grid.spacing,
+            is_periodic=True,
         )
         factor = np.sin(wave * grid.spacing) / grid.spacing
         expected = factor * np.cos(wave * x[..., axis])

@@ -112,7 +112,11 @@ def texts(file: h5py.File) -> None:
 def chunk_bomb(file: h5py.File) -> None:
     """Declare a chunk of 4 MiB that unpacks to 512 MiB, from half a MiB."""
     dataset = file.create_dataset(
-        "x", (1 << 20,), "f4", chunks=(1 << 20,), compression=1
+        "x",
+        (1 << 20,),
+        "f4",
+        chunks=(1 << 20,),
+        compression=1,
     )
     packer = zlib.compressobj(9)
     parts = [packer.compress(bytes(1 << 24)) for _ in range(32)]
@@ -123,7 +127,11 @@ def chunk_bomb(file: h5py.File) -> None:
 def inflated(file: h5py.File) -> None:
     """Store 16 chunks of 32 MiB of zeros each."""
     dataset = file.create_dataset(
-        "x", (1 << 28,), "i2", chunks=(1 << 24,), compression=9
+        "x",
+        (1 << 28,),
+        "i2",
+        chunks=(1 << 24,),
+        compression=9,
     )
     packed = zlib.compress(bytes(1 << 25), 9)
     for first in range(0, 1 << 28, 1 << 24):

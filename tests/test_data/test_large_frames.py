@@ -133,7 +133,10 @@ def identify_process(path: Path, report: Report) -> tuple[str, bool]:
     ],
 )
 def test_worker_processes_read_more_than_a_gigabyte(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first_bytes: int, is_here: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    first_bytes: int,
+    is_here: bool,
 ) -> None:
     """The order of the files stays."""
     paths = {}

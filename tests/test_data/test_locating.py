@@ -91,7 +91,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     folder = tmp_path_factory.mktemp("made")
     np.save(folder / "runs.npy", np.stack(straight_runs(3)))
     return adopt(
-        folder / "runs.npy", output=folder / "own", radius=0.1, frame_interval=0.1
+        folder / "runs.npy",
+        output=folder / "own",
+        radius=0.1,
+        frame_interval=0.1,
     )
 
 

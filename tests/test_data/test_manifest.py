@@ -55,7 +55,9 @@ def make_entry(scenario: int, content: str = "") -> FileEntry:
 
 
 def merge(
-    old: Manifest | None, scenarios: Iterable[int | FileEntry], **changes: Any
+    old: Manifest | None,
+    scenarios: Iterable[int | FileEntry],
+    **changes: Any,
 ) -> Manifest:
     """Return an old manifest with entries merged in, made-up ones for plain ids."""
     entries = []
@@ -252,7 +254,10 @@ def test_a_written_manifest_is_read_back(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_manifest_names_the_key(
-    tmp_path: Path, changes: dict[str, Any], entry_changes: dict[str, str], key: str
+    tmp_path: Path,
+    changes: dict[str, Any],
+    entry_changes: dict[str, str],
+    key: str,
 ) -> None:
     """The error has file, key and fix."""
     path = write_manifest(tmp_path, merge(None, range(5)))

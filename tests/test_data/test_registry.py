@@ -358,7 +358,10 @@ def test_a_solver_that_cannot_be_fed_is_refused_before_work(
             path,
             parts,
             lambda dry_run=dry_run: generate(
-                "fluid", "tiny", dry_run=dry_run, **options
+                "fluid",
+                "tiny",
+                dry_run=dry_run,
+                **options,
             ),
         )
     assert [
@@ -500,7 +503,11 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     ],
 )
 def test_a_broken_package_is_left_out(
-    name: str, source: str, reason: str, plugged: Plug, theirs: str
+    name: str,
+    source: str,
+    reason: str,
+    plugged: Plug,
+    theirs: str,
 ) -> None:
     """A package that cannot be imported or read costs one warning that names it, and
     none of our splits.
@@ -552,7 +559,11 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=False
+        command,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert '"split": "cavity"' in done.stdout

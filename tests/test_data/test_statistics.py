@@ -65,7 +65,10 @@ def test_against_numpy() -> None:
             [np.diff(run, n=order, axis=0).reshape(-1, 2) for run in runs]
         )
         np.testing.assert_allclose(
-            result[f"{name}_mean"], values.mean(axis=0), rtol=1e-7, atol=1e-12
+            result[f"{name}_mean"],
+            values.mean(axis=0),
+            rtol=1e-7,
+            atol=1e-12,
         )
         np.testing.assert_allclose(result[f"{name}_std"], values.std(axis=0), rtol=1e-8)
 

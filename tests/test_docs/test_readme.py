@@ -44,7 +44,12 @@ def run_program(text: str, root: Path, folder: Path) -> str:
     where = {**os.environ, "LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", text]
     done = subprocess.run(
-        command, cwd=folder, env=where, capture_output=True, text=True, check=False
+        command,
+        cwd=folder,
+        env=where,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -228,7 +233,10 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
     result = generate("dam-break", "tiny", subset="test", root=tmp_path)
     assert result.simulated == (3, 4)
     with lagbench.open_split(
-        "dam-break", subset="test", size="tiny", root=tmp_path
+        "dam-break",
+        subset="test",
+        size="tiny",
+        root=tmp_path,
     ) as test:
         height = test.position.sel(space="y").mean("particle")
         assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
@@ -251,7 +259,12 @@ def test_sage_is_a_baseline_and_enstrophy_a_metric(
     run = tmp_path / "run"
     settings = ["training.steps=2"]
     trained = train(
-        "sage", "curl-noise", "tiny", output=run, settings=settings, **options
+        "sage",
+        "curl-noise",
+        "tiny",
+        output=run,
+        settings=settings,
+        **options,
     )
     predicted = predict(trained.weights, tmp_path / "predictions.nc", **options)
     assert predicted.method == "GNS + SAGEConv"

@@ -339,7 +339,9 @@ def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
 
 
 def variable(
-    file: netCDF4.Dataset, shape: tuple[int, ...], kind: str
+    file: netCDF4.Dataset,
+    shape: tuple[int, ...],
+    kind: str,
 ) -> netCDF4.Variable:
     """Return a new variable for positions."""
     names = ("time", "point", "axis")

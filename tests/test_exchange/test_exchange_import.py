@@ -32,7 +32,10 @@ def positions(folder: Path, subset: str = "train") -> np.ndarray:
     "form", ["gns-npz", "lagrangebench-h5", "lagrangebench-h5 --from-walls"]
 )
 def test_an_export_comes_back(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, form: str
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    form: str,
 ) -> None:
     """Every subset has the stored bits again, and the task is the exported one.
 
@@ -198,7 +201,10 @@ def test_what_the_user_says_goes_before_the_metadata(
     given.
     """
     source = write_h5(
-        tmp_path / "in", straight_runs(3, box=3.0), bounds=[[0, 3], [0, 3]], dx=0.2
+        tmp_path / "in",
+        straight_runs(3, box=3.0),
+        bounds=[[0, 3], [0, 3]],
+        dx=0.2,
     )
     arguments = [
         "import",

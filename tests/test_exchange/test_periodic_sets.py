@@ -100,7 +100,9 @@ def ids_of_test(made: LocalSplit) -> dict[int, int]:
 
 
 def score_of(
-    made: LocalSplit, positions: dict[int, NDArray[np.float32]], folder: Path
+    made: LocalSplit,
+    positions: dict[int, NDArray[np.float32]],
+    folder: Path,
 ) -> ScoreCard:
     """Return the scores of predictions."""
     path = folder / "predictions.nc"

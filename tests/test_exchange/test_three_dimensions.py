@@ -115,7 +115,10 @@ def test_predictions_are_ragged_and_valid(made: LocalSplit, tmp_path: Path) -> N
             np.testing.assert_array_equal(frames, position)
     with pytest.raises(lagbench.errors.UsageError):
         lagbench.submission.write(
-            path, {2: truth[3], 3: truth[2]}, split=made.folder, method="swapped"
+            path,
+            {2: truth[3], 3: truth[2]},
+            split=made.folder,
+            method="swapped",
         )
 
 

@@ -40,7 +40,10 @@ print(json.dumps(rows))
 
 
 def make(
-    root: Path, split: str = "cavity", *, scenarios: tuple[int, ...] = (0, 1, 2, 3, 4)
+    root: Path,
+    split: str = "cavity",
+    *,
+    scenarios: tuple[int, ...] = (0, 1, 2, 3, 4),
 ) -> tuple[Size, Manifest]:
     """Write rotating_disc and their manifest."""
     size = registry.load().size(split, "tiny")
@@ -197,7 +200,9 @@ def test_tables_have_as_many_cells_as_their_heads(folder: Path) -> None:
 
 @pytest.mark.parametrize("scenarios", [(0, 1, 2, 3, 4), ()])
 def test_without_matplotlib_or_files_there_are_no_pictures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenarios: tuple[int, ...]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    scenarios: tuple[int, ...],
 ) -> None:
     """The card is written all the same, names the files that are there and links no
     picture.

@@ -68,7 +68,11 @@ def test_bars_are_as_long_as_their_values() -> None:
         draw_bar("none", math.nan),
     ]
     chart = bar_chart(
-        bars, linear(0, 1), label="share", title="title", description="words"
+        bars,
+        linear(0, 1),
+        label="share",
+        title="title",
+        description="words",
     )
     reading = read_html(chart)
     assert not reading.faults

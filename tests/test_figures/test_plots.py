@@ -134,7 +134,11 @@ def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
     """Frames may be missing before, between or behind those that are left."""
     for scenario in (0, 1):
         write_swirl(
-            tmp_path, "fluid", scenario, walls=None, parameters={"family": "disc"}
+            tmp_path,
+            "fluid",
+            scenario,
+            walls=None,
+            parameters={"family": "disc"},
         )
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
         part = data.isel(scenario=0, frame=CUTS[cut])
@@ -303,7 +307,10 @@ def test_arrowheads_point_where_a_wall_slides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("ending", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_vector_pictures_have_the_same_bytes_twice(
-    swirl: Path, tmp_path: Path, ending: str, head: bytes
+    swirl: Path,
+    tmp_path: Path,
+    ending: str,
+    head: bytes,
 ) -> None:
     """PDF and SVG hold no date."""
     first = plot_frame(swirl, 0, tmp_path / f"first.{ending}").read_bytes()

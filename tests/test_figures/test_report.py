@@ -130,12 +130,19 @@ class ScoredFiles:
         root = self.bench.root
         registry = self.bench.registry
         return write_report(
-            folder, self.cards, self.paths, root=root, registry=registry
+            folder,
+            self.cards,
+            self.paths,
+            root=root,
+            registry=registry,
         )
 
 
 def score_methods(
-    bench: ReportBench, folder: Path, *methods: tuple[str, Method], **labels: Any
+    bench: ReportBench,
+    folder: Path,
+    *methods: tuple[str, Method],
+    **labels: Any,
 ) -> ScoredFiles:
     """Submit and score methods by name."""
     cards = []
@@ -257,7 +264,9 @@ def test_markup_is_not_escaped_again() -> None:
 
 
 def test_same_bytes_every_time(
-    home: Path, page: Callable[[str], str], tmp_path: Path
+    home: Path,
+    page: Callable[[str], str],
+    tmp_path: Path,
 ) -> None:
     """The same predictions give the same page; no folder stands in it."""
     bench = make_report_bench(home, "multimaterial")

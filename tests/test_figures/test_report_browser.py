@@ -46,7 +46,10 @@ def report(request: pytest.FixtureRequest, home: Path) -> Path:
 @pytest.mark.parametrize("width", [1280, 390, 320])
 @pytest.mark.parametrize("dark", [False, True])
 def test_page_opens_in_silence(
-    running: Browser, report: Path, width: int, dark: bool
+    running: Browser,
+    report: Path,
+    width: int,
+    dark: bool,
 ) -> None:
     """No message, no request, no sideways scrolling; scheme and focus show."""
     page = running.open(report, width=width, dark=dark)

@@ -78,7 +78,10 @@ def test_equal_hashes_are_told(
 ) -> None:
     """All hashes hold: the verdict says so and nothing is simulated."""
     result = generate(
-        SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right)
+        SPLIT,
+        SIZE,
+        root=copied(),
+        registry=with_measured(unmeasured, right),
     )
     assert result.verdict == "equal to datasets.yaml"
     assert result.simulated == ()
@@ -226,7 +229,11 @@ def test_values_are_hashed_once(
             if not may_hash:
                 patch.setattr("lagbench.make.inventory.check_scenario", refuse)
             result = generate(
-                SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run
+                SPLIT,
+                SIZE,
+                root=root,
+                registry=unmeasured,
+                dry_run=dry_run,
             )
         assert result.kept == (0, 1, 2, 3, 4)
 

@@ -250,7 +250,12 @@ def test_parts_complete_each_other(
     whole hash.
     """
     part = generate(
-        SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured
+        SPLIT,
+        SIZE,
+        subset="test",
+        root=tmp_path,
+        workers=1,
+        registry=unmeasured,
     )
     assert part.simulated == (3, 4)
     assert part.missing == (0, 1, 2)
@@ -309,7 +314,11 @@ def test_files_of_other_parameters_are_made_anew(
         text.replace(old, "velocity_relaxation: {value: 0.003")
     )
     result = generate(
-        SPLIT, SIZE, root=copied(), dry_run=True, registry=load(tmp_path / "own.yaml")
+        SPLIT,
+        SIZE,
+        root=copied(),
+        dry_run=True,
+        registry=load(tmp_path / "own.yaml"),
     )
     assert result.simulated == (0, 1, 2, 3, 4)
     assert result.kept == ()
@@ -322,7 +331,11 @@ def test_a_dry_run_touches_nothing(
     folder.
     """
     result = generate(
-        SPLIT, SIZE, root=tmp_path / "new", dry_run=True, registry=unmeasured
+        SPLIT,
+        SIZE,
+        root=tmp_path / "new",
+        dry_run=True,
+        registry=unmeasured,
     )
     real = sum(len(data) for data in contents(generated.root).values())
     assert real < result.bytes_needed < 2 * real
@@ -362,7 +375,11 @@ def test_batches_start_each_scenario_at_its_own_frame(
     size = load().size("cavity", "tiny")
     assert len({draw_initial_state(size, i).start_frame for i in range(3)}) == 3
     batch = generate(
-        "cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2"
+        "cavity",
+        "tiny",
+        root=tmp_path,
+        device="parallel",
+        scenarios="0-2",
     )
     manifests = [
         manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)
@@ -496,7 +513,11 @@ def test_planning_draws_no_scenario(
     counts = [substep_count(size, scenario) for scenario in size.scenarios]
     assert estimate(size, size.scenarios).substeps == tuple(counts)
     result = generate(
-        "cavity", SIZE, root=tmp_path / "data", dry_run=True, registry=counted_registry
+        "cavity",
+        SIZE,
+        root=tmp_path / "data",
+        dry_run=True,
+        registry=counted_registry,
     )
     assert result.simulated == size.scenarios
     assert draw_log.read_text() == ""
@@ -571,7 +592,12 @@ def test_a_registry_of_ones_own_is_all_that_counts(
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate(
-        "own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own
+        "own-noise",
+        SIZE,
+        scenarios="3",
+        root=tmp_path,
+        workers=1,
+        registry=own,
     )
     assert "# Noise of our own" in (result.folder / "README.md").read_text()
     assert all((result.folder / name).stat().st_size > 1000 for name in PICTURES)
@@ -605,7 +631,10 @@ print(peak, sorted(heavy))
     ],
 )
 def test_a_worker_stays_small(
-    split: str, scenario: int, unmeasured_path: Path, tmp_path: Path
+    split: str,
+    scenario: int,
+    unmeasured_path: Path,
+    tmp_path: Path,
 ) -> None:
     """Simulating and writing three frames of the full size takes at most 400 MB and no
     heavy library.
@@ -620,7 +649,11 @@ def test_a_worker_stays_small(
         str(tmp_path),
     ]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=300, check=True
+        command,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
     )
     kilobytes, heavy = done.stdout.splitlines()[-1].split(" ", 1)
     assert int(kilobytes) <= 400_000

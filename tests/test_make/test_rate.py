@@ -210,7 +210,11 @@ def test_a_cache_that_cannot_be_written_is_no_loss(
     """
     cache.write_text("a file")
     result = generate(
-        SPLIT, SIZE, scenarios="0", root=tmp_path / "root", registry=unmeasured
+        SPLIT,
+        SIZE,
+        scenarios="0",
+        root=tmp_path / "root",
+        registry=unmeasured,
     )
     assert result.simulated == (0,)
     cache.unlink()

@@ -170,7 +170,10 @@ def described(**attributes: object) -> Callable[[Path], None]:
     ],
 )
 def test_harm_is_named(
-    harm: Callable[[Path], object], words: str, copied: Copy, measured: Registry
+    harm: Callable[[Path], object],
+    words: str,
+    copied: Copy,
+    measured: Registry,
 ) -> None:
     """A bit flipped, a file cut, changed, to be read otherwise, or of another scenario:
     exit code 4.
@@ -345,7 +348,12 @@ def test_simulating_anew_is_identical(
 ) -> None:
     """First and last scenario, simulated anew, have the hashes of their files."""
     result = verify(
-        SPLIT, SIZE, root=generated.root, regenerate=2, workers=2, registry=measured
+        SPLIT,
+        SIZE,
+        root=generated.root,
+        regenerate=2,
+        workers=2,
+        registry=measured,
     )
     assert result.regenerated == {0: "identical", 4: "identical"}
     result.check()
@@ -365,7 +373,12 @@ def test_simulating_anew_needs_no_file_but_a_hash(
     }
     for word, registry in words.items():
         result = verify(
-            SPLIT, SIZE, root=tmp_path, scenarios="2", regenerate=1, registry=registry
+            SPLIT,
+            SIZE,
+            root=tmp_path,
+            scenarios="2",
+            regenerate=1,
+            registry=registry,
         )
         assert result.regenerated == {2: word}
     with pytest.raises(DataError) as caught:

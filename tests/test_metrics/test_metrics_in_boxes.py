@@ -57,7 +57,11 @@ def scenario_in(box: Box, position: Floats, *, material: int = 0) -> Scenario:
 
 
 def pair_in(
-    box: Box, position: Floats, *, velocity: ArrayLike = 0.0, shift: ArrayLike = 0.0
+    box: Box,
+    position: Floats,
+    *,
+    velocity: ArrayLike = 0.0,
+    shift: ArrayLike = 0.0,
 ) -> FramePair:
     """Return a pair whose prediction is the truth moved by a shift."""
     scenario = scenario_in(box, position)

@@ -299,7 +299,12 @@ def test_connectivity_speaks_of_prediction_and_truth() -> None:
     """
     x = 0.2 * lattice(6)
     pair = pair_of(
-        x, 0 * x, 0 * x, predicted_position=4 * x, material=[1] * 36, materials=ALL
+        x,
+        0 * x,
+        0 * x,
+        predicted_position=4 * x,
+        material=[1] * 36,
+        materials=ALL,
     )
     assert measured(pair, "connectivity", "connectivity_true") == [0.0, 1.0]
     fluid = pair_of(x, 0 * x, 0 * x, material=[0] * 18 + [2] * 18, materials=ALL)

@@ -134,7 +134,10 @@ def test_momentum_by_hand() -> None:
     """
     u = np.array([[3.0, 0.0], [0.0, 4.0]])
     found = alone(
-        "momentum_error", [[0.3, 0.5], [0.7, 0.5]], u, u + np.array([0.3, 0.4])
+        "momentum_error",
+        [[0.3, 0.5], [0.7, 0.5]],
+        u,
+        u + np.array([0.3, 0.4]),
     )
     assert found == pytest.approx(1.0 / 7.0)
     x = lattice(12)

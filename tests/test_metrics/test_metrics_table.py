@@ -172,7 +172,9 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
     ],
 )
 def test_means_over_frames_come_before_those_over_scenarios(
-    values: dict[int, tuple[float, float]], mean: float, undefined: tuple[int, ...]
+    values: dict[int, tuple[float, float]],
+    mean: float,
+    undefined: tuple[int, ...],
 ) -> None:
     """Undefined scenarios are left out; the interval is the bootstrap of the scenarios'
     values.

@@ -56,7 +56,9 @@ def first_scenario(generated: GenerationResult) -> Path:
 
 @pytest.mark.parametrize("make", REFUSED, ids=lambda make: make.__name__)
 def test_a_hostile_file_is_refused(
-    make: Callable[[Path], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Callable[[Path], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its checks name the reason, and nothing of it is run.
 
@@ -76,7 +78,9 @@ def test_a_hostile_file_is_refused(
 
 @pytest.mark.parametrize("make", STOPPED, ids=lambda make: make.__name__)
 def test_a_greedy_model_is_stopped(
-    make: Callable[[Path], Path], tmp_path: Path, generated: GenerationResult
+    make: Callable[[Path], Path],
+    tmp_path: Path,
+    generated: GenerationResult,
 ) -> None:
     """Memory and processor time are bounded, whatever the graph computes."""
     model = opened(make(tmp_path / "model.onnx"), generated)
@@ -121,7 +125,10 @@ def test_a_model_predicts_what_its_graph_says(
     step = given[-1] - given[-2]
     frames = np.arange(1, SIZE.task.horizon + 1)[:, None, None]
     np.testing.assert_allclose(
-        rollout.position, given[-1] + frames * step, rtol=0, atol=2e-5
+        rollout.position,
+        given[-1] + frames * step,
+        rtol=0,
+        atol=2e-5,
     )
     assert rollout.diverged_at is None
 

@@ -67,7 +67,10 @@ def publish(folder: Path, values: list[float], *, method: str, **changes: Any) -
 
 
 def publish_seeds(
-    folder: Path, rows: Iterable[Iterable[float]], method: str, **changes: Any
+    folder: Path,
+    rows: Iterable[Iterable[float]],
+    method: str,
+    **changes: Any,
 ) -> Path:
     """Write a folder of the seeds of a method and return it."""
     for seed, values in enumerate(rows):
@@ -202,7 +205,10 @@ def test_the_table_of_means_counts_undefined_frames(tmp_path: Path) -> None:
     ],
 )
 def test_other_data_are_not_compared(
-    tmp_path: Path, changes: dict[str, str], error: type[Exception], word: str
+    tmp_path: Path,
+    changes: dict[str, str],
+    error: type[Exception],
+    word: str,
 ) -> None:
     """The error names what differs."""
     a = publish(tmp_path, [1.0] * 6, method="a")
@@ -450,10 +456,16 @@ def test_chosen_metrics_come_after_the_ranking_metric(scored: dict[str, Path]) -
 
 def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
     a = publish(
-        tmp_path / "a", [1, 2, 3, 4, 5, 6], method="toy", predictions_sha256="a"
+        tmp_path / "a",
+        [1, 2, 3, 4, 5, 6],
+        method="toy",
+        predictions_sha256="a",
     )
     b = publish(
-        tmp_path / "b", [2, 3, 4, 5, 6, 8], method="toy", predictions_sha256="b"
+        tmp_path / "b",
+        [2, 3, 4, 5, 6, 8],
+        method="toy",
+        predictions_sha256="b",
     )
     result = compare(a, b)
     assert result.first == "toy (1)"
@@ -614,7 +626,9 @@ def test_wide_tables_come_in_blocks() -> None:
 
 
 def test_metrics_that_cannot_be_loaded(
-    run: Callable[..., Result], tmp_path: Path, package: Callable[..., Path]
+    run: Callable[..., Result],
+    tmp_path: Path,
+    package: Callable[..., Path],
 ) -> None:
     """The error names the entry point, not the file of scores."""
     package("metrics", "broken_metric:METRICS", "raise KeyError('mine')\n")
@@ -663,7 +677,11 @@ def test_a_name_that_is_too_long_is_unreadable(tmp_path: Path, suffix: str) -> N
     ],
 )
 def test_lines_say_how_much_better_a_submission_is(
-    bench: ScoreBench, tmp_path: Path, predict: Any, row: int, word: str
+    bench: ScoreBench,
+    tmp_path: Path,
+    predict: Any,
+    row: int,
+    word: str,
 ) -> None:
     """The number is the size of the difference, and the word its sign."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))

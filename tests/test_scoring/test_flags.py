@@ -36,7 +36,10 @@ def trace_of(truth: Floats, prediction: Floats) -> Trace:
 
 
 def make_trace(
-    error: Sequence[float], *, cosine: float = 1.0, motion: float = 1.0
+    error: Sequence[float],
+    *,
+    cosine: float = 1.0,
+    motion: float = 1.0,
 ) -> Trace:
     """Return a trace with these RMS errors and one cosine between neighbours.
 

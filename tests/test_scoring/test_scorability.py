@@ -94,11 +94,17 @@ def undefined_warnings(card: ScoreCard) -> list[Any]:
     ],
 )
 def test_the_proposed_grid_makes_the_score_defined(
-    tmp_path: Path, side: int, cells: int, word: str
+    tmp_path: Path,
+    side: int,
+    cells: int,
+    word: str,
 ) -> None:
     """The warning counts scenarios and nodes and names a grid for split.yaml."""
     split = adopt_trajectories(
-        tmp_path, four_lattices(side), cells=cells, full_box=True
+        tmp_path,
+        four_lattices(side),
+        cells=cells,
+        full_box=True,
     )
     predictions = tmp_path / "p.nc"
     lagbench.template(str(split.folder), output=predictions)
@@ -204,7 +210,10 @@ def test_a_short_scenario_is_a_reason(tmp_path: Path) -> None:
     ],
 )
 def test_a_training_begins_with_the_warning(
-    tmp_path: Path, cells: int, is_warned: bool, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    cells: int,
+    is_warned: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """There is one warning, with a grid that helps, or none without a reason."""
 

@@ -65,7 +65,10 @@ def test_the_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
     ],
 )
 def test_references_are_what_a_user_would_submit(
-    bench: ScoreBench, tmp_path: Path, row: str, predict: Any
+    bench: ScoreBench,
+    tmp_path: Path,
+    row: str,
+    predict: Any,
 ) -> None:
     """A reference written as a predictions.nc scores exactly like the scorer's row."""
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
@@ -193,7 +196,10 @@ def assert_every_frame_counted_once(reports: list[Progress], bench: ScoreBench) 
 
 
 def test_workers_write_the_same_bytes(
-    bench: ScoreBench, persistence_card: ScoreCard, predictions: Path, tmp_path: Path
+    bench: ScoreBench,
+    persistence_card: ScoreCard,
+    predictions: Path,
+    tmp_path: Path,
 ) -> None:
     """Another folder does not matter either; progress arrives from the workers."""
     reports: list[Progress] = []
@@ -208,7 +214,10 @@ def test_workers_write_the_same_bytes(
 
 
 def test_the_order_of_scenarios_does_not_change_the_bytes(
-    bench: ScoreBench, persistence_card: ScoreCard, predictions: Path, tmp_path: Path
+    bench: ScoreBench,
+    persistence_card: ScoreCard,
+    predictions: Path,
+    tmp_path: Path,
 ) -> None:
     reordered = Path(shutil.copy(predictions, tmp_path))
     with h5py.File(reordered, "r+") as file:
@@ -255,7 +264,10 @@ def test_a_validated_file_is_not_validated_again(
 ) -> None:
     """The result of its validation gives the same card; that of another is refused."""
     validated = validate(
-        predictions, root=bench.root, require_truth=True, registry=bench.registry
+        predictions,
+        root=bench.root,
+        require_truth=True,
+        registry=bench.registry,
     )
     monkeypatch.setattr(scoring, "validate", None)
     card = bench.evaluate(predictions, validated=validated)

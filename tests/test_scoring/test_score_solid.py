@@ -91,7 +91,11 @@ def test_truth_is_perfect_and_references_are_measured(
     lagbench.submission.write(path, {2: truth}, split=made.folder, method="truth")
     validated = lagbench.validate(path, root=root, isolated=False)
     card = lagbench.score(
-        path, root=root, output_dir=tmp_path, workers=1, validated=validated
+        path,
+        root=root,
+        output_dir=tmp_path,
+        workers=1,
+        validated=validated,
     )
     assert card.submission["vorticity_nrmse"].mean == 0.0
     assert card.submission["position_rmse"].mean == 0.0

@@ -34,7 +34,12 @@ def write_still(path: Path, root: Path, subset: str, labelled: str) -> Path:
     size = load().size(SPLIT, "tiny").scored_on(subset)
     truth = Truth(size, root)
     writer = PredictionsWriter(
-        path, split=SPLIT, size="tiny", method="still", subset=subset, root=root
+        path,
+        split=SPLIT,
+        size="tiny",
+        method="still",
+        subset=subset,
+        root=root,
     )
     with writer:
         for scenario in size.scored_scenarios:

@@ -49,7 +49,9 @@ from lagbench.submission import Header
 
 
 def scored(
-    values: list[float], metric: str = "vorticity_rmse", first: int = 0
+    values: list[float],
+    metric: str = "vorticity_rmse",
+    first: int = 0,
 ) -> Score:
     """Return a score with these values over scenarios."""
     ids = tuple(range(first, first + len(values)))

@@ -26,7 +26,10 @@ def ragged(tmp_path: Path) -> Path:
     """A root whose cavity tiny test scenarios differ in frames and particles."""
     for place, scenario in enumerate(TEST_IDS):
         write_scenario(
-            tmp_path, make_key(scenario), frames=5 - place, particles=6 + place
+            tmp_path,
+            make_key(scenario),
+            frames=5 - place,
+            particles=6 + place,
         )
     return tmp_path
 
@@ -187,7 +190,11 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
     ],
 )
 def test_unknown_names_offer_the_nearest(
-    tmp_path: Path, split: str, size: str, subset: Any, hint: str
+    tmp_path: Path,
+    split: str,
+    size: str,
+    subset: Any,
+    hint: str,
 ) -> None:
     """A typing error names the nearest known word."""
     with pytest.raises(UsageError, match=hint):

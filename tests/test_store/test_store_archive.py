@@ -264,7 +264,11 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
     ],
 )
 def test_a_lying_server_is_named(
-    server: Mirror, packed: Path, here: Path, fault: str, error: type[LagbenchError]
+    server: Mirror,
+    packed: Path,
+    here: Path,
+    fault: str,
+    error: type[LagbenchError],
 ) -> None:
     """Files that were right stay, and the next command completes them."""
     server.faults = {".tar": fault}

@@ -65,7 +65,10 @@ def left(root: Path) -> set[str]:
 
 
 def test_all_files_come_and_are_right(
-    store: Store, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch
+    store: Store,
+    here: Path,
+    original: LocalSplit,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The data set is complete and equals the original; nothing temporary is left.
 
@@ -173,7 +176,10 @@ def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
         here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9))
     )
     other = adopt(
-        here / "runs.npy", output=here / "other" / "own", radius=0.1, frame_interval=0.1
+        here / "runs.npy",
+        output=here / "other" / "own",
+        radius=0.1,
+        frame_interval=0.1,
     )
     of_another = (other.folder / "full/v1/manifest.json").read_bytes()
     for text, error in (
@@ -238,7 +244,10 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
     ],
 )
 def test_each_lie_has_its_error_and_leaves_nothing(
-    server: Mirror, here: Path, faults: dict[str, str], error: type[LagbenchError]
+    server: Mirror,
+    here: Path,
+    faults: dict[str, str],
+    error: type[LagbenchError],
 ) -> None:
     """No file of that name, no temporary one; the message names the address; other
     files stay right.
@@ -259,7 +268,10 @@ def test_each_lie_has_its_error_and_leaves_nothing(
     ("fault", "useful"), [("drops always", 0), ("drops and starts over", 1)]
 )
 def test_a_line_that_stays_broken(
-    server: Mirror, here: Path, fault: str, useful: int
+    server: Mirror,
+    here: Path,
+    fault: str,
+    useful: int,
 ) -> None:
     """A connection that brings it no further five times is given up, with an error that
     names the address.
@@ -275,7 +287,11 @@ def test_a_line_that_stays_broken(
     ("name", "fault"), [(LIST, "slow"), (FIRST, "slow"), (FIRST, "drops")]
 )
 def test_an_interrupted_download_goes_on(
-    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch, name: str, fault: str
+    server: Mirror,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    fault: str,
 ) -> None:
     """What came before the connection was lost, or given up, is not asked for again by
     the next command.
@@ -313,7 +329,10 @@ def test_an_interrupted_download_goes_on(
     ],
 )
 def test_no_generate_stops_where_the_store_does(
-    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+    server: Mirror,
+    here: Path,
+    fault: str,
+    error: type[LagbenchError],
 ) -> None:
     """What the store has not, or does not give, is an error when nothing may be
     simulated.
@@ -366,7 +385,10 @@ def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
     for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
         with pytest.raises(objects.NotInStoreError):
             download(
-                "own", root=here, mirror=f"{server.url}/{typed}", or_generate=False
+                "own",
+                root=here,
+                mirror=f"{server.url}/{typed}",
+                or_generate=False,
             )
         assert server.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
 

@@ -116,7 +116,10 @@ def test_scenarios_that_the_store_lacks_are_an_error(
 
 
 def test_scores_are_those_of_the_folder(
-    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+    url: str,
+    generated: GenerationResult,
+    tiny: Registry,
+    tmp_path: Path,
 ) -> None:
     """They need the test subset alone.
 
@@ -154,7 +157,10 @@ def test_baselines_read_from_a_store(
 
 
 def test_an_export_from_a_store_has_the_same_bytes(
-    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+    url: str,
+    generated: GenerationResult,
+    tiny: Registry,
+    tmp_path: Path,
 ) -> None:
     """It needs all subsets."""
 
@@ -241,7 +247,11 @@ def test_other_content_is_refused(folder: Store, tiny: Registry, damage: str) ->
     ],
 )
 def test_a_wrong_manifest_is_refused(
-    folder: Store, tmp_path: Path, key: str, value: object, error: type[DataError]
+    folder: Store,
+    tmp_path: Path,
+    key: str,
+    value: object,
+    error: type[DataError],
 ) -> None:
     """Other hashes than those of datasets.yaml, endless files, names that lead away.
 

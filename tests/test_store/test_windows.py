@@ -84,7 +84,10 @@ def train(root: Path, registry: Registry) -> Open:
     """A function that opens train with windows of 6 + 1 frames by default."""
 
     def open_windows(
-        folder: Path = root, *, subset: str | list[str] = "train", **changes: int
+        folder: Path = root,
+        *,
+        subset: str | list[str] = "train",
+        **changes: int,
     ) -> WindowDataset:
         options: dict[str, Any] = {"history": 6, "future": 1} | changes
         return WindowDataset(
@@ -253,7 +256,11 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
         frames = size.frame_count(scenario)
         write_scenario(tmp_path, key, frames=frames, walls=False)
     data = lagbench.windows(
-        "fluid", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
+        "fluid",
+        subset="valid",
+        size="tiny",
+        root=tmp_path,
+        registry=unmeasured,
     )
     assert data.history == 2
     assert data.gravity == 2.5
@@ -261,7 +268,11 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
 
 
 def write_viscous(
-    folder: Path, registry: Registry, *, split: str, stated: dict[int, object]
+    folder: Path,
+    registry: Registry,
+    *,
+    split: str,
+    stated: dict[int, object],
 ) -> None:
     """Write the valid subset of a tiny split, some scenarios with a viscosity."""
     size = registry.size(split, "tiny")
@@ -303,7 +314,11 @@ def test_windows_have_the_viscosity_of_the_data_set_where_files_state_none(
     """That of curl noise is the effective one of its task."""
     write_viscous(tmp_path, unmeasured, split="curl-noise", stated={})
     data = lagbench.windows(
-        "curl-noise", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
+        "curl-noise",
+        subset="valid",
+        size="tiny",
+        root=tmp_path,
+        registry=unmeasured,
     )
     task = unmeasured.size("curl-noise", "tiny").task
     assert task.effective_viscosity is not None
@@ -320,7 +335,11 @@ def test_a_viscosity_that_is_none_is_damage(
     with h5py.File(path, "r+") as file:
         file.attrs["viscosity"] = stated
     data = lagbench.windows(
-        "cavity", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
+        "cavity",
+        subset="valid",
+        size="tiny",
+        root=tmp_path,
+        registry=unmeasured,
     )
     with pytest.raises(DataError) as caught:
         data[0]
@@ -570,7 +589,10 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
     read = store_windows.FrameStore._read
 
     def read_and_count(
-        store: store_windows.FrameStore, scenario: int, first: int, last: int
+        store: store_windows.FrameStore,
+        scenario: int,
+        first: int,
+        last: int,
     ) -> object:
         frames_read.extend(range(first, last))
         return read(store, scenario, first, last)
@@ -681,7 +703,10 @@ def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
     ],
 )
 def test_options_without_data_are_refused(
-    root: Path, registry: Registry, options: dict[str, object], words: str
+    root: Path,
+    registry: Registry,
+    options: dict[str, object],
+    words: str,
 ) -> None:
     """The error says what to do."""
     all_options: dict[str, Any] = {
@@ -914,7 +939,12 @@ def test_predictions_that_are_no_numbers_are_refused(
     with pytest.raises(UsageError) as caught:
         next(
             predict(
-                step, "cavity", size="tiny", root=root, registry=registry, history=2
+                step,
+                "cavity",
+                size="tiny",
+                root=root,
+                registry=registry,
+                history=2,
             )
         )
     assert "scenario 4" in str(caught.value.where)

@@ -131,7 +131,10 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     write_entry(board, parameters=7, cost=cost)
 
     sources = Sources(
-        board=board, weights=weights, runs=plan.runs, registry=plan.described
+        board=board,
+        weights=weights,
+        runs=plan.runs,
+        registry=plan.described,
     )
     methods = SplitResults(sources, SPLIT, SIZE).methods
     committed = methods["gns"]
@@ -299,7 +302,10 @@ def test_what_is_missing_is_listed_with_its_command(
 
 @pytest.mark.parametrize("floor", [False, True])
 def test_the_page_works_without_entries(
-    plan: Plan, sources: Sources, tmp_path: Path, floor: bool
+    plan: Plan,
+    sources: Sources,
+    tmp_path: Path,
+    floor: bool,
 ) -> None:
     """Nothing on the board, or floors alone: a page without claims that names the
     command for every size.
@@ -360,7 +366,10 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
     scenario = cavity.size.subsets["test"][0]
     truth = cavity.truth(scenario).astype(float)
     with open_rollouts(
-        plan, SPLIT, scenario=scenario, names=("supergat", "gns", "mlp")
+        plan,
+        SPLIT,
+        scenario=scenario,
+        names=("supergat", "gns", "mlp"),
     ) as rollouts:
         assert tuple(rollouts.predictions) == ("supergat", "gns")  # mlp has no run
         assert np.array_equal(rollouts.position("gns", 5), truth[5])  # given
@@ -372,7 +381,10 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
         assert np.allclose(scene.displacement, truth[6] - truth[5], atol=0)
         told = pair.truth.scenario
         again = fields(
-            truth[15], truth[15] - truth[14], told.config.grid, full=told.full_weight
+            truth[15],
+            truth[15] - truth[14],
+            told.config.grid,
+            full=told.full_weight,
         )
         assert np.array_equal(
             again.vorticity, pair.truth.fields.vorticity, equal_nan=True
@@ -487,7 +499,10 @@ def test_a_reader_that_leaves_stops_nothing() -> None:
     """``--list | head -1``: exit code 0 and no traceback."""
     words = [sys.executable, "-m", "studies.thesis", "--list"]
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as child:
         child.stdout.close()
         assert child.stderr.read() == ""
@@ -495,7 +510,10 @@ def test_a_reader_that_leaves_stops_nothing() -> None:
 
 
 def test_what_fails_is_said_and_the_rest_is_made(
-    plan: Plan, cavity: ScoreBench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    plan: Plan,
+    cavity: ScoreBench,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Without the data of another split its tables fail with exit code 4; others are
     written.

@@ -127,7 +127,10 @@ MUTATIONS = st.lists(
 
 
 def check_mutation(
-    bench: Bench, peaks: list[float], changes: list[tuple[float, int]], keep: float
+    bench: Bench,
+    peaks: list[float],
+    changes: list[tuple[float, int]],
+    keep: float,
 ) -> None:
     """A valid file with bytes changed and its end cut off passes or fails named checks,
     in bounds.

@@ -113,7 +113,10 @@ def test_the_template_is_the_last_given_frame_repeated(
     assert again.path.read_bytes() == result.path.read_bytes()
     with pytest.raises(DataError) as caught:
         template(
-            "cavity", "tiny", output=tmp_path / "t.nc", **{**made, "root": tmp_path}
+            "cavity",
+            "tiny",
+            output=tmp_path / "t.nc",
+            **{**made, "root": tmp_path},
         )
     assert caught.value.where.endswith("cavity/tiny/v2/test")
     assert not (tmp_path / "t.nc").exists()
@@ -195,7 +198,10 @@ def _nan(values: np.ndarray) -> np.ndarray:
     ],
 )
 def test_wrong_arrays_and_labels_are_refused_and_leave_no_file(
-    bench: Bench, values: Any, labels: dict[str, Any], place: str
+    bench: Bench,
+    values: Any,
+    labels: dict[str, Any],
+    place: str,
 ) -> None:
     """Missing, unknown, misshapen, no numbers: the error says where, what was expected
     and how to mend it; no file is left.
@@ -232,7 +238,10 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
 @pytest.mark.parametrize("size", [0, 5_000])
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_full_disk_is_said(
-    bench: Bench, tmp_path: Path, size: int, whole: bool
+    bench: Bench,
+    tmp_path: Path,
+    size: int,
+    whole: bool,
 ) -> None:
     """Wherever the disk fills up, that is said and nothing is left, whatever the values
     lack.
