@@ -8,16 +8,11 @@ from typing import Annotated
 import typer
 
 from lagbench.scoring.compare import compare
-from lagbench.scoring.tables import LEGEND as ARROW_LEGEND
-from lagbench.scoring.tables import comparison_tables
+from lagbench.scoring.tables import comparison_lines, comparison_tables
 
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption, option
 from .output import print_json, print_line, print_tables
-
-LEGEND = (
-    f"{ARROW_LEGEND}; †: so many frames without a value; "
-    "open: the test finds no difference at 5 %"
-)
+from .validate import ExpectedSplitOption
 
 
 def compare_command(
@@ -41,6 +36,7 @@ def compare_command(
     metric: Annotated[
         list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
     ] = None,
+    split: ExpectedSplitOption = None,
     board: Annotated[
         Path | None,
         option(
@@ -59,7 +55,13 @@ def compare_command(
     The comparison runs over the test scenarios, and over seeds where there are several.
     """
     result = compare(
-        first, second, metrics=metric or (), board=board, root=root, workers=workers
+        first,
+        second,
+        metrics=metric or (),
+        split=split,
+        board=board,
+        root=root,
+        workers=workers,
     )
     if as_json:
         print_json(result.as_json())
@@ -67,6 +69,8 @@ def compare_command(
         if result.namesakes:
             print_line(f"{result.first}: {first}")
             print_line(f"{result.second}: {second}")
-        print_tables(comparison_tables(result, every=every or bool(metric)))
-        print_line(LEGEND)
+        every = every or bool(metric)
+        print_tables(comparison_tables(result, every=every), is_narrow=True)
+        for line in comparison_lines(result, every=every):
+            print_line(line)
         print_line(result.verdict)

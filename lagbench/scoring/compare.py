@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lagbench.data.local import locate_split
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     ChecksFailedError,
@@ -146,12 +147,13 @@ class ComparisonResult:
     @property
     def _verdict_of_few(self) -> str:
         """The verdict of too few scenarios for a p-value."""
+        verb = "decides" if self.scenarios == 1 else "decide"
         verdict = (
-            f"{format_count(self.scenarios, 'scenario')}: no significance is claimed "
-            f"under {FEWEST_SCENARIOS}"
+            f"{format_count(self.scenarios, 'scenario')} {verb} nothing: a test needs "
+            f"{FEWEST_SCENARIOS}"
         )
         if self.scenarios < FEWEST_FOR_INTERVAL:
-            return f"{verdict}, no interval under {FEWEST_FOR_INTERVAL}"
+            return f"{verdict}, an interval {FEWEST_FOR_INTERVAL}"
         return f"{verdict}; read the intervals"
 
     @property
@@ -216,6 +218,7 @@ def _metric_as_json(comparison: MetricComparison) -> dict[str, Any]:
 class _ScoringOptions:
     """Options with which predictions are scored."""
 
+    split: str | None  # name of the split to which both must belong
     root: str | Path | None
     workers: int | None
     registry: Registry | None
@@ -228,6 +231,7 @@ def compare(
     second: str | Path,
     *,
     metrics: Collection[str] = (),
+    split: str | Path | None = None,
     board: str | Path | None = None,
     root: str | Path | None = None,
     workers: int | None = None,
@@ -250,6 +254,8 @@ def compare(
             data set. If both have that name, the reference is meant.
         metrics: metrics that are compared beside the ranking metric, which always is;
             all that judge by default.
+        split: the split to which both must belong, or the path of a local split's
+            folder; the one that they name when None.
         board: folder of the leaderboard; ``leaderboard`` in the working folder when
             None, else that of the clone.
         root: folder of all data sets, where predictions are to be scored.
@@ -257,11 +263,14 @@ def compare(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: an unknown metric, reference or entry, no leaderboard where one is
-            named, or the two belong to different splits or sizes.
+        UsageError: an unknown metric, reference, entry or split, no leaderboard where
+            one is named, or the two belong to different splits or sizes.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root, registry=registry)
     entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)
@@ -281,7 +290,11 @@ def compare(
             _require_entry(str(second), split, size, entries=entries)
 
     scoring = _ScoringOptions(
-        root=root, workers=workers, registry=registry, examine=require_second
+        split=expected_split,
+        root=root,
+        workers=workers,
+        registry=registry,
+        examine=require_second,
     )
     one = _load_contestant(first, scoring)
     is_reference = is_bare and str(second) in one.references
@@ -505,6 +518,7 @@ def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant
     seeds = []
     for path in _seed_files(Path(source)):
         scores = _load_scores(path, scoring)
+        _check_split(path, scores.identity, scoring.split)
         if SUBMISSION not in scores.scores:
             rows = ", ".join(map(repr, list(scores.scores)[:10]))
             raise _incomplete(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
@@ -527,6 +541,21 @@ def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant
         ranking=first.ranking,
         scores=by_metric,
         references=references,
+    )
+
+
+def _check_split(
+    path: Path, identity: Mapping[str, str], expected_split: str | None
+) -> None:
+    """Refuse scores of another split than the expected one."""
+    if expected_split is None or identity["split"] == expected_split:
+        return
+    raise UsageError(
+        "the scores are of another split",
+        where=str(path),
+        expected=expected_split,
+        got=ascii(identity["split"]),
+        fix="name that split, or leave --split out",
     )
 
 
@@ -617,6 +646,7 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
     try:
         card = score(
             path,
+            split=scoring.split,
             root=scoring.root,
             workers=scoring.workers,
             registry=scoring.registry,

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from lagbench.errors import format_count
 from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
 
@@ -41,6 +42,12 @@ ARROWS = {
 """Marks of the better side of a metric, behind its name."""
 
 LEGEND = "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
+
+CHANCE = "?"
+"""Mark of a difference that may be chance, behind better or worse."""
+
+TOO_FEW = "too few"
+"""What stands instead of better or worse where scenarios decide nothing."""
 
 FLAG_STATES = {True: "raised", False: "not raised", None: "unknown"}
 
@@ -260,18 +267,13 @@ def _against(card: ScoreCard, row: str) -> str:
 def comparison_tables(
     result: ComparisonResult, *, every: bool = False
 ) -> Iterator[Table]:
-    """Yield which method is better, then means.
+    """Yield which method is better, then means with their units.
 
     The difference is that of the loss: below 0 where the first method is better, also
     where more of the metric is better. With ``every`` all metrics are shown, not only
     the chosen ones.
     """
-    chosen = (result.ranking, *CHOSEN)
-    shown = []
-    for name, comparison in result.metrics.items():
-        if every or name in chosen:
-            shown.append(comparison)
-
+    shown = _shown_metrics(result, every=every)
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
     yield Table(
         title,
@@ -285,20 +287,50 @@ def comparison_tables(
     )
 
 
+def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterator[str]:
+    """Yield the lines below the tables, which explain the marks that these have."""
+    yield LEGEND
+    shown = _shown_metrics(result, every=every)
+    if any(any(comparison.undefined) for comparison in shown):
+        yield "†: so many frames without a value"
+    sides = [_side(comparison) for comparison in shown]
+    if any(side.endswith(CHANCE) for side in sides):
+        yield f"{CHANCE}: the test finds no difference at 5 %"
+    if TOO_FEW in sides:
+        yield f"{TOO_FEW}: under {FEWEST_SCENARIOS} scenarios nothing is decided"
+
+
+def _shown_metrics(result: ComparisonResult, *, every: bool) -> list[MetricComparison]:
+    """Return the metrics of the tables: the chosen ones, or all."""
+    chosen = (result.ranking, *CHOSEN)
+    shown = []
+    for name, comparison in result.metrics.items():
+        if every or name in chosen:
+            shown.append(comparison)
+    return shown
+
+
 def _difference_row(comparison: MetricComparison) -> tuple[str, ...]:
+    """Return a row without the unit, for four columns to fit a terminal."""
     test = comparison.test
     p = "-"
     if not math.isnan(test.p):
         p = f"{test.p:.3g}"
     difference = _with_interval(test.difference, test.interval)
-    return (_label(comparison.metric), _side(comparison), difference, p)
+    metric = comparison.metric
+    label = f"{metric.name}{ARROWS[metric.direction]}"
+    return (label, _side(comparison), difference, p)
 
 
 def _side(comparison: MetricComparison) -> str:
     """Return whether the first method is better, and whether that may be chance."""
     side = comparison.side
-    if side in ("better", "worse") and not comparison.test.significant:
-        return f"{side}, open"
+    if side not in ("better", "worse"):
+        return side
+    if len(comparison.test.scenarios) < FEWEST_SCENARIOS:
+        return TOO_FEW
+    if not comparison.test.significant:
+        return f"{side}{CHANCE}"
     return side
 
 

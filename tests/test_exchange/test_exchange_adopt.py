@@ -154,6 +154,24 @@ def test_a_local_split_is_verified_templated_and_scored(
     assert card.header.split == "mine"
 
 
+def test_predictions_for_a_local_split_are_compared(
+    own: LocalSplit, tmp_path: Path
+) -> None:
+    """The split is named as in score: by its folder, without a root."""
+    target = tmp_path / "predictions.nc"
+    lagbench.template(str(own.folder), output=target)
+    result = lagbench.compare(target, "persistence", split=f"{own.folder}/")
+    assert (result.split, result.second) == ("mine", "persistence")
+
+    lagbench.score(target, split=str(own.folder), output_dir=tmp_path)
+    scores = tmp_path / "scores.json"
+    assert lagbench.compare(scores, "persistence", split=own.folder).split == "mine"
+    with pytest.raises(UsageError) as caught:
+        lagbench.compare(scores, "persistence", split="cavity")
+    assert caught.value.where == str(scores)
+    assert caught.value.expected == "cavity"
+
+
 def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
     """Each subset ends with all of its trajectories written, of as many."""
     last_reports: dict[str, Progress] = {}

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,12 @@ from lagbench.figures.tables import Table
 from lagbench.metrics import differ
 from lagbench.scoring.card import digits
 from lagbench.scoring.compare import compare
-from lagbench.scoring.tables import card_tables, comparison_tables, flag_lines
+from lagbench.scoring.tables import (
+    card_tables,
+    comparison_lines,
+    comparison_tables,
+    flag_lines,
+)
 
 
 @pytest.fixture(scope="module")
@@ -335,7 +341,7 @@ def test_a_named_board_must_be_one(scored: dict[str, Path], tmp_path: Path) -> N
 
 
 def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
-    """A difference that may be chance is open."""
+    """A difference that may be chance has a question mark."""
     a = publish(tmp_path, [1.0] * 6, method="a")
     b = publish(tmp_path, [2.0] * 6, method="b")
     c = publish(tmp_path, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], method="c")
@@ -344,7 +350,47 @@ def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
         table = next(iter(comparison_tables(compare(first, second))))
         column = table.columns.index("first is")
         sides.append(table.rows[0][column])
-    assert sides == ["better", "worse", "better, open", "same"]
+    assert sides == ["better", "worse", "better?", "same"]
+
+
+def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
+    """Five scenarios cannot reach 5 %: neither column nor verdict claims anything."""
+    a = publish(tmp_path, [1.0] * 5, method="a")
+    b = publish(tmp_path, [2.0] * 5, method="b")
+    result = compare(a, b)
+    table, _ = comparison_tables(result)
+    assert table.rows[0][table.columns.index("first is")] == "too few"
+    assert result.verdict.startswith("5 scenarios decide nothing")
+    assert any("too few" in line for line in comparison_lines(result))
+    # scenarios in which both have equal values are the same, however few
+    table, _ = comparison_tables(compare(a, publish(tmp_path, [1.0] * 5, method="c")))
+    assert table.rows[0][table.columns.index("first is")] == "same"
+
+
+def test_lines_explain_only_what_the_tables_show(tmp_path: Path) -> None:
+    a = publish(tmp_path, [1.0] * 6, method="a")
+    b = publish(tmp_path, [2.0] * 6, method="b")
+    assert len(list(comparison_lines(compare(a, b)))) == 1
+    c = publish(tmp_path, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], method="c")
+    rows = rows_of([1.0] * 6, [2] + [0] * 5)
+    d = publish(tmp_path, [1.0] * 6, method="d", rows=rows)
+    _, undefined, chance = comparison_lines(compare(d, c))
+    assert undefined.startswith("†")
+    assert chance.startswith("?")
+
+
+@pytest.mark.parametrize("every", [False, True])
+def test_a_comparison_fits_a_terminal(scored: dict[str, Path], every: bool) -> None:
+    """Each of both tables is one block of 80 columns, whatever the digits are."""
+    result = compare(scored["still"], scored["straight"])
+    metrics = {}
+    for name, comparison in result.metrics.items():
+        test = replace(
+            comparison.test, difference=-1.23e-06, interval=(-2.34e-06, -1.11e-07)
+        )
+        metrics[name] = replace(comparison, test=test)
+    for table in comparison_tables(replace(result, metrics=metrics), every=every):
+        assert len(list(output.split_table(table, gap=output.NARROW_GAP))) == 1
 
 
 def test_scores_nc_has_the_best_reference(scored: dict[str, Path]) -> None:
