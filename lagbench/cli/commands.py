@@ -15,7 +15,7 @@ COMMANDS = (
         name="list",
         target="inventory:list_command",
         summary="List all splits and sizes, their cost, and the data on this machine.",
-        example="list --json",
+        example="list cavity",
     ),
     CommandEntry(
         name="info",

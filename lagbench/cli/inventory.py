@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
+
+import typer
 
 from lagbench.data.layout import url_of
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
@@ -13,7 +15,7 @@ from lagbench.data.registry import Registry, Size, Split, format_ids, load
 from lagbench.errors import LagbenchError
 from lagbench.make.inventory import Overview, overview
 
-from .options import JsonFlag, RootOption, accept_split, option
+from .options import JsonFlag, RootOption, accept_split, choose_split, option
 from .output import (
     format_bytes,
     format_seconds,
@@ -43,8 +45,28 @@ LEGEND = (
 """Lines that say what the columns mean."""
 
 
-def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
-    """List all splits and sizes, their cost, and the data on this machine."""
+def list_command(
+    split_argument: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SPLIT",
+            help="One split, by its name or folder; all splits by default.",
+        ),
+    ] = None,
+    split_option: Annotated[
+        str | None, option("--split NAME", "The same as SPLIT.")
+    ] = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """List all splits and sizes, their cost, and the data on this machine.
+
+    Of one split it also shows the references.
+    """
+    if split_argument is not None or split_option is not None:
+        split = choose_split(split_argument, split_option)
+        _list_split(split, root=root, as_json=as_json)
+        return
     folder = resolve_root(root)
     overviews = _list_overviews(folder)
     if as_json:
@@ -56,6 +78,68 @@ def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     for line in _describe_times(overviews):
         print_line(line)
     print_line(f"data sets live in {url_of(folder) or folder}")
+
+
+def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
+    """Show the sizes of one split and the references that were measured on them."""
+    name, folder, registry = locate_split(split, root=root)
+    entry = registry.split(name)
+    sizes = [registry.size(name, size) for size in entry.sizes]
+    overviews = [overview(size, folder) for size in sizes]
+    references = {size.name: _measured_references(size) for size in sizes}
+    if as_json:
+        print_json({"root": folder, "sizes": overviews, "references": references})
+        return
+
+    print_line(f"{entry.title} ({name} {entry.version}, {entry.licence})")
+    rows = [_format_row(size_overview)[1:] for size_overview in overviews]
+    print_table("", COLUMNS[1:], rows, is_narrow=True)
+    for line in (*LEGEND, *_describe_times(overviews)):
+        print_line(line)
+    print_line("")
+    _print_references(sizes, references)
+    print_line(f"more: lagbench info {split}")
+    print_line(f"data sets live in {url_of(folder) or folder}")
+
+
+def _measured_references(size: Size) -> dict[str, float]:
+    """Return the mean ranking score of each reference that was measured, by name."""
+    # the table of all splits needs no metrics, which take longer to load
+    from lagbench.metrics.table import ranking_metric
+    from lagbench.references.shipped import shipped
+
+    ranking = ranking_metric(size)
+    means = {}
+    for name, reference in (shipped(size) or {}).items():
+        means[name] = reference.scores[ranking].mean
+    return means
+
+
+def _print_references(
+    sizes: Sequence[Size], references: Mapping[str, Mapping[str, float]]
+) -> None:
+    """Print the ranking scores of the references, a column for each size."""
+    from lagbench.metrics.table import ranking_metric
+    from lagbench.references.table import CLASSICAL, REFERENCES
+
+    if not any(references.values()):
+        line = "references: not measured yet"
+        if not sizes[0].simulated:
+            line = "references: they are measured with each score"
+        print_line(line)
+        return
+    rows = []
+    for name in REFERENCES:
+        cells = []
+        for size in sizes:
+            value = references[size.name].get(name)
+            cells.append("-" if value is None else f"{value:.3g}")
+        if any(cell != "-" for cell in cells):
+            kind = "classical" if name in CLASSICAL else "naive"
+            rows.append((name, kind, *cells))
+    columns = ("reference", "kind", *(size.name for size in sizes))
+    print_line(f"{ranking_metric(sizes[0])} of the references, less is better")
+    print_table("", columns, rows, is_narrow=True)
 
 
 def _list_overviews(folder: Path) -> list[Overview]:

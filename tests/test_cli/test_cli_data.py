@@ -12,9 +12,11 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from conftest import SIZE, SPLIT
+from exchange_readers import straight_runs
 from typer.testing import Result
 
 import lagbench
@@ -22,6 +24,7 @@ from lagbench.cli import doctor
 from lagbench.cli.doctor import REQUIRED_LIBRARIES
 from lagbench.data.registry import load
 from lagbench.make.generate import GenerationResult
+from lagbench.references.shipped import shipped
 
 Run = Callable[..., Result]
 
@@ -57,6 +60,47 @@ def test_list_has_counts_bytes_time_and_local_data_as_json(
     assert set(full["present"].values()) == {0}
     assert full["bytes"] == 50_400 * 8192 * 16 + 84 * 65536
     assert full["seconds"] > 60.0
+
+
+def test_list_shows_one_split_with_its_references(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has the sizes, the version and the measured scores of the references."""
+    monkeypatch.delenv("LAGBENCH_REGISTRY")
+    text = run("list", "cavity", "--root", tmp_path).stdout
+    assert text == run("list", "--split", "cavity", "--root", tmp_path).stdout
+    entry = load().split("cavity")
+    assert f"cavity {entry.version}" in text
+    for size in entry.sizes:
+        assert re.search(rf"^{size} +\d+/", text, re.MULTILINE)
+    assert "curl-noise" not in text
+    assert "vorticity_nrmse" in text
+
+    command = ("list", "cavity", "--root", tmp_path, "--json")
+    data = json.loads(run(*command).stdout)
+    assert [overview["size"] for overview in data["sizes"]] == list(entry.sizes)
+    measured = shipped(load().size("cavity", "mini"))
+    assert measured is not None
+    for name, value in data["references"]["mini"].items():
+        assert value == pytest.approx(measured[name].scores["vorticity_nrmse"].mean)
+    assert "persistence" in data["references"]["mini"]
+
+
+def test_list_shows_a_local_split_by_its_folder(run: Run, tmp_path: Path) -> None:
+    """The references of such a split are measured with each score."""
+    np.save(tmp_path / "runs.npy", np.stack(straight_runs(3)))
+    own = lagbench.adopt(
+        tmp_path / "runs.npy",
+        output=tmp_path / "own",
+        radius=0.1,
+        frame_interval=0.25,
+    )
+    result = run("list", f"{own.folder}/")
+    assert result.exit_code == 0
+    assert "with each score" in result.stdout
+    result = run("list", "cavitty", "--root", tmp_path)
+    assert result.exit_code == 2
+    assert "'cavity'" in result.stderr
 
 
 def test_info_shows_parameters_with_units_and_the_local_data(
