@@ -100,6 +100,9 @@ def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> 
     for name, reference in references.items():
         score = reference.scores[ranking]
         low, high = score.interval
+        interval = "too few"
+        if np.isfinite(low):
+            interval = f"{low:.3g} to {high:.3g}"
         defined = reference.correlation[np.isfinite(reference.correlation)]
         correlation = "undefined"
         if defined.size:
@@ -112,7 +115,7 @@ def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> 
             kind = str(REFERENCES[name].kind)
         print(
             f"| {size.split} {size.name} | {name}{mark} | {kind} | {score.mean:.4g} "
-            f"| {low:.3g} to {high:.3g} | {correlation} "
+            f"| {interval} | {correlation} "
             f"| {reference.seconds_per_frame:.2g} | {_relative_cost(size, reference)} |"
         )
 

@@ -34,9 +34,8 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
     fills_box,
-    fitted_field,
     given_in,
-    linear_field,
+    velocity_field,
     wall_motion,
     with_wall_images,
 )
@@ -143,10 +142,7 @@ def _carry(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
         after = mirror.positions(_frame(file, frame))
         step = given.box.displacement(before, after)  # [length/frame]
         points, velocities = with_wall_images(given, before, step, walls[frame])
-        if given.box.dimension == 2:
-            field = linear_field(points, velocities)
-        else:
-            field = fitted_field(points, velocities)
+        field = velocity_field(points, velocities)
         position = given.inside(position + field(position))
         before = after
         yield position.astype("float32")

@@ -39,7 +39,7 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
     fills_box,
-    linear_field,
+    velocity_field,
     with_wall_images,
 )
 from .train_library import UP
@@ -119,7 +119,7 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
                 given.box.displacement(before, after),
                 given.walls[frame],
             )
-            field = linear_field(points, velocities)
+            field = velocity_field(points, velocities)
             position[others] += field(position[others])
         else:
             position[others] = after[leader] + offset

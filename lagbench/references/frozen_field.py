@@ -22,7 +22,7 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
     fills_box,
-    linear_field,
+    velocity_field,
     with_wall_images,
 )
 
@@ -45,7 +45,7 @@ def decay(position: Floats, box: Box) -> float:
 def predict(given: Given) -> Prediction:
     """Yield positions that the last given field carries."""
     wall = given.walls[given.size.task.input_frames - 1]
-    field = linear_field(*with_wall_images(given, given.middle, given.step, wall))
+    field = velocity_field(*with_wall_images(given, given.middle, given.step, wall))
     factor = 1.0
     if given.driven or given.body_force is not None:
         rate = 1.0

@@ -5,10 +5,11 @@ train. A *classical* one integrates the equations. Both get what a model gets of
 scenario: its first frames, its materials, the motion of its walls and its viscosity.
 
 Some predictors carry the particles of a full box by a velocity field that is known at
-scattered points. Between the points the field is linear on their Delaunay triangles.
-Beyond a wall stand mirror images of the points near it, so that the field meets the
-condition of the wall half-way: where walls hold the fluid, the image of u is
-``2 u_wall - u``; where they let it slide, its normal component is reversed.
+scattered points. In two dimensions the field is linear on the Delaunay triangles of the
+points. In three it is fitted to the nearest points (:func:`fitted_field`). Beyond a
+wall stand mirror images of the points near it, so that the field meets the condition of
+the wall half-way: where walls hold the fluid, the image of u is ``2 u_wall - u``; where
+they let it slide, its normal component is reversed.
 """
 
 from __future__ import annotations
@@ -197,6 +198,20 @@ def _body_force(file: ScenarioFile, size: Size) -> Floats | None:
     frames = slice(0, size.task.input_frames + size.task.horizon)
     acceleration = file.read("body_force", frames).astype(np.float64)
     return np.asarray(acceleration * size.frame_interval**2)
+
+
+def velocity_field(points: Floats, velocities: Floats) -> Field:
+    """Return the field that carries particles, from its velocities at points.
+
+    In two dimensions it is :func:`linear_field`, in three :func:`fitted_field`.
+
+    Args:
+        points: scattered points [length], shape [point, axis].
+        velocities: velocities there [length/frame], shape [point, axis].
+    """
+    if points.shape[1] == 2:
+        return linear_field(points, velocities)
+    return fitted_field(points, velocities)
 
 
 def linear_field(points: Floats, values: Floats) -> Field:
