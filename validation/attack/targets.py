@@ -33,6 +33,7 @@ from .models import ONNX, write_straight_on
 from .models import WEIGHTS as WEIGHT_MUTATIONS
 from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
 from .running import run_command
+from .safetensors_files import SAFETENSORS, write_small_network
 
 SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise")
 """Splits of which ``tiny`` is generated below the root where it is missing."""
@@ -173,6 +174,7 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
     models = folder / "models"
     models.mkdir()
     write_straight_on(models / "model.onnx")
+    write_small_network(models / "model.safetensors", root)
     run(
         *("train", "--baseline", "hybrid-projection", "--split", "curl-noise"),
         *("--size", "tiny", "-o", "run", "--device", "cpu", "-q"),
@@ -269,6 +271,7 @@ def list_targets(folder: Path) -> list[Target]:
     """Return all targets; the valid files lie in a folder."""
     predict_model = ("predict", "model.onnx", "--split", "decaying-vortices")
     predict_weights = ("predict", "weights.pt", "-o", "p.nc", "--no-bench", "-q")
+    predict_network = ("predict", "model.safetensors", *predict_weights[2:])
     train = ("train", "--baseline", "hybrid-projection", "--split", "curl-noise")
     targets = [
         Target(
@@ -287,6 +290,14 @@ def list_targets(folder: Path) -> list[Target]:
             victim="weights.pt",
             mutations=(*WEIGHT_MUTATIONS, *BYTES, *WEIGHT_MUTATIONS, *PLACES),
             commands=[predict_weights],
+            weight=12,
+        ),
+        Target(
+            name="safetensors model",
+            source="models",
+            victim="model.safetensors",
+            mutations=(*SAFETENSORS, *BYTES, *SAFETENSORS, *PLACES),
+            commands=[predict_network],
             weight=12,
         ),
         Target(
