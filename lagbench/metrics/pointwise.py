@@ -36,9 +36,12 @@ def attribute_mse(pair: FramePair) -> float:
 
     ``L = sum((y - yhat)^2) / (N k)`` over z-scores of (x, y, u, v); the means of Eq.
     4.15 cancel in the difference. 0 is perfect; 1 is the error of always predicting the
-    mean of train.
+    mean of train. Undefined where an attribute has one value in all of train: it has no
+    z-score.
     """
     std = np.array(pair.scenario.config.attribute_std)
+    if not std.all():
+        return float("nan")
     squares = np.concatenate([pair.position_square, pair.velocity_square])
     return average(squares / std**2)
 

@@ -78,6 +78,18 @@ def test_attribute_error_equals_that_of_standardised_arrays() -> None:
     assert attribute_mse.measure(pair) == pytest.approx(expected)
 
 
+def test_attributes_that_never_vary_have_no_standardised_error() -> None:
+    """Particles that fall straight down have no horizontal velocity in all of train."""
+    x = lattice(4)
+    fall = np.tile([0.0, -0.01], (len(x), 1))
+    std = np.array([*CONFIG.attribute_std[:2], 0.0, 0.1])
+    pair = pair_of(x, fall, fall, predicted_position=x)
+    scenario = replace(
+        pair.scenario, config=replace(pair.scenario.config, attribute_std=tuple(std))
+    )
+    assert np.isnan(attribute_mse.measure(replace(pair, scenario=scenario)))
+
+
 def test_materials_have_errors_of_their_own() -> None:
     """Jelly off by 0.2 and liquid exact: MSE of jelly 0.04, of liquid 0, of all 0.02.
 

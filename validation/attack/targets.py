@@ -475,12 +475,12 @@ def _array_targets() -> list[Target]:
             check=find_wrong_values,
         ),
         Target(
-            name="ballistic-analog: train",
+            name="analog: train",
             source="analogs",
             victim="own/full/v1/train/0000.nc",
             mutations=(*BYTES, *PLACES),
             commands=[
-                ("compare", "p.nc", "ballistic-analog", "--root", ".", "-q"),
+                ("compare", "p.nc", "analog", "--root", ".", "-q"),
                 ("score", "p.nc", "--split", "own/", "-o", "scores", "-q"),
             ],
             weight=2,
