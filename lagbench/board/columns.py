@@ -107,6 +107,9 @@ class Column:
     perfect: float | None = None
     form: str = "number"  # how cells are written: number, count, factor or text
     reported: bool = False  # stated by the submitter, computed again by nobody
+    # of the cost of a frame, which is measured or stated: the column "time taken by"
+    # says which
+    of_cost: bool = False
     meaning: str
     # value of a row, where the column shows no metric
     read: Callable[[TableRow], object] | None = None
@@ -309,7 +312,7 @@ ENTRY_COLUMNS = (
         label="speed\u2011up",
         form="factor",
         direction=Direction.HIGHER,
-        reported=True,
+        of_cost=True,
         meaning="Time of the solver over that of the model per frame.",
         read=_read_cost("speed_up"),
     ),
@@ -318,7 +321,7 @@ ENTRY_COLUMNS = (
         label="time per frame",
         unit="s",
         direction=Direction.LOWER,
-        reported=True,
+        of_cost=True,
         meaning="Wall time of a frame of one scenario.",
         read=_read_cost("seconds_per_frame"),
     ),
@@ -334,7 +337,7 @@ ENTRY_COLUMNS = (
         key="solver_seconds_per_frame",
         label="solver time per frame",
         unit="s",
-        reported=True,
+        of_cost=True,
         meaning="On the same machine.",
         read=_read_cost("solver_seconds_per_frame"),
     ),
@@ -342,7 +345,7 @@ ENTRY_COLUMNS = (
         key="device",
         label="device",
         form="text",
-        reported=True,
+        of_cost=True,
         meaning="Machine of both times.",
         read=_read_cost("device"),
     ),

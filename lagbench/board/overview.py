@@ -248,11 +248,11 @@ def _count_sets(count: int) -> str:
 def find_hero(board: Board) -> tuple[Tab, BoardRow] | None:
     """Return the data set whose film stands first, and its best entry.
 
-    It is the one with the most materials, and of these the one with the most skill.
-    Variants count.
+    Data sets whose best entry has skill come first, then those with the most materials,
+    then those with the most skill. Variants count.
     """
     best: tuple[Tab, BoardRow] | None = None
-    most = (0, -math.inf)
+    most = (False, 0, -math.inf)
     for tab in board.tabs:
         row = _find_best(tab)
         if row is None or tab.truth is None:
@@ -261,8 +261,9 @@ def find_hero(board: Board) -> tuple[Tab, BoardRow] | None:
         skill = -math.inf
         if row.skill is not None and math.isfinite(row.skill.mean):
             skill = row.skill.mean
-        if best is None or (materials, skill) > most:
-            most = (materials, skill)
+        merit = (skill > 0.0, materials, skill)
+        if best is None or merit > most:
+            most = merit
             best = tab, row
     return best
 

@@ -196,7 +196,7 @@ class _Painter:
     def _is_judged(self, row: TableRow) -> bool:
         if isinstance(row, BoardRow):
             return row.active
-        return not self._column.reported
+        return not self._column.reported and not self._column.of_cost
 
     def classes_of(self, row: TableRow) -> Iterator[str]:
         """Yield the classes of a row's cell."""
