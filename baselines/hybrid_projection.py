@@ -112,7 +112,7 @@ class ClosedGrid(StaggeredGrid):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flow:
+class FlowState:
     """One scenario on the way: its solver and where its fluid is."""
 
     grid: ClosedGrid
@@ -131,7 +131,7 @@ class Flow:
 class Flows:
     """State of a rollout: a flow for each window."""
 
-    flows: tuple[Flow, ...]
+    flows: tuple[FlowState, ...]
     device: torch.device
 
 
@@ -201,7 +201,7 @@ class HybridProjection(Baseline):
 
     def _begin(
         self, given: Batch, window: int, is_inside: Tensor, coefficients: Floats
-    ) -> Flow:
+    ) -> FlowState:
         """Return the flow of one window, brought to its last given frame."""
         interval = self.info.frame_interval
         frames = given.position[is_inside].double().cpu().numpy()
@@ -218,7 +218,7 @@ class HybridProjection(Baseline):
         )
         last = frames.shape[1] - 1
         step = box.displacement(frames[:, -2], frames[:, -1])
-        flow = Flow(
+        flow = FlowState(
             grid=grid,
             field=[],
             position=frames[:, -1],
@@ -278,7 +278,7 @@ class HybridProjection(Baseline):
         position = torch.from_numpy(np.concatenate(positions)).float()
         return replace(state, flows=tuple(flows)), position.to(state.device)
 
-    def _advance_flow(self, flow: Flow) -> Flow:
+    def _advance_flow(self, flow: FlowState) -> FlowState:
         """Return a flow one frame later."""
         interval = self.info.frame_interval
         wall_velocity = flow.wall_velocity(flow.frame + 1)
@@ -354,7 +354,7 @@ class HybridProjection(Baseline):
             vorticity.append(compute_vorticity(flow.field, flow.grid))
         return given, vorticity
 
-    def _observe(self, window: Batch) -> Flow:
+    def _observe(self, window: Batch) -> FlowState:
         """Return the flow of a window's last step, half a frame before its end."""
         interval = self.info.frame_interval
         box = self.info.box
@@ -368,7 +368,7 @@ class HybridProjection(Baseline):
         )
         return replace(flow, field=field)
 
-    def _begin_at_rest(self, window: Batch) -> Flow:
+    def _begin_at_rest(self, window: Batch) -> FlowState:
         """Return the flow of a window without its field."""
         box = self.info.box
         dimension = window.position.shape[2]
@@ -381,7 +381,7 @@ class HybridProjection(Baseline):
             no_slip=bool(walls.any()),
             hyperviscosity=0.0,
         )
-        return Flow(
+        return FlowState(
             grid=grid,
             field=[],
             position=np.zeros((0, dimension)),

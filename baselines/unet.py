@@ -60,7 +60,7 @@ def convolve_three(
     )
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """Two convolutions beside a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, periodic: Sequence[bool]) -> None:
@@ -105,17 +105,18 @@ class UNet(nn.Module):
         coarse = 4 * width
 
         self.begin = convolve_three(inputs, fine, periodic)
-        self.down_fine = Block(fine, fine, periodic)
-        self.down_middle = Block(middle, middle, periodic)
+        self.down_fine = ResidualBlock(fine, fine, periodic)
+        self.down_middle = ResidualBlock(middle, middle, periodic)
         self.halve_fine = convolution(fine, middle, 2, stride=2)
         self.halve_middle = convolution(middle, coarse, 2, stride=2)
         self.bottom = nn.Sequential(
-            Block(coarse, coarse, periodic), Block(coarse, coarse, periodic)
+            ResidualBlock(coarse, coarse, periodic),
+            ResidualBlock(coarse, coarse, periodic),
         )
         self.double_coarse = transposed(coarse, middle, 2, stride=2)
         self.double_middle = transposed(middle, fine, 2, stride=2)
-        self.up_middle = Block(2 * middle, middle, periodic)
-        self.up_fine = Block(2 * fine, fine, periodic)
+        self.up_middle = ResidualBlock(2 * middle, middle, periodic)
+        self.up_fine = ResidualBlock(2 * fine, fine, periodic)
         self.end = convolve_three(fine, outputs, periodic)
         for parameter in self.end.parameters():
             nn.init.zeros_(parameter)

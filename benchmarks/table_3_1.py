@@ -59,7 +59,7 @@ THESIS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measurement:
+class TimedRow:
     """Our times for one row, in milliseconds."""
 
     row: ThesisRow
@@ -136,7 +136,7 @@ def best_ms(
     return 1e3 * min(times)
 
 
-def measure(row: ThesisRow, *, device: solver.Device, repeats: int) -> Measurement:
+def measure(row: ThesisRow, *, device: solver.Device, repeats: int) -> TimedRow:
     """Time one row: substeps in runs of a fixed number, and frames of its own
     substeps.
     """
@@ -145,7 +145,7 @@ def measure(row: ThesisRow, *, device: solver.Device, repeats: int) -> Measureme
         clock = time.process_time
     else:
         clock = time.perf_counter
-    return Measurement(
+    return TimedRow(
         row=row,
         substep_ms=best_ms(running, FIXED, repeats, clock) / FIXED,
         frame_ms=best_ms(running, row.substeps, repeats, clock),
@@ -184,7 +184,7 @@ def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
     return exponents(rows, substep_ms, frame_ms)
 
 
-def of_measured(measurements: Sequence[Measurement]) -> Exponents:
+def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
     """Return the exponents of our times."""
     rows = []
     substep_ms = []
@@ -196,7 +196,7 @@ def of_measured(measurements: Sequence[Measurement]) -> Exponents:
     return exponents(rows, substep_ms, frame_ms)
 
 
-def markdown(measurements: Sequence[Measurement], device: str) -> str:
+def markdown(measurements: Sequence[TimedRow], device: str) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
         f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
@@ -234,7 +234,7 @@ def markdown(measurements: Sequence[Measurement], device: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(measurements: Sequence[Measurement], device: str, path: Path) -> None:
+def draw(measurements: Sequence[TimedRow], device: str, path: Path) -> None:
     """Draw Fig. 3.1: (a) log-log with lines, (b) linear with second-degree fits."""
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -46,7 +46,7 @@ OTHER_COLOUR = "s3"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curve:
+class ValidationCurve:
     """The validations of one training."""
 
     name: str  # of the method
@@ -68,9 +68,9 @@ class Curve:
         return 1.0 - min(self.errors) / min(early)
 
 
-def curves_of(folder: Folder) -> dict[tuple[str, str], list[Curve]]:
+def curves_of(folder: Folder) -> dict[tuple[str, str], list[ValidationCurve]]:
     """Return the curves of active entries by data set; averaged rows have none."""
-    curves: dict[tuple[str, str], list[Curve]] = {}
+    curves: dict[tuple[str, str], list[ValidationCurve]] = {}
     for path in folder.entries():
         entry = read_entry(folder.path / path)
         if entry.status is not Status.ACTIVE or entry.method.endswith("-averaged"):
@@ -80,7 +80,7 @@ def curves_of(folder: Folder) -> dict[tuple[str, str], list[Curve]]:
     return curves
 
 
-def _curves_of_entry(folder: Folder, entry: Entry) -> Iterator[Curve]:
+def _curves_of_entry(folder: Folder, entry: Entry) -> Iterator[ValidationCurve]:
     colour = OTHER_COLOUR
     for beginning, family_colour in FAMILIES:
         if entry.method.startswith(beginning):
@@ -98,7 +98,7 @@ def _curves_of_entry(folder: Folder, entry: Entry) -> Iterator[Curve]:
                 windows.append(step * windows_per_step)
                 errors.append(error)
         if windows:
-            yield Curve(
+            yield ValidationCurve(
                 name=entry.name,
                 seed=prediction.seed,
                 colour=colour,
@@ -149,7 +149,7 @@ def _validations_of(
     return metric, validations
 
 
-def draw(data_set: tuple[str, str], curves: Sequence[Curve]) -> Markup:
+def draw(data_set: tuple[str, str], curves: Sequence[ValidationCurve]) -> Markup:
     """Return the chart of a data set."""
     where = " ".join(data_set)
     all_windows: list[float] = []
@@ -187,7 +187,7 @@ def draw(data_set: tuple[str, str], curves: Sequence[Curve]) -> Markup:
     return plot.svg(where, f"{where}: validation errors of {len(curves)} trainings.")
 
 
-def table(curves: dict[tuple[str, str], list[Curve]]) -> str:
+def table(curves: dict[tuple[str, str], list[ValidationCurve]]) -> str:
     """Return trainings with four validations or more, as Markdown."""
     heads = (
         "data set",

@@ -7,6 +7,7 @@ import functools
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,6 +45,15 @@ NEVER = {
 """What stays apart although a layer would allow it: models learn from files, the solver
 knows no score.
 """
+
+PRODUCT_FOLDERS = (
+    "lagbench",
+    "generators",
+    "baselines",
+    "studies",
+    "validation",
+)
+"""Folders in which a class name has one meaning."""
 
 LONGEST_CHAIN = 15
 """Modules in the longest chain of imports, at most."""
@@ -179,6 +189,22 @@ def test_no_chain_of_imports_is_long() -> None:
             long_chains[module] = length
     assert max(chain_lengths.values()) > 1
     assert not long_chains
+
+
+def test_no_two_classes_have_one_name() -> None:
+    """A reader who meets a class in two places is looking at one class."""
+    modules_of = defaultdict(set)
+    for folder in PRODUCT_FOLDERS:
+        for path in (PACKAGE.parent / folder).rglob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef):
+                    modules_of[node.name].add(path.resolve())
+    twice = {}
+    for name, modules in modules_of.items():
+        if len(modules) > 1:
+            twice[name] = sorted(modules)
+    assert "Registry" in modules_of
+    assert not twice
 
 
 def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:

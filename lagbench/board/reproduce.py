@@ -163,7 +163,7 @@ def reproduce(
     described = load_rooted_registry(data_root, registry)
     chosen = choose_entries(folder, entries, described, split=split, size=size)
 
-    run = _Run(
+    run = _Reproduction(
         folder=folder,
         root=data_root,
         registry=described,
@@ -275,7 +275,7 @@ def score_positions(
 
 
 @dataclass(kw_only=True)
-class _Run:
+class _Reproduction:
     """One run of the command: its choices, and what it has loaded."""
 
     folder: Folder

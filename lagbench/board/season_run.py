@@ -64,7 +64,7 @@ SAVED = "scores.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Repetition:
     """How the scores of a repeated run compare with those on the board."""
 
     has_same_bytes: bool
@@ -82,7 +82,7 @@ class SeasonResult:
     predicted: list[str] = field(
         default_factory=list
     )  # as in "cavity/mini/gns, seed 0"
-    comparison: Comparison | None = None  # where the scores were compared only
+    comparison: Repetition | None = None  # where the scores were compared only
 
     @property
     def exit_code(self) -> int:
@@ -137,7 +137,7 @@ def run_season(
             fix=f"lagbench season run {name}",
         )
     data_root = resolve_root(root)
-    run = _Run(
+    run = _SeasonRun(
         folder=folder,
         season=season,
         root=data_root,
@@ -169,13 +169,13 @@ def run_season(
 
 def compare_scores(
     stored: SeasonScores, scores: SeasonScores, *, has_same_bytes: bool
-) -> Comparison:
+) -> Repetition:
     """Return the greatest relative difference of two runs of the same season."""
     before = list(_values_of(stored))
     after = list(_values_of(scores))
     scale = np.maximum(np.abs(before), np.finfo(np.float32).tiny)
     relative = np.abs(np.subtract(after, before)) / scale
-    return Comparison(
+    return Repetition(
         has_same_bytes=has_same_bytes,
         greatest=float(np.max(relative)),
         values=len(before),
@@ -201,7 +201,7 @@ def values_of(scores: Score) -> dict[int, float]:
 
 
 @dataclass(kw_only=True)
-class _Run:
+class _SeasonRun:
     """One run of a season: its choices, and what is scored so far."""
 
     folder: Folder

@@ -106,7 +106,7 @@ def score_on_shift(
     folder.require()
     data_root = resolve_root(root)
     described = load_rooted_registry(data_root, registry)
-    run = _Run(
+    run = _ShiftRun(
         folder=folder,
         root=data_root,
         registry=described,
@@ -130,7 +130,7 @@ def score_on_shift(
 
 
 @dataclass(kw_only=True)
-class _Run:
+class _ShiftRun:
     """One run of the command: its choices, and what it has loaded."""
 
     folder: Folder

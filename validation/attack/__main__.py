@@ -38,7 +38,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True)
-class Case:
+class AttackCase:
     """A case and how it ended."""
 
     number: int
@@ -150,7 +150,9 @@ def _copy_valid_files(source: Path, work: Path) -> Path:
     return folder
 
 
-def _run_case(number: int, target: Target, seed: int, valid: Path, work: Path) -> Case:
+def _run_case(
+    number: int, target: Target, seed: int, valid: Path, work: Path
+) -> AttackCase:
     """Mutate the valid files of a target and run a command on them."""
     rng = np.random.Generator(np.random.PCG64([seed, number]))
     mutation = target.mutations[int(rng.integers(len(target.mutations)))]
@@ -170,7 +172,7 @@ def _run_case(number: int, target: Target, seed: int, valid: Path, work: Path) -
             wrong = target.check(source, folder, outcome.output)
             if wrong is not None:
                 failures.append(wrong)
-    return Case(
+    return AttackCase(
         number=number,
         target=target,
         mutation=mutation.__name__,
@@ -180,13 +182,13 @@ def _run_case(number: int, target: Target, seed: int, valid: Path, work: Path) -
     )
 
 
-def _ending(case: Case) -> str:
+def _ending(case: AttackCase) -> str:
     if case.outcome.code == 0:
         return "accepted"
     return "refused"
 
 
-def _print_case(case: Case, *, is_full: bool) -> None:
+def _print_case(case: AttackCase, *, is_full: bool) -> None:
     outcome = case.outcome
     sys.stdout.write(
         f"case {case.number}: {case.target.name}, {case.mutation}, "
