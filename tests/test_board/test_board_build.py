@@ -14,6 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 from board_bench import PLACE, BoardBench, copied, master, noisy
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from sample_boards import make_entry
 
@@ -90,7 +91,7 @@ def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
         assert digits(value.mean) == digits(score.mean)
         assert digits(value.low) == digits(low)
         assert digits(value.high) == digits(high)
-        np.testing.assert_array_equal(value.per_scenario, score.values)
+        assert_array_equal(value.per_scenario, score.values)
         assert value.undefined == sum(score.undefined)
         assert math.isnan(value.std)
         for frame, mean in value.at.items():
@@ -192,7 +193,7 @@ def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) 
     )
     assert coarse.precision > 5.0 * fine.precision
     truth = board.tabs[0].truth.vorticity
-    np.testing.assert_allclose(truth, fine.preview.vorticity[0], atol=fine.precision)
+    assert_allclose(truth, fine.preview.vorticity[0], atol=fine.precision)
 
 
 def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from page_reader import read_array, read_levels
 
@@ -35,7 +36,7 @@ def test_numbers_come_back_within_half_a_step(
     reference = store.add(array, prefer_logarithmic=prefer_logarithmic)
     restored = restore(store, reference)[:, 0]
 
-    np.testing.assert_array_equal(np.isnan(restored), np.isnan(array))
+    assert_array_equal(np.isnan(restored), np.isnan(array))
     is_known = ~np.isnan(array)
     half_step = 0.5 * float(reference["step"])
     zero = float(reference["zero"])
@@ -56,7 +57,7 @@ def test_rows_and_columns_keep_their_places(rows: int, columns: int, seed: int) 
     store = ArrayStore()
     store.add([1.0, 2.0, 4.0])
     restored = restore(store, store.add(values))
-    np.testing.assert_allclose(restored, values, atol=0.51 / LEVELS)
+    assert_allclose(restored, values, atol=0.51 / LEVELS)
 
 
 def test_whole_numbers_are_exact_and_stand_once() -> None:
@@ -91,5 +92,5 @@ def test_coarse_field_keeps_its_mean() -> None:
     field = np.arange(16.0).reshape(4, 4)
     field[0, 0] = np.nan
     # upper left block: 1, 4, 5 are known, mean 10/3
-    np.testing.assert_allclose(coarsen(field, 2), [[10 / 3, 4.5], [10.5, 12.5]])
-    np.testing.assert_array_equal(coarsen(field, 4), field)
+    assert_allclose(coarsen(field, 2), [[10 / 3, 4.5], [10.5, 12.5]])
+    assert_array_equal(coarsen(field, 4), field)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from html_check import Element, read_html
+from numpy.testing import assert_allclose
 from page_reader import element_text, read_page_data
 from sample_boards import make_board, with_entry
 
@@ -71,9 +72,9 @@ def test_curves_and_films_arrive_at_the_script(board: Board, page: str) -> None:
             frames = data.array(plain_curve["frames"])[:, 0]
             assert frames.tolist() == list(curve.frames)
             values = data.array(plain_curve["values"])
-            np.testing.assert_allclose(values[:, 0], curve.mean, rtol=2e-3)
-            np.testing.assert_allclose(values[:, 1], curve.low, rtol=2e-3)
-            np.testing.assert_allclose(values[:, 2], curve.high, rtol=2e-3)
+            assert_allclose(values[:, 0], curve.mean, rtol=2e-3)
+            assert_allclose(values[:, 1], curve.low, rtol=2e-3)
+            assert_allclose(values[:, 2], curve.high, rtol=2e-3)
 
             pictures = plain_row["pictures"]
             film = data.array(pictures["film"])
@@ -81,8 +82,8 @@ def test_curves_and_films_arrive_at_the_script(board: Board, page: str) -> None:
             assert film.shape[1] == len(pictures["material"])
             first_particle = row.pictures.film[0, 0]
             last_particle = row.pictures.film[-1, -1]
-            np.testing.assert_allclose(film[0, 0], first_particle, atol=6e-4)
-            np.testing.assert_allclose(film[-1, -1], last_particle, atol=6e-4)
+            assert_allclose(film[0, 0], first_particle, atol=6e-4)
+            assert_allclose(film[-1, -1], last_particle, atol=6e-4)
 
 
 def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:

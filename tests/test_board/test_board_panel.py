@@ -24,6 +24,7 @@ from browser import (
     still,
     until,
 )
+from numpy.testing import assert_allclose
 from sample_boards import make_board, with_entry
 
 from lagbench.board.cost import points_of
@@ -163,9 +164,7 @@ def test_map_shows_the_field(page: Page, board: Board) -> None:
     limit = np.nanmax(np.abs(field))
     known = np.isfinite(field)
     assert np.all(pixels[~known] == [128, 128, 128, 34])
-    np.testing.assert_allclose(
-        pixels[known][:, 3], 255 * np.abs(field[known]) / limit, atol=1.6
-    )
+    assert_allclose(pixels[known][:, 3], 255 * np.abs(field[known]) / limit, atol=1.6)
     strong = known & (np.abs(field) > 0.2 * limit)
     assert np.all((pixels[strong][:, 0] > pixels[strong][:, 2]) == (field[strong] > 0))
 

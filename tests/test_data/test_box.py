@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lagbench.data.box import Box
 from lagbench.errors import UsageError
@@ -35,7 +36,7 @@ def test_a_displacement_leads_to_the_nearest_image(box: Box) -> None:
     end = box.low + box.lengths * rng.random((50, box.dimension))
     ways = box.displacement(start, end)
     for way, here, there in zip(ways, start, end, strict=True):
-        np.testing.assert_allclose(way, nearest_image(box, here, there), atol=1e-12)
+        assert_allclose(way, nearest_image(box, here, there), atol=1e-12)
 
 
 def test_between_walls_a_displacement_is_the_plain_difference_bit_for_bit() -> None:
@@ -44,7 +45,7 @@ def test_between_walls_a_displacement_is_the_plain_difference_bit_for_bit() -> N
     end = rng.random((100, 2)).astype("float32")
     way = WALLED.displacement(start, end)
     assert way.dtype == np.float32
-    np.testing.assert_array_equal(way, end - start)
+    assert_array_equal(way, end - start)
 
 
 @pytest.mark.parametrize("box", [CHANNEL, SOLID])
@@ -53,13 +54,13 @@ def test_wrapped_points_lie_in_the_box_and_are_the_same_points(box: Box) -> None
     position = box.low + box.lengths * rng.uniform(-3.0, 4.0, (200, box.dimension))
     wrapped = box.wrap(position)
     periods = (wrapped - position) / box.lengths
-    np.testing.assert_allclose(periods, np.rint(periods), atol=1e-12)
+    assert_allclose(periods, np.rint(periods), atol=1e-12)
     for axis, is_periodic in enumerate(box.periodic):
         if is_periodic:
             assert (wrapped[:, axis] >= box.low[axis]).all()
             assert (wrapped[:, axis] < box.high[axis]).all()
         else:
-            np.testing.assert_array_equal(wrapped[:, axis], position[:, axis])
+            assert_array_equal(wrapped[:, axis], position[:, axis])
 
 
 def test_a_point_just_below_the_lower_end_does_not_wrap_to_the_upper_end() -> None:
@@ -70,13 +71,13 @@ def test_a_point_just_below_the_lower_end_does_not_wrap_to_the_upper_end() -> No
 
 def test_points_beyond_a_wall_are_put_on_it_and_others_wrapped() -> None:
     inside = CHANNEL.inside([[2.5, 0.95], [-0.5, 0.05], [1.0, 0.5]])
-    np.testing.assert_allclose(inside, [[0.5, 0.9], [1.5, 0.1], [1.0, 0.5]])
+    assert_allclose(inside, [[0.5, 0.9], [1.5, 0.1], [1.0, 0.5]])
 
 
 def test_contained_points_lie_between_the_walls() -> None:
     points = [[0.5, 0.5], [0.95, 0.5], [np.nan, 0.5], [0.5, 1.0]]
-    np.testing.assert_array_equal(WALLED.contains(points), [True, False, False, True])
-    np.testing.assert_array_equal(CHANNEL.contains([[7.0, 0.5], [7.0, 1.0]]), [1, 0])
+    assert_array_equal(WALLED.contains(points), [True, False, False, True])
+    assert_array_equal(CHANNEL.contains([[7.0, 0.5], [7.0, 1.0]]), [1, 0])
     assert WALLED.contains([0.92, 0.5], tolerance=0.03)
 
 

@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenario
 
 from lagbench.data import MATERIALS
@@ -69,10 +70,10 @@ def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None
         assert set(scenario.coords) == {"frame", "time", "particle", "space", "wall"}
         assert list(scenario["space"].values) == ["x", "y"]
         assert list(scenario["wall"].values) == ["left", "right", "bottom", "top"]
-        np.testing.assert_array_equal(scenario["position"], frames_of(3, 4, 8))
-        np.testing.assert_array_equal(scenario["time"], np.arange(4) * 0.1)
+        assert_array_equal(scenario["position"], frames_of(3, 4, 8))
+        assert_array_equal(scenario["time"], np.arange(4) * 0.1)
         top_velocity = scenario["wall_velocity"][:, 3, 0]
-        np.testing.assert_array_equal(top_velocity, 0.125)
+        assert_array_equal(top_velocity, 0.125)
         attributes = scenario.attrs
         assert attributes["Conventions"] == "CF-1.11"
         assert {name: attributes[name] for name in PARAMETERS} == PARAMETERS
@@ -91,7 +92,7 @@ def test_plain_h5py_opens_it(written: tuple[Path, str]) -> None:
             assert variable.compression == "gzip"
             assert variable.compression_opts == 1
             assert variable.shuffle
-        np.testing.assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
+        assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
 
 
 def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
@@ -427,15 +428,15 @@ def test_frames_and_slices_can_be_read(written: tuple[Path, str]) -> None:
         assert file.header.particles == 8
         assert file.header.key == KEY
         assert file.read("particle_mass") == 1e-4 / 8
-        np.testing.assert_array_equal(file.read("position", 2), truth[2])
-        np.testing.assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
+        assert_array_equal(file.read("position", 2), truth[2])
+        assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
 
 
 def test_blocks_stream_all_frames_in_order(written: tuple[Path, str]) -> None:
     path, _ = written
     with read_scenario(path) as file:
         frames = np.concatenate(list(file.blocks("position")))
-    np.testing.assert_array_equal(frames, frames_of(3, 4, 8))
+    assert_array_equal(frames, frames_of(3, 4, 8))
 
 
 def test_an_unknown_variable_is_an_error(written: tuple[Path, str]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
@@ -76,8 +77,8 @@ def test_linear_flows_have_their_rates(
     position = lattice(grid)
     velocity = np.stack(flow(*position.T), axis=-1)
     fields = fields_of(position, velocity, grid)
-    np.testing.assert_allclose(deep(fields.vorticity), vorticity, atol=1e-12)
-    np.testing.assert_allclose(deep(fields.divergence), divergence, atol=1e-12)
+    assert_allclose(deep(fields.vorticity), vorticity, atol=1e-12)
+    assert_allclose(deep(fields.divergence), divergence, atol=1e-12)
 
 
 @BOTH
@@ -91,7 +92,7 @@ def test_rigid_translation_is_exact_for_any_particles(placement: Placement) -> N
     count = filled.sum()
     assert count > 100
     expected = np.tile([0.3, -0.2], (count, 1))
-    np.testing.assert_allclose(fields.velocity[filled], expected, rtol=1e-14)
+    assert_allclose(fields.velocity[filled], expected, rtol=1e-14)
 
 
 def taylor_green(position: Floats) -> tuple[Floats, Floats]:
@@ -160,7 +161,7 @@ def test_weights_are_a_partition_of_unity(
     assert sums.weight.sum() == pytest.approx(50.0, rel=1e-13)
     momentum = sums.momentum.sum(axis=(0, 1))
     expected = u.sum(axis=0)
-    np.testing.assert_allclose(momentum, expected, atol=1e-12)
+    assert_allclose(momentum, expected, atol=1e-12)
 
 
 def spline(s: Floats) -> Floats:
@@ -196,8 +197,8 @@ def test_transfer_equals_the_sum_over_all_pairs(
     weight = np.einsum("ip,kp->ikp", along[..., 0], along[..., 1])
     sums = gridding.transfer(x, u, grid)
     total_weight = weight.sum(axis=-1)
-    np.testing.assert_allclose(sums.weight, total_weight, atol=1e-13)
-    np.testing.assert_allclose(sums.momentum, weight @ u, atol=1e-12)
+    assert_allclose(sums.weight, total_weight, atol=1e-13)
+    assert_allclose(sums.momentum, weight @ u, atol=1e-12)
 
 
 def test_a_batch_has_the_bits_of_its_frames() -> None:
@@ -217,11 +218,11 @@ def test_a_batch_has_the_bits_of_its_frames() -> None:
         for name in ("weight", "velocity", "vorticity", "divergence"):
             batch_field = getattr(batch, name)
             expected = getattr(single, name)
-            np.testing.assert_array_equal(batch_field[frame], expected)
+            assert_array_equal(batch_field[frame], expected)
         permuted = fields_of(x[frame][order], u[frame][order], grid)
-        np.testing.assert_allclose(permuted.velocity, single.velocity, atol=1e-12)
-        np.testing.assert_allclose(permuted.vorticity, single.vorticity, atol=1e-10)
-        np.testing.assert_array_equal(permuted.counted, single.counted)
+        assert_allclose(permuted.velocity, single.velocity, atol=1e-12)
+        assert_allclose(permuted.vorticity, single.vorticity, atol=1e-10)
+        assert_array_equal(permuted.counted, single.counted)
 
 
 def test_wall_nodes_count_and_corner_nodes_do_not() -> None:
@@ -239,7 +240,7 @@ def test_wall_nodes_count_and_corner_nodes_do_not() -> None:
     expected = np.zeros((40, 40), bool)
     expected[2:-2, 2:-2] = True
     expected[[2, 2, -3, -3], [2, -3, 2, -3]] = False
-    np.testing.assert_array_equal(fields.counted, expected)
+    assert_array_equal(fields.counted, expected)
 
 
 def test_vorticity_stands_where_four_neighbours_count() -> None:
@@ -249,7 +250,7 @@ def test_vorticity_stands_where_four_neighbours_count() -> None:
     expected = np.zeros((6, 6), bool)
     expected[1:-1, 1:-1] = True
     expected[[1, 3, 2, 2], [3, 3, 2, 4]] = False
-    np.testing.assert_array_equal(gridding.differentiable_nodes(counted), expected)
+    assert_array_equal(gridding.differentiable_nodes(counted), expected)
 
 
 def test_nodes_that_a_prediction_leaves_empty_have_velocity_zero() -> None:
@@ -259,7 +260,7 @@ def test_nodes_that_a_prediction_leaves_empty_have_velocity_zero() -> None:
     sums = gridding.Transfer(weight, momentum[None])
     velocity = gridding.node_velocity(sums, 4.0)
     expected = [(0.0, 0.0), (0.0, 0.0), (2.0, 0.0)]
-    np.testing.assert_allclose(velocity[0], expected)
+    assert_allclose(velocity[0], expected)
 
 
 def test_the_mask_of_the_truth_decides_for_a_prediction() -> None:
@@ -274,9 +275,7 @@ def test_the_mask_of_the_truth_decides_for_a_prediction() -> None:
         full=truth.full,
         counted=truth.counted,
     )
-    np.testing.assert_array_equal(
-        np.isnan(prediction.vorticity), np.isnan(truth.vorticity)
-    )
+    assert_array_equal(np.isnan(prediction.vorticity), np.isnan(truth.vorticity))
     assert np.isfinite(prediction.vorticity).any()
 
 
@@ -295,8 +294,8 @@ def test_particles_outside_the_box_carry_no_weight(value: float) -> None:
     all_velocities = np.concatenate([u, np.full((2, 2), 9.0)])
     sums = gridding.transfer(all_positions, all_velocities, grid)
     expected = gridding.transfer(x, u, grid)
-    np.testing.assert_array_equal(sums.weight, expected.weight)
-    np.testing.assert_array_equal(sums.momentum, expected.momentum)
+    assert_array_equal(sums.weight, expected.weight)
+    assert_array_equal(sums.momentum, expected.momentum)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
@@ -76,10 +77,10 @@ def test_a_constant_velocity_stays_constant_and_full(
     result = fields(x, uniform, grid, full=full)
     assert result.weight.shape == grid.shape
     density = inner(result.density, box, 2)
-    np.testing.assert_allclose(density, 1.0, rtol=1e-12)
+    assert_allclose(density, 1.0, rtol=1e-12)
     for axis, component in enumerate(velocity):
         nodes = inner(result.velocity[..., axis], box, 2)
-        np.testing.assert_allclose(nodes, component, rtol=1e-12)
+        assert_allclose(nodes, component, rtol=1e-12)
 
 
 @EVERY_PLACEMENT
@@ -92,9 +93,9 @@ def test_both_scatters_agree_between_walls(placement: Placement) -> None:
     fast = transfer(x, u, grid)
     sums = np.empty((3, *grid.shape))
     scatter_in_box(x, u, grid, sums)
-    np.testing.assert_allclose(sums[0], fast.weight, atol=1e-12)
+    assert_allclose(sums[0], fast.weight, atol=1e-12)
     momentum = np.moveaxis(fast.momentum, -1, 0)
-    np.testing.assert_allclose(sums[1:], momentum, atol=1e-12)
+    assert_allclose(sums[1:], momentum, atol=1e-12)
 
 
 @pytest.mark.parametrize("box", [CHANNEL, TORUS, SOLID_CHANNEL, SOLID_TORUS])
@@ -110,7 +111,7 @@ def test_weights_sum_to_the_particles_where_no_wall_cuts_the_stencil(box: Box) -
     assert sums.weight.sum() == pytest.approx(200.0, rel=1e-12)
     momentum = sums.momentum.reshape(-1, box.dimension)
     total = u.sum(axis=0)
-    np.testing.assert_allclose(momentum.sum(axis=0), total, rtol=1e-10)
+    assert_allclose(momentum.sum(axis=0), total, rtol=1e-10)
 
 
 @EVERY_PLACEMENT
@@ -130,9 +131,9 @@ def test_a_shift_by_a_cell_along_a_periodic_axis_rolls_the_fields(
         shift[axis] = grid.spacing
         after = transfer(x + shift, u, grid)
         rolled = np.roll(before.weight, 1, axis=axis)
-        np.testing.assert_allclose(after.weight, rolled, atol=1e-10)
+        assert_allclose(after.weight, rolled, atol=1e-10)
         rolled = np.roll(before.momentum, 1, axis=axis)
-        np.testing.assert_allclose(after.momentum, rolled, atol=1e-10)
+        assert_allclose(after.momentum, rolled, atol=1e-10)
 
 
 @pytest.mark.parametrize("box", [TORUS, SOLID, SOLID_CHANNEL])
@@ -153,13 +154,13 @@ def test_the_curl_of_a_rigid_rotation_is_twice_its_rate() -> None:
     assert omega.shape == (*grid.shape, 3)
     inner_omega = inner(omega, SOLID, 1)
     expected = np.broadcast_to(2.0 * rate, inner_omega.shape)
-    np.testing.assert_allclose(inner_omega, expected, atol=1e-12)
+    assert_allclose(inner_omega, expected, atol=1e-12)
 
     plane = Grid(9, Placement.NODES)
     x, y = np.moveaxis(node_places(plane) - 0.5, -1, 0)
     velocity = np.stack([-0.5 * y, 0.5 * x], axis=-1)
     omega = curl(velocity, plane.spacing)
-    np.testing.assert_allclose(inner(omega, WALLED, 1), 1.0, atol=1e-12)
+    assert_allclose(inner(omega, WALLED, 1), 1.0, atol=1e-12)
 
 
 def test_the_generic_curl_agrees_with_that_between_walls_in_two_dimensions() -> None:
@@ -168,9 +169,9 @@ def test_the_generic_curl_agrees_with_that_between_walls_in_two_dimensions() -> 
     slopes = slope_along(velocity[..., 1], -2, 0.1)
     generic = slopes - slope_along(velocity[..., 0], -1, 0.1)
     between_walls = vorticity(velocity, 0.1)
-    np.testing.assert_allclose(generic, between_walls, atol=1e-12)
+    assert_allclose(generic, between_walls, atol=1e-12)
     periodic = curl(velocity, 0.1, [True, False])
-    np.testing.assert_allclose(periodic[1:-1], between_walls[1:-1], atol=1e-12)
+    assert_allclose(periodic[1:-1], between_walls[1:-1], atol=1e-12)
 
 
 @EVERY_BOX
@@ -182,7 +183,7 @@ def test_the_divergence_of_the_position_is_the_dimension_between_walls(
     velocity[..., list(box.periodic)] = 0.3  # the position jumps at a period
     walled_axes = box.dimension - sum(box.periodic)
     rate = divergence(velocity, grid.spacing, box.periodic)
-    np.testing.assert_allclose(inner(rate, box, 1), walled_axes, atol=1e-12)
+    assert_allclose(inner(rate, box, 1), walled_axes, atol=1e-12)
 
 
 def test_slopes_of_a_wave_have_no_seam_along_a_periodic_axis() -> None:
@@ -199,7 +200,7 @@ def test_slopes_of_a_wave_have_no_seam_along_a_periodic_axis() -> None:
         )
         factor = np.sin(wave * grid.spacing) / grid.spacing
         expected = factor * np.cos(wave * x[..., axis])
-        np.testing.assert_allclose(slope, expected, atol=1e-12)
+        assert_allclose(slope, expected, atol=1e-12)
 
 
 @EVERY_BOX
@@ -233,8 +234,8 @@ def test_fields_of_a_batch_are_those_of_its_frames() -> None:
     batch = fields(x, u, grid, full=full)
     for frame in range(2):
         single = fields(x[frame], u[frame], grid, full=full)
-        np.testing.assert_array_equal(batch.vorticity[frame], single.vorticity)
-        np.testing.assert_array_equal(batch.divergence[frame], single.divergence)
+        assert_array_equal(batch.vorticity[frame], single.vorticity)
+        assert_array_equal(batch.divergence[frame], single.divergence)
 
 
 def test_a_period_is_a_whole_number_of_cells() -> None:

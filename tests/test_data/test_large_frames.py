@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import netCDF4
-import numpy as np
 import pytest
 from independent_hash import content_hash
+from numpy.testing import assert_array_equal
 from scenario_factory import make_key, write_scenario
 
 from lagbench.data import writer as files
@@ -36,7 +36,7 @@ def test_a_large_frame_has_chunks_of_particles(tmp_path: Path) -> None:
         last_frame = file.read("position", 1)
     with netCDF4.Dataset(path) as file:
         expected = file["position"][1, -3:]
-    np.testing.assert_array_equal(last_frame[-3:], expected)
+    assert_array_equal(last_frame[-3:], expected)
 
 
 def test_chunks_do_not_enter_the_hash(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scenario_factory import frames_of, make_key, write_scenario
 
 from lagbench.data.checksums import round_digits
@@ -64,13 +65,13 @@ def test_against_numpy() -> None:
         values = np.concatenate(
             [np.diff(run, n=order, axis=0).reshape(-1, 2) for run in runs]
         )
-        np.testing.assert_allclose(
+        assert_allclose(
             result[f"{name}_mean"],
             values.mean(axis=0),
             rtol=1e-7,
             atol=1e-12,
         )
-        np.testing.assert_allclose(result[f"{name}_std"], values.std(axis=0), rtol=1e-8)
+        assert_allclose(result[f"{name}_std"], values.std(axis=0), rtol=1e-8)
 
 
 @settings(deadline=None)

@@ -16,6 +16,7 @@ import netCDF4
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from typer.testing import Result
 
@@ -90,12 +91,12 @@ def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None
         "test": runs[5:],
     }.items():
         with lagbench.open_split(str(own.folder), subset=subset) as data:
-            np.testing.assert_array_equal(data["position"].values, np.stack(expected))
+            assert_array_equal(data["position"].values, np.stack(expected))
             assert data["time"].values[-1] == 11 * 0.25
     velocity = stored(own, 0, "velocity")
     expected = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
-    np.testing.assert_array_equal(velocity[1:], expected)
-    np.testing.assert_array_equal(velocity[0], expected[0])
+    assert_array_equal(velocity[1:], expected)
+    assert_array_equal(velocity[0], expected[0])
 
 
 def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
@@ -282,7 +283,7 @@ def test_exchanged_axes_are_refused_until_they_are_stated(
         adopt(paths, output=tmp_path / "mine", **BASIC)
     axes = ("particle", "frame", "space")
     own_split = adopt(paths, output=tmp_path / "mine", axes=axes, **BASIC)
-    np.testing.assert_array_equal(stored(own_split, 2, "position"), runs[2])
+    assert_array_equal(stored(own_split, 2, "position"), runs[2])
     with pytest.raises(UsageError, match="no order of axes"):
         adopt(paths, output=tmp_path / "other", axes=("frame", "space"), **BASIC)
 
@@ -330,7 +331,7 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(tmp_path: Path) ->
     high = np.max([run.max(axis=(0, 1)) for run in runs], axis=0)
     scale = 2.0 ** np.ceil(np.log2((high - low).max()))
     expected = np.stack([0.0 * low, (high - low) / scale], axis=1)
-    np.testing.assert_allclose(size.bounds, expected)
+    assert_allclose(size.bounds, expected)
 
 
 def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
@@ -349,11 +350,9 @@ def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
     own_split = adopt(
         [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
     )
-    np.testing.assert_array_equal(stored(own_split, 2, "velocity"), motion(runs[2]))
-    np.testing.assert_array_equal(stored(own_split, 2, "material"), named["material"])
-    np.testing.assert_array_equal(
-        stored(own_split, 2, "wall_velocity")[5], named["wall_velocity"]
-    )
+    assert_array_equal(stored(own_split, 2, "velocity"), motion(runs[2]))
+    assert_array_equal(stored(own_split, 2, "material"), named["material"])
+    assert_array_equal(stored(own_split, 2, "wall_velocity")[5], named["wall_velocity"])
 
 
 def variable(
@@ -383,7 +382,7 @@ def test_netcdf(tmp_path: Path, runs: Runs) -> None:
         "test": 1,
     }
     expected = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
-    np.testing.assert_array_equal(stored(own_split, 2, "position"), expected)
+    assert_array_equal(stored(own_split, 2, "position"), expected)
 
 
 def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
@@ -435,7 +434,7 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     with lagbench.open_split(str(own_split.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
         assert data["particle_count"].values.tolist() == [40, 30]
-        np.testing.assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
+        assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
     lagbench.template(str(own_split.folder), output=tmp_path / "p.nc")
     assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
 
@@ -469,7 +468,7 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     assert size.task.radius == 0.075
     assert size.bounds[0] == (0.0, 0.75)
     assert size.value("source_scale") == 4.0
-    np.testing.assert_array_equal(stored(own_split, 0, "position") * 4, wide[0])
+    assert_array_equal(stored(own_split, 0, "position") * 4, wide[0])
 
 
 @pytest.mark.parametrize(
@@ -886,7 +885,7 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
     size = locate(str(own_split.folder)).size
     assert size.box.periodic == (True, True)
     velocity = stored(own_split, 0, "velocity") * size.frame_interval  # [length/frame]
-    np.testing.assert_allclose(velocity[..., 0], 0.02, atol=1e-6)
+    assert_allclose(velocity[..., 0], 0.02, atol=1e-6)
     manifest = read_manifest(tmp_path, "mine", "full", 1)
     assert manifest is not None
     assert manifest.statistics["velocity_mean"][0] == pytest.approx(0.02, rel=1e-4)
@@ -940,7 +939,7 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
     assert np.max(straight.per_frame) < 1e-5
     at_rest = card.scores["persistence"]["position_rmse"].per_frame[0]  # [length]
     drift = 0.02 * np.arange(1, len(at_rest) + 1)
-    np.testing.assert_allclose(at_rest, drift / np.sqrt(2.0), rtol=0.01)
+    assert_allclose(at_rest, drift / np.sqrt(2.0), rtol=0.01)
 
 
 def test_a_periodic_axis_needs_a_name_and_bounds(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from exchange_readers import (
     read_metadata,
     straight_runs,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 from typer.testing import Result
 
 import lagbench
@@ -143,11 +144,11 @@ def test_positions_are_those_stored(
             trajectories, expected[subset], strict=True
         ):
             assert position.dtype == np.float32
-            np.testing.assert_array_equal(position + origin, truth)
+            assert_array_equal(position + origin, truth)
             assert kinds.shape == (position.shape[1],)
     # Means and deviations are those computed in one go from the exported train file.
     for name, value in frame_statistics(files["train"]).items():
-        np.testing.assert_allclose(
+        assert_allclose(
             metadata[name],
             value,
             rtol=2e-8,
@@ -205,17 +206,13 @@ def test_lagrangebench_bounds(
     )
     metadata = read_metadata(tmp_path)
     bounds = np.array(metadata["bounds"])
-    np.testing.assert_allclose(
-        bounds, [[0.0, 1.0 if from_walls is False else 0.9]] * 2, atol=1e-6
-    )
+    assert_allclose(bounds, [[0.0, 1.0 if from_walls is False else 0.9]] * 2, atol=1e-6)
     truth = stored(generated.split, generated.root, "tiny")["test"]
     origin = np.array(metadata["lagbench"]["origin"])
     for (position, _), run in zip(read_h5(tmp_path / "test.h5"), truth, strict=True):
         assert (position >= 0).all()
         assert (position < bounds[:, 1] - bounds[:, 0]).all()
-        np.testing.assert_array_equal(
-            position.astype(np.float64) + origin, run.astype(np.float64)
-        )
+        assert_array_equal(position.astype(np.float64) + origin, run.astype(np.float64))
 
 
 def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> None:
@@ -292,7 +289,7 @@ def test_unequal_lengths(mixed: LocalSplit, tmp_path: Path) -> None:
     runs = read_h5(tmp_path / "b" / "train.h5")
     whole = read_gns(tmp_path / "a" / "train.npz")[1][0]
     assert [len(run) for run, _ in runs] == [12, 12, 12]
-    np.testing.assert_array_equal(runs[2][0], whole[12:24])
+    assert_array_equal(runs[2][0], whole[12:24])
     assert h5.left_out == 6
 
 
@@ -458,11 +455,11 @@ def test_readers_see_the_lid_move(
     position = raw + np.array(metadata["lagbench"]["origin"], np.float32)
     # 0.8 / 0.04 = 20 particles to a layer, three layers to a wall, four walls.
     assert kinds[40:].tolist() == [still] * 180 + [moving] * 60
-    np.testing.assert_allclose(position[:, :40], truth["test"][0], atol=1e-7)
+    assert_allclose(position[:, :40], truth["test"][0], atol=1e-7)
     walls = position[:, 40:220]
     top = position[:, 220:]
     assert (walls == walls[0]).all()
-    np.testing.assert_allclose(np.unique(top[..., 1].round(5)), [0.92, 0.96, 1.0])
+    assert_allclose(np.unique(top[..., 1].round(5)), [0.92, 0.96, 1.0])
     assert (top[..., 0] >= 0.1 - 1e-6).all()
     assert (top[..., 0] <= 0.9 + 1e-6).all()
     steps = np.diff(top, axis=0)
@@ -475,8 +472,8 @@ def test_readers_see_the_lid_move(
         within = steps[frame, ~again[frame], 0]
         across = steps[frame, again[frame], 0]
         jump = expected - np.copysign(0.8, expected)
-        np.testing.assert_allclose(within, expected, atol=1e-6)
-        np.testing.assert_allclose(across, jump, atol=1e-6)
+        assert_allclose(within, expected, atol=1e-6)
+        assert_allclose(across, jump, atol=1e-6)
     assert again.any()
     if form == "lagrangebench-h5":
         assert ((raw >= 0) & (raw < np.array(metadata["bounds"])[:, 1])).all()
@@ -484,7 +481,7 @@ def test_readers_see_the_lid_move(
     back = import_split(tmp_path / "out", format=form, output=tmp_path / "back")
     assert back.particles == (40, 40)
     came = stored("back", tmp_path, "full")
-    np.testing.assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
+    assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
 
 
 def test_walls_at_rest_are_solid(flow: Callable[..., object], tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from exchange_readers import read_gns, read_h5, straight_runs
 from exchange_writers import SUBSETS, write_gns, write_h5
+from numpy.testing import assert_array_equal
 from typer.testing import Result
 
 import lagbench
@@ -62,7 +63,7 @@ def test_an_export_comes_back(
             size="tiny",
             root=generated.root,
         ) as data:
-            np.testing.assert_array_equal(
+            assert_array_equal(
                 positions(own_split.folder, subset), data["position"].values
             )
             mass = data["particle_mass"].values[0]
@@ -87,7 +88,7 @@ def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
     own_split = import_split(source, format=form, output=tmp_path / "own")
     assert not (tmp_path / "trace").exists()
     read = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
-    np.testing.assert_array_equal(positions(own_split.folder), [run for run, _ in read])
+    assert_array_equal(positions(own_split.folder), [run for run, _ in read])
     interval = 0.01 if gns else 0.05
     assert locate(str(own_split.folder)).size.frame_interval == pytest.approx(interval)
 
@@ -140,7 +141,7 @@ def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
         pickle.dump(joint, stream, protocol=protocol)
     own_split = import_split(source, format="gns-npz", output=tmp_path / "own")
     assert own_split.scenarios["train"] == 2
-    np.testing.assert_array_equal(
+    assert_array_equal(
         positions(own_split.folder), np.stack(runs[:2]).astype(np.float32)
     )
     with lagbench.open_split(str(own_split.folder), subset="train") as data:
@@ -171,9 +172,7 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     )
     assert named.particles == (36, 36)
     assert dropped.particles == (30, 30)
-    np.testing.assert_array_equal(
-        positions(dropped.folder)[0], straight_runs(3)[0][:, :30]
-    )
+    assert_array_equal(positions(dropped.folder)[0], straight_runs(3)[0][:, :30])
 
 
 def test_a_crossing_of_a_periodic_boundary_is_a_short_step(tmp_path: Path) -> None:

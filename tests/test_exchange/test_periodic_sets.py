@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 from exchange_writers import SUBSETS, write_metadata
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 import lagbench
@@ -146,7 +147,7 @@ def test_positions_adopted_with_the_same_axes_are_the_same(
             lagbench.open_split(made.folder, subset=subset) as theirs,
             lagbench.open_split(own.folder, subset=subset) as ours,
         ):
-            np.testing.assert_array_equal(ours["position"], theirs["position"])
+            assert_array_equal(ours["position"], theirs["position"])
 
 
 def test_a_particle_that_crosses_the_boundary_costs_no_error(

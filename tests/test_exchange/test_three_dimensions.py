@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exchange_readers import read_gns, read_h5
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 import lagbench
@@ -75,7 +76,7 @@ def test_the_files_state_three_axes_and_which_are_periodic(made: LocalSplit) -> 
         assert file.read("wall_velocity").shape == (FRAMES, 6, 3)
         assert file.header.parameters["periodic"] == "x z"
         position = file.read("position")
-    np.testing.assert_array_equal(position, straight_run(COUNTS[0]))
+    assert_array_equal(position, straight_run(COUNTS[0]))
     assert (position[..., [0, 2]] < [1.0, 0.75]).all()
 
 
@@ -84,8 +85,8 @@ def test_statistics_follow_the_shortest_way(made: LocalSplit) -> None:
     measured = locate(made.folder).size.measured
     assert measured is not None
     mean = measured.statistics["velocity_mean"]
-    np.testing.assert_allclose(mean, VELOCITY, atol=1e-7)
-    np.testing.assert_allclose(measured.statistics["velocity_std"], 0.0, atol=1e-6)
+    assert_allclose(mean, VELOCITY, atol=1e-7)
+    assert_allclose(measured.statistics["velocity_std"], 0.0, atol=1e-6)
 
 
 def test_subsets_and_windows_have_three_components(made: LocalSplit) -> None:
@@ -93,10 +94,10 @@ def test_subsets_and_windows_have_three_components(made: LocalSplit) -> None:
         assert data["space"].values.tolist() == ["x", "y", "z"]
         assert data["particle_count"].values.tolist() == list(COUNTS[2:])
         stored = data["position"].values[1, :, : COUNTS[3]]
-    np.testing.assert_array_equal(stored, straight_run(COUNTS[3]))
+    assert_array_equal(stored, straight_run(COUNTS[3]))
     window = lagbench.windows(made.folder, subset="test", history=2)[-1]
     expected = straight_run(COUNTS[3])[-3:].transpose(1, 0, 2)
-    np.testing.assert_array_equal(window.position, expected)
+    assert_array_equal(window.position, expected)
     assert window.wall_velocity is not None
     assert window.wall_velocity.shape == (3, 6, 3)
 
@@ -112,7 +113,7 @@ def test_predictions_are_ragged_and_valid(made: LocalSplit, tmp_path: Path) -> N
     with open_predictions(path) as predictions:
         for number, position in truth.items():
             frames = predictions.frames(number, 3, FRAMES - 3)
-            np.testing.assert_array_equal(frames, position)
+            assert_array_equal(frames, position)
     with pytest.raises(lagbench.errors.UsageError):
         lagbench.submission.write(
             path,
@@ -143,7 +144,7 @@ def test_another_program_reads_it_and_it_comes_back(
     assert box.periodic == (True, False, True)
     with lagbench.open_split(again.folder, subset="valid") as data:
         stored = data["position"].values[0]
-    np.testing.assert_allclose(stored, straight_run(COUNTS[1]), atol=1e-6)
+    assert_allclose(stored, straight_run(COUNTS[1]), atol=1e-6)
 
 
 def test_a_solid_that_crosses_its_box_needs_the_axes(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 from PIL import ImageSequence
 from PIL.GifImagePlugin import GifImageFile
@@ -49,7 +50,7 @@ def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @given(hnp.arrays(np.uint8, images.map(lambda shape: (*shape, 3))))
 def test_packing_keeps_every_pixel(pixels: Pixels) -> None:
     """Unpack is the inverse of pack."""
-    np.testing.assert_array_equal(unpack(pack(pixels)), pixels)
+    assert_array_equal(unpack(pack(pixels)), pixels)
 
 
 @given(hnp.arrays(np.uint8, even_sizes.map(lambda n: (2 * n, 2 * n, 3))))

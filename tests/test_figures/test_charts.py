@@ -10,6 +10,7 @@ import pytest
 from html_check import Reading, read_html
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from lagbench.figures.chart import (
     Bar,
@@ -87,7 +88,7 @@ def test_logarithmic_axis_is_even_in_decades() -> None:
     axis = logarithmic(2e-4, 0.03)
     assert (axis.low, axis.high) == pytest.approx((1e-4, 0.1))
     shares = axis.share([1e-4, 1e-3, 1e-2, 1e-1])
-    np.testing.assert_allclose(shares, [0, 1 / 3, 2 / 3, 1], atol=1e-12)
+    assert_allclose(shares, [0, 1 / 3, 2 / 3, 1], atol=1e-12)
     assert np.isnan(axis.share([0.0, -1.0, math.nan])).all()
     assert [tick.label for tick in axis.ticks] == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹"]
 

@@ -31,6 +31,7 @@ from board_bench import (
 from html_check import Reading, read_html
 from hypothesis import example, given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -479,7 +480,7 @@ def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
     for frame, values in shown.items():
         field = crop_to_walls(bench.task, expected[frame])
         share = np.clip(field / limit, -1.0, 1.0)
-        np.testing.assert_allclose(values, share, atol=0.0101, equal_nan=True)
+        assert_allclose(values, share, atol=0.0101, equal_nan=True)
 
 
 def test_style_sheet_is_packaged() -> None:

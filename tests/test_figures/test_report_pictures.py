@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -97,7 +98,7 @@ def test_histogram_shares_within_the_truths_range_are_those_of_numpy() -> None:
     assert shares.sum() == pytest.approx(100.0)
     counts, _ = np.histogram(guess, edges)
     expected = 100.0 * counts / 500
-    np.testing.assert_allclose(shares[1:-1], expected[1:-1])
+    assert_allclose(shares[1:-1], expected[1:-1])
     assert shares[0] > expected[0]
     assert shares[-1] > expected[-1]
 

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import PIL.Image
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lagbench.data.box import Box
 from lagbench.figures.canvas import (
@@ -44,7 +45,7 @@ def test_lengths_across_the_line_of_sight_keep_their_scale() -> None:
     assert depths.max() == 1.0
     nearest = corners[depths.argmin()]
     farthest = corners[depths.argmax()]
-    np.testing.assert_array_equal(nearest + farthest, [1.0, 1.0, 1.0])
+    assert_array_equal(nearest + farthest, [1.0, 1.0, 1.0])
     # the longest depth follows from Pythagoras on the diagonal of the cube
     across = np.linalg.norm(view.place(farthest) - view.place(nearest)) / view.scale
     longest = np.sqrt(3.0 - across**2)
@@ -52,7 +53,7 @@ def test_lengths_across_the_line_of_sight_keep_their_scale() -> None:
     place = (view.place(points) - 0.5) / view.scale
     away = (view.depth(points) - 0.5) * longest
     length = np.sqrt((place**2).sum(axis=1) + away**2)
-    np.testing.assert_allclose(length, np.linalg.norm(way, axis=1), rtol=1e-12)
+    assert_allclose(length, np.linalg.norm(way, axis=1), rtol=1e-12)
 
 
 def test_up_is_up_and_the_back_is_farther() -> None:
@@ -74,7 +75,7 @@ def test_three_edges_meet_in_front() -> None:
 def test_the_farthest_particle_is_the_palest() -> None:
     colours = np.zeros((2, 3))
     shaded = shade(colours, np.array([0.0, 1.0]), np.ones(3))
-    np.testing.assert_allclose(shaded, [[0.0] * 3, [1.0 - PALEST] * 3])
+    assert_allclose(shaded, [[0.0] * 3, [1.0 - PALEST] * 3])
 
 
 def test_pale_particles_keep_their_hue() -> None:
@@ -99,6 +100,6 @@ def test_flat_pictures_keep_their_palette() -> None:
     colours = colour_bytes(build_vorticity_map())[None]
     image = PIL.Image.fromarray(colours)
     palette = choose_palette(image)
-    np.testing.assert_array_equal(palette, build_palette())
+    assert_array_equal(palette, build_palette())
     reduced = np.asarray(reduce_colours(image, palette).convert("RGB"))
     assert np.abs(reduced.astype(float) - colours).max() <= 8

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import PAINT_PICTURES, SIZE, SPLIT
 from independent_hash import content_hash, dumps
+from numpy.testing import assert_array_equal
 
 from lagbench.data import WALLS
 from lagbench.data.manifest import Manifest, read_manifest
@@ -106,9 +107,9 @@ def test_a_file_holds_what_its_scenario_says(
         material = file.read("material")
         velocity = file.read("velocity", 0)
     state = draw_initial_state(size, 3)
-    np.testing.assert_array_equal(first, state.position.astype(np.float32))
-    np.testing.assert_array_equal(velocity, state.velocity.astype(np.float32))
-    np.testing.assert_array_equal(material, state.material)
+    assert_array_equal(first, state.position.astype(np.float32))
+    assert_array_equal(velocity, state.velocity.astype(np.float32))
+    assert_array_equal(material, state.material)
     words = [int(word) for word in header.seed.split(", ")]
     again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
     assert again.random() == generator(SPLIT, SIZE, 2, 3).random()
@@ -129,7 +130,7 @@ def test_cavity_files_hold_the_walls_of_every_frame(
         start = file.header.parameters["start_frame"]
         assert "active_frames" not in file.header.parameters
     assert start == state.start_frame
-    np.testing.assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
+    assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
     assert (
         len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0))
         > 13

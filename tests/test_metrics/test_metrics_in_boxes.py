@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
@@ -113,7 +114,7 @@ def test_a_whole_period_is_no_error_and_a_crossing_no_jump() -> None:
     scenario = pair.scenario
     wrapped = SOLID_TORUS.wrap(position - [0.3, 0.0, 0.0])
     snapshot = scenario.snapshot(position, wrapped)
-    np.testing.assert_allclose(snapshot.velocity[:, 0], 0.3, atol=1e-12)
+    assert_allclose(snapshot.velocity[:, 0], 0.3, atol=1e-12)
 
 
 def test_only_walls_have_an_outside() -> None:
@@ -144,7 +145,7 @@ def test_the_spectrum_of_a_mode_lies_in_its_shell(
         energy = energy_spectrum(field, [is_periodic] * dimension)
         expected = np.zeros_like(energy)
         expected[number - 1] = np.sum(field**2)
-        np.testing.assert_allclose(energy, expected, atol=1e-10)
+        assert_allclose(energy, expected, atol=1e-10)
 
 
 def test_shells_of_a_torus_are_those_of_the_fourier_transform() -> None:
@@ -157,7 +158,7 @@ def test_shells_of_a_torus_are_those_of_the_fourier_transform() -> None:
     shell = np.rint(np.sqrt(kx**2 + ky**2 + kz**2))
     expected = [power[shell == number].sum() for number in range(1, 5)]
     energy = energy_spectrum(velocity, [True] * 3)
-    np.testing.assert_allclose(energy, expected, rtol=1e-12)
+    assert_allclose(energy, expected, rtol=1e-12)
 
 
 def test_a_periodic_axis_beside_walls_counts_half_waves() -> None:
@@ -181,9 +182,7 @@ def test_a_known_rotation_is_found_and_both_forms_agree() -> None:
     body = rng.standard_normal((40, 3))
     body -= body.mean(axis=0)
     rotation = Rotation.from_rotvec([0.3, -1.2, 0.7]).as_matrix()
-    np.testing.assert_allclose(
-        fit_rotation(body @ rotation.T, body), rotation, atol=1e-12
-    )
+    assert_allclose(fit_rotation(body @ rotation.T, body), rotation, atol=1e-12)
     assert rigid_residual(body @ rotation.T + 0.4, body) < 1e-12
     assert rigid_residual(body * [1.0, 1.0, -1.0], body) > 0.1
 
@@ -193,7 +192,7 @@ def test_a_known_rotation_is_found_and_both_forms_agree() -> None:
         t -= t.mean(axis=0)
         p -= p.mean(axis=0)
         by_svd = p @ fit_rotation(t, p).T
-        np.testing.assert_allclose(by_svd, rotate_in_plane(t, p), atol=1e-12)
+        assert_allclose(by_svd, rotate_in_plane(t, p), atol=1e-12)
 
 
 def test_a_noisy_fit_is_that_of_scipy() -> None:
@@ -204,7 +203,7 @@ def test_a_noisy_fit_is_that_of_scipy() -> None:
     prediction -= prediction.mean(axis=0)
     best, distance = Rotation.align_vectors(truth, prediction)
     ours = fit_rotation(truth, prediction)
-    np.testing.assert_allclose(ours, best.as_matrix(), atol=1e-10)
+    assert_allclose(ours, best.as_matrix(), atol=1e-10)
     expected = distance / math.sqrt(len(truth))
     assert rigid_residual(truth, prediction) == pytest.approx(expected)
 
@@ -235,9 +234,9 @@ def test_bonds_reach_across_periodic_ends_only() -> None:
 def test_directions_are_unit_vectors_spread_evenly() -> None:
     for dimension in (2, 3):
         rows = directions(dimension).astype(np.float64)
-        np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, atol=1e-6)
+        assert_allclose(np.linalg.norm(rows, axis=1), 1.0, atol=1e-6)
         spread = rows.T @ rows / len(rows)
-        np.testing.assert_allclose(spread, np.eye(dimension) / dimension, atol=0.01)
+        assert_allclose(spread, np.eye(dimension) / dimension, atol=0.01)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -260,7 +259,7 @@ def test_angular_momentum_is_a_scalar_or_a_vector() -> None:
     scenario = scenario_in(SOLID, position)
     snapshot = scenario.snapshot(position, position - np.cross(rate, arm))
     inertia = np.sum(arm[:, 0] ** 2 + arm[:, 1] ** 2)  # the same about every axis
-    np.testing.assert_allclose(angular_momentum(snapshot), inertia * rate, rtol=1e-10)
+    assert_allclose(angular_momentum(snapshot), inertia * rate, rtol=1e-10)
 
     plane = lattice(2, 5)
     arm = plane - 0.5

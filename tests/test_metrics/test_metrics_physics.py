@@ -19,6 +19,7 @@ from metric_flows import (
     scenario_of,
     swirl,
 )
+from numpy.testing import assert_allclose
 
 from lagbench.metrics import METRICS, Score, aggregate, select, tally
 
@@ -83,12 +84,12 @@ def test_energies_of_a_truth_that_slows_or_rests() -> None:
     """
     predicted = np.array([0.5, 1e-4])
     errors = METRICS["energy_error"].series(predicted, np.array([1.0, 0.0]))
-    np.testing.assert_allclose(errors, [0.5, 0.1])
+    assert_allclose(errors, [0.5, 0.1])
 
     predicted = np.array([5.0, 0.03, 9.0, 7.0])
     true = np.array([0.009, 0.01, 1.0, 0.0])
     ratios = METRICS["energy_ratio"].series(predicted, true)
-    np.testing.assert_allclose(ratios, [math.nan, 3.0, 9.0, math.nan])
+    assert_allclose(ratios, [math.nan, 3.0, 9.0, math.nan])
 
     at_rest = np.repeat(lattice(10)[None], 5, axis=0)
     drift = 0.001 * np.arange(5)[:, None, None]
@@ -121,7 +122,7 @@ def test_momentum_errors_have_a_floor() -> None:
     share = momentum / np.sum(np.hypot(u[:, 0], u[:, 1]))
     expected = [0.1 * share, (1.1 - 1e-6) / 1e-3 * share]
     errors = scores["momentum_error"].per_frame[0]
-    np.testing.assert_allclose(errors, expected, rtol=1e-6)
+    assert_allclose(errors, expected, rtol=1e-6)
     assert scores["angular_momentum_error"].per_frame[0, 1] < 1.2e3
 
 

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from metric_flows import CONFIG, Floats, pairs_of, rollout, scenario_of
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError, WorkFailedError
@@ -187,7 +187,7 @@ def test_means_over_frames_come_before_those_over_scenarios(
     assert correlation.undefined == undefined
     assert correlation.mean == pytest.approx(mean)
     interval = bootstrap_interval(correlation.values)
-    np.testing.assert_equal(correlation.interval, interval)
+    assert_equal(correlation.interval, interval)
 
 
 @pytest.mark.parametrize("holes", [0, 3])
@@ -203,7 +203,7 @@ def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None
         is_defined = ~np.isnan(row)
         means.append(np.mean(row[is_defined].copy()))
     correlation = score(METRICS["vorticity_pearson"], tallies)
-    np.testing.assert_array_equal(correlation.values, means)
+    assert_array_equal(correlation.values, means)
 
 
 def test_a_horizon_beyond_the_series_is_undefined() -> None:
@@ -224,7 +224,7 @@ def test_tallies_add() -> None:
     twice = tallied() + tallied()
     once = tallied()
     for name in twice.names:
-        np.testing.assert_array_equal(twice.series(name), once.series(name))
+        assert_array_equal(twice.series(name), once.series(name))
     with pytest.raises(UsageError):
         of_pearson(0.1) + of_pearson(0.1, 0.2)
     with pytest.raises(UsageError):

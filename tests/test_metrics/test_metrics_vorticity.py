@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from metric_flows import lattice, measured, pair_of, swirl
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_equal
 from numpy.typing import NDArray
 
 from lagbench.metrics import METRICS, FramePair
@@ -307,7 +307,7 @@ def test_stable_frames_by_hand(correlations: list[float], frames: float) -> None
     """Frames before the first value under 0.95; undefined ones do not count, the
     threshold itself holds.
     """
-    np.testing.assert_equal(frames_before_fall(np.array(correlations)), frames)
+    assert_equal(frames_before_fall(np.array(correlations)), frames)
 
 
 def test_nrmse_is_the_ratio_of_sums_over_frames() -> None:

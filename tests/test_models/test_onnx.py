@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from hostile_onnx import REFUSED, STOPPED, pickle_as_onnx, straight_on
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
@@ -124,7 +125,7 @@ def test_a_model_predicts_what_its_graph_says(
         given = file.read("position", slice(0, SIZE.task.input_frames)).astype(float)
     step = given[-1] - given[-2]
     frames = np.arange(1, SIZE.task.horizon + 1)[:, None, None]
-    np.testing.assert_allclose(
+    assert_allclose(
         rollout.position,
         given[-1] + frames * step,
         rtol=0,
@@ -145,7 +146,7 @@ def test_edges_are_all_pairs_within_the_radius() -> None:
         np.fill_diagonal(distance, np.inf)
         receivers, senders = np.nonzero(distance <= 0.2)
         edges = find_edges(position, 0.2, bounds, np.array(periodic))
-        np.testing.assert_array_equal(edges, [senders, receivers])
+        assert_array_equal(edges, [senders, receivers])
 
 
 def test_an_exported_step_predicts_what_it_did(
@@ -179,7 +180,7 @@ def test_an_exported_step_predicts_what_it_did(
         iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
     )
     position = model.predict(SIZE.path(generated.root, scenario))
-    np.testing.assert_allclose(position, expected, rtol=0, atol=1e-5)
+    assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
 def test_a_step_over_a_grid_of_particles_is_exported(
@@ -214,7 +215,7 @@ def test_a_step_over_a_grid_of_particles_is_exported(
         iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
     )
     position = model.predict(SIZE.path(generated.root, scenario))
-    np.testing.assert_allclose(position, expected, rtol=0, atol=1e-5)
+    assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
 def test_an_entry_carries_an_onnx_model(

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from metric_flows import Floats, pairs_of, rollout, scenario_of
+from numpy.testing import assert_allclose
 from score_bench import Predict, ScoreBench, half_right, late, right, still, straight
 
 from lagbench.metrics import FramePair, snapshots
@@ -69,8 +70,8 @@ def test_trace_of_an_offset_that_grows() -> None:
     trace = trace_of(truth, truth + frames * np.array([0.01, 0.0]))
     errors = [0.5, 2.0, 4.5, 8.0, 12.5, 18.0]
     overlaps = [1.0, 3.0, 6.0, 10.0, 15.0]
-    np.testing.assert_allclose(trace.error * 1e4, errors, rtol=1e-9)
-    np.testing.assert_allclose(trace.overlap[1:] * 1e4, overlaps, rtol=1e-9)
+    assert_allclose(trace.error * 1e4, errors, rtol=1e-9)
+    assert_allclose(trace.overlap[1:] * 1e4, overlaps, rtol=1e-9)
     assert math.isnan(trace.overlap[0])
 
     # cosine 1 throughout; the smallest ratio is 6/5; the last quarter is the last
@@ -93,7 +94,7 @@ def test_trace_finds_the_shift(shift: int) -> None:
     shifted = trace.shifted[shift]
     defined = shifted[~np.isnan(shifted)]
     assert len(defined) == HORIZON - max(0, shift)
-    np.testing.assert_allclose(defined, 0.0, atol=1e-30)
+    assert_allclose(defined, 0.0, atol=1e-30)
 
     dynamics = analyse_error(trace)
     assert dynamics.shift == shift
@@ -105,7 +106,7 @@ def test_particles_out_of_the_box_are_counted() -> None:
     truth = rollout()
     prediction = truth.copy()
     prediction[2:, ::4] = 2.0
-    np.testing.assert_allclose(trace_of(truth, prediction).outside, 0.25)
+    assert_allclose(trace_of(truth, prediction).outside, 0.25)
 
 
 def test_a_cloud_in_half_the_box_occupies_half() -> None:
@@ -115,7 +116,7 @@ def test_a_cloud_in_half_the_box_occupies_half() -> None:
     squeezed[:, :, 0] /= 2.0
     occupancy = trace_of(truth, squeezed).occupancy
     assert np.all(np.abs(occupancy - 0.5) <= 0.1)
-    np.testing.assert_allclose(trace_of(truth, truth).occupancy, 1.0)
+    assert_allclose(trace_of(truth, truth).occupancy, 1.0)
 
 
 GROWING = make_trace([1, 2, 3, 4, 5, 6])

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from file_size_limit import largest_file
+from numpy.testing import assert_allclose, assert_array_equal
 from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
@@ -51,7 +52,7 @@ def test_the_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
     for name, score in card.submission.items():
         perfect = score.metric.perfect
         if perfect is not None:
-            np.testing.assert_allclose(score.values, perfect, atol=1e-12, err_msg=name)
+            assert_allclose(score.values, perfect, atol=1e-12, err_msg=name)
     assert card.submission["stable_frames"].mean == bench.size.task.horizon
     raised = {flag.name for flag in card.flags if flag.raised}
     assert raised == {"copy_suspect", "below_twin_floor"}
@@ -74,8 +75,8 @@ def test_references_are_what_a_user_would_submit(
     card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
     for name, score in card.submission.items():
         expected = card.scores[row][name]
-        np.testing.assert_array_equal(score.per_frame, expected.per_frame, err_msg=name)
-        np.testing.assert_array_equal(score.values, expected.values, err_msg=name)
+        assert_array_equal(score.per_frame, expected.per_frame, err_msg=name)
+        assert_array_equal(score.values, expected.values, err_msg=name)
 
 
 def test_position_rmse_is_that_of_xarray(
@@ -91,7 +92,7 @@ def test_position_rmse_is_that_of_xarray(
     mean_square = (error**2).mean(("frame", "particle", "space"))
     expected = np.sqrt(mean_square.values)
     rmse = persistence_card.submission["position_rmse"].values
-    np.testing.assert_allclose(rmse, expected, rtol=1e-6)
+    assert_allclose(rmse, expected, rtol=1e-6)
 
 
 def test_a_card_is_shown_in_one_line(persistence_card: ScoreCard) -> None:
@@ -154,7 +155,7 @@ def test_freezing_midway_leaves_frames_out(bench: ScoreBench, tmp_path: Path) ->
     )
     card = bench.evaluate(path)
     pearson = card.submission["vorticity_pearson"]
-    np.testing.assert_allclose(pearson.values, 1.0)
+    assert_allclose(pearson.values, 1.0)
     assert pearson.undefined == (10, 10)
     assert card.submission["vorticity_rmse"].mean > 0.0
     assert card.as_json()["diverged_at"] == {"3": 16, "4": 16}

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from file_size_limit import largest_file
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from numpy.typing import NDArray
 from score_bench import ScoreBench, straight
 
@@ -150,7 +151,7 @@ def test_six_scenarios_of_598_frames_take_300_kb(
     expected = aggregate(metrics, large.tallies[SUBMISSION])
     scores = statistics.scores()
     for name, score in expected.items():
-        np.testing.assert_equal(scores[name].mean, score.mean)
+        assert_equal(scores[name].mean, score.mean)
 
 
 def test_incompressible_scores_of_90_frames_take_300_kb(
@@ -181,7 +182,7 @@ def test_stored_statistics_saturate_at_the_largest_float32() -> None:
     values = {"a": 1e300, "b": -1e300, "c": 0.1, "d": math.nan}
     stored = round_statistics(Tally.of("abcd", (0,), {0: values}))
     expected = [largest, -largest, float(np.float32(0.1)), 0.0]
-    np.testing.assert_array_equal(stored.total[:, 0], expected)
+    assert_array_equal(stored.total[:, 0], expected)
     assert stored.undefined[:, 0].tolist() == [0, 0, 0, 1]
 
 
@@ -201,13 +202,13 @@ def test_long_rollouts_are_stored_in_eleven_bits() -> None:
 
     # Later values of the first row are beyond float32.
     growing = stored.total[0, :80]
-    np.testing.assert_allclose(growing, tally.total[0, :80], rtol=2.0**-11)
+    assert_allclose(growing, tally.total[0, :80], rtol=2.0**-11)
     mantissa, _ = np.frexp(growing)
     assert len(np.unique(mantissa * 2**11 % 1)) == 1
     constant_rows = [set(row) for row in stored.total[1:]]
     assert constant_rows == [{0.0}, {1.0}, {-largest}]
     again = round_statistics(stored)
-    np.testing.assert_array_equal(again.total[:3], stored.total[:3])
+    assert_array_equal(again.total[:3], stored.total[:3])
 
 
 def test_the_preview_shows_the_truth_beside_the_prediction(
@@ -223,9 +224,9 @@ def test_the_preview_shows_the_truth_beside_the_prediction(
     assert len(frames) == task.horizon
     assert len(particles) == PARTICLES
     level = 2.0 / 65534
-    np.testing.assert_allclose(film[0], truth[frames][:, particles], atol=level)
+    assert_allclose(film[0], truth[frames][:, particles], atol=level)
     prediction = straight(truth, task.input_frames, len(frames))
-    np.testing.assert_allclose(film[1], prediction[:, particles], atol=level)
+    assert_allclose(film[1], prediction[:, particles], atol=level)
 
 
 def test_the_preview_has_histograms_of_its_vorticity(card: ScoreCard) -> None:
@@ -236,9 +237,7 @@ def test_the_preview_has_histograms_of_its_vorticity(card: ScoreCard) -> None:
         frame_count = len(preview["map_frame"])
     true_vorticity, predicted_vorticity = vorticity
     assert np.isnan(true_vorticity).any()
-    np.testing.assert_array_equal(
-        np.isnan(true_vorticity), np.isnan(predicted_vorticity)
-    )
+    assert_array_equal(np.isnan(true_vorticity), np.isnan(predicted_vorticity))
     for frame in range(frame_count):
         is_defined = ~np.isnan(true_vorticity[frame])
         shares = histograms(
@@ -257,17 +256,17 @@ def test_scores_nc_reads_back_to_the_bit(card: ScoreCard) -> None:
     assert list(scores) == list(card.submission)
     for name, score in scores.items():
         expected = card.submission[name]
-        np.testing.assert_array_equal(score.values, expected.values, err_msg=name)
-        np.testing.assert_equal(score.interval, expected.interval)
+        assert_array_equal(score.values, expected.values, err_msg=name)
+        assert_equal(score.interval, expected.interval)
         assert score.undefined == expected.undefined, name
 
     for scenario, expected in card.tallies[SUBMISSION].items():
         tally = statistics.tallies[scenario]
         assert tally.names == expected.names
         assert tally.frames == expected.frames
-        np.testing.assert_array_equal(tally.total, expected.total)
-        np.testing.assert_array_equal(tally.weight, expected.weight)
-        np.testing.assert_array_equal(tally.undefined, expected.undefined)
+        assert_array_equal(tally.total, expected.total)
+        assert_array_equal(tally.weight, expected.weight)
+        assert_array_equal(tally.undefined, expected.undefined)
 
 
 def test_scores_json_has_what_a_comparison_needs(card: ScoreCard) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 import lagbench
@@ -121,7 +122,7 @@ def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
         given = given_in(file, size, root)
     first = next(REFERENCES["constant-velocity"].predict(given))
     step = given.box.displacement(given.last, first.astype(np.float64))
-    np.testing.assert_allclose(step, given.step, atol=1e-6)
+    assert_allclose(step, given.step, atol=1e-6)
     assert np.abs(given.step).max() < 0.1
 
     truth = carried(AMPLITUDES[2])[-1].astype(np.float64)

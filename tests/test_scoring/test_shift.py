@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import lagbench
 from lagbench.data.registry import load
@@ -61,9 +62,7 @@ def test_shift_is_scored_beside_its_references(root: Path, tmp_path: Path) -> No
     references = shipped(size.scored_on("shift"))
     assert references is not None
     expected = references["persistence"].scores[card.ranking].values
-    np.testing.assert_allclose(
-        card.scores[SUBMISSION][card.ranking].values, expected, rtol=1e-4
-    )
+    assert_allclose(card.scores[SUBMISSION][card.ranking].values, expected, rtol=1e-4)
     json_path, netcdf_path = card.files
     assert json.loads(json_path.read_text())["subset"] == "shift"
     read_score_file(netcdf_path, size.scored_on("shift"))

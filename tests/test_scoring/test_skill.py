@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+from numpy.testing import assert_allclose, assert_array_equal
 from score_bench import ScoreBench, right, still, straight
 
 from lagbench.data.registry import Measured, Size, load
@@ -304,10 +305,10 @@ def test_shipped_scores_are_the_measured_ones(
     frozen = from_file["frozen-field"]
     expected_scores = measured_references["frozen-field"].scores
     correlation = expected_scores["vorticity_pearson"].per_frame[:, -1]
-    np.testing.assert_allclose(frozen.correlation, correlation, rtol=1e-3)
+    assert_allclose(frozen.correlation, correlation, rtol=1e-3)
     curve = mean_curve(frozen.scores["position_rmse"])
     expected_curve = mean_curve(expected_scores["position_rmse"])
-    np.testing.assert_allclose(curve, expected_curve, rtol=6e-3)
+    assert_allclose(curve, expected_curve, rtol=6e-3)
 
 
 def test_another_data_set_has_no_shipped_scores(
@@ -465,9 +466,9 @@ def test_an_interrupted_measurement_goes_on(
     np.savez(files[0], **arrays)
 
     resumed = measure_persistence(resume=True)
-    np.testing.assert_allclose(resumed[0], 4.0 * first[0])
+    assert_allclose(resumed[0], 4.0 * first[0])
     fresh = measure_persistence()
-    np.testing.assert_array_equal(fresh, first)
+    assert_array_equal(fresh, first)
 
 
 def test_scoring_takes_what_is_shipped(

@@ -9,6 +9,7 @@ import dask.array
 import netCDF4
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal, assert_equal
 from scenario_factory import frames_of, make_key, write_scenario
 
 import lagbench
@@ -51,7 +52,7 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
         assert data["position"].dims == ("scenario", "frame", "particle", "space")
         assert data["wall_velocity"].dims == ("scenario", "frame", "wall", "space")
         assert tuple(data["scenario"].values) == TEST_IDS
-        np.testing.assert_array_equal(data["time"], np.arange(5) * 0.1)
+        assert_array_equal(data["time"], np.arange(5) * 0.1)
         most_particles = 6 + len(TEST_IDS) - 1
         for place, scenario in enumerate(TEST_IDS):
             frames = 5 - place
@@ -63,11 +64,11 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
 
             expected = np.full((5, most_particles, 2), np.nan, np.float32)
             expected[:frames, :particles] = frames_of(scenario, frames, particles)
-            np.testing.assert_array_equal(one["position"], expected)
-            np.testing.assert_array_equal(one["velocity"], -expected)
+            assert_array_equal(one["position"], expected)
+            assert_array_equal(one["velocity"], -expected)
             material = np.full(most_particles, -1)
             material[:particles] = np.arange(particles) % 4
-            np.testing.assert_array_equal(one["material"], material)
+            assert_array_equal(one["material"], material)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +110,7 @@ def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
         for scenario in TEST_IDS:
             viscosity = float(data["viscosity"].sel(scenario=scenario))
             expected = stated.get(scenario, np.nan)
-            np.testing.assert_equal(viscosity, expected)
+            assert_equal(viscosity, expected)
 
 
 def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:

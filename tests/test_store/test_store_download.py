@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from exchange_readers import straight_runs
 from faulty_server import Mirror, serving
+from numpy.testing import assert_array_equal
 from object_stores import Store, holding
 from typer.testing import CliRunner
 
@@ -88,7 +89,7 @@ def test_all_files_come_and_are_right(
     with lagbench.open_split("own", root=here) as scenarios:
         position = scenarios["position"].values
     with lagbench.open_split(str(original.folder)) as scenarios:
-        np.testing.assert_array_equal(position, scenarios["position"].values)
+        assert_array_equal(position, scenarios["position"].values)
     monkeypatch.setattr("lagbench.make.inventory.check_scenario", None)
     assert download("own", root=here, mirror=store.url).kept == (0, 1, 2, 3)
 

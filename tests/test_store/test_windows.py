@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.testing import assert_array_equal
 from scenario_factory import frames_of, make_key, write_scenario
 from torch.utils.data import DataLoader
 
@@ -132,7 +133,7 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
             assert window.scenario == scenario
             assert window.frame == first
             expected = frames[first : first + LENGTH].transpose(1, 0, 2)
-            np.testing.assert_array_equal(window.position.numpy(), expected)
+            assert_array_equal(window.position.numpy(), expected)
             assert window.position.is_contiguous()
             assert window.origin is None
             number += 1
@@ -154,7 +155,7 @@ def test_windows_have_the_first_frame_on_request(train: Open) -> None:
     assert len(with_origin) == WINDOWS
     for number in range(WINDOWS):
         window = with_origin[number]
-        np.testing.assert_array_equal(window.origin, stored_frames(window.scenario)[0])
+        assert_array_equal(window.origin, stored_frames(window.scenario)[0])
         assert torch.equal(window.position, data[number].position)
 
 
@@ -234,8 +235,8 @@ def test_arrays_tensors_and_open_split_agree(
                 "wall_velocity": frames.wall_velocity,
             }
             for name, values in expected.items():
-                np.testing.assert_array_equal(getattr(array, name), values.values)
-                np.testing.assert_array_equal(getattr(tensor, name), values.values)
+                assert_array_equal(getattr(array, name), values.values)
+                assert_array_equal(getattr(tensor, name), values.values)
 
 
 def test_the_task_gives_the_default_history(root: Path, registry: Registry) -> None:
@@ -661,7 +662,7 @@ def test_whole_scenarios_lie_side_by_side(paths_of_test: dict[int, Path]) -> Non
     for row, scenario in enumerate(paths_of_test):
         expected = frames_of(scenario, 26, 8)[3:9].transpose(1, 0, 2)
         position = batch.position[batch.sample == row]
-        np.testing.assert_array_equal(position.numpy(), expected)
+        assert_array_equal(position.numpy(), expected)
 
 
 def test_a_whole_scenario_has_all_frames_by_default(
@@ -922,7 +923,7 @@ def test_predictions_are_rollouts_of_the_task(
         assert_same(batches[row * task.horizon], window)
         expected = roll_out(extrapolate, window, task.horizon).transpose(0, 1)
         assert predictions[scenario].dtype == np.float32
-        np.testing.assert_array_equal(predictions[scenario], expected.numpy())
+        assert_array_equal(predictions[scenario], expected.numpy())
 
 
 def test_predictions_that_are_no_numbers_are_refused(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from reproduce_bench import a_method, made_up_results
 from scipy.stats import kendalltau
 
@@ -287,7 +288,7 @@ def test_interpolation_finds_the_vorticity_of_a_linear_flow(
     bounds = ((0.3, 0.7), (0.2, 0.6))
     vorticity = cubic_vorticity(position, velocity, bounds, cells=8)
     assert vorticity.shape == (8, 8)
-    np.testing.assert_allclose(vorticity, 2 * spin, rtol=0, atol=1e-5)
+    assert_allclose(vorticity, 2 * spin, rtol=0, atol=1e-5)
 
 
 def test_errors_of_interpolated_fields() -> None:

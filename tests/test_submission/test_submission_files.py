@@ -22,6 +22,7 @@ from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
 from scenario_factory import frames_of
 from submission_data import (
     FRAMES,
@@ -81,7 +82,7 @@ def test_what_is_written_is_read(bench: Bench, values: np.ndarray) -> None:
         with open_predictions(path) as predictions:
             for row, scenario in enumerate(TESTS):
                 got = predictions.frames(scenario, GIVEN, HORIZON)
-                np.testing.assert_array_equal(got.view("u4"), values[row].view("u4"))
+                assert_array_equal(got.view("u4"), values[row].view("u4"))
 
 
 def test_the_template_is_the_last_given_frame_repeated(
@@ -104,9 +105,7 @@ def test_the_template_is_the_last_given_frame_repeated(
             last = np.broadcast_to(
                 frames_of(scenario, FRAMES, PARTICLES)[GIVEN - 1], SHAPE
             )
-            np.testing.assert_array_equal(
-                predictions.frames(scenario, GIVEN, HORIZON), last
-            )
+            assert_array_equal(predictions.frames(scenario, GIVEN, HORIZON), last)
     with h5py.File(result.path) as file:
         assert file["position"].chunks == (1, 1, PARTICLES, 2)
     again = template("cavity", "tiny", output=bench.folder / "twice.nc", **made)
@@ -225,7 +224,7 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     )
     path = write(bench.folder / "v.nc", values, **more)
     with h5py.File(path) as file:
-        np.testing.assert_array_equal(file["velocity"][...], -file["position"][...])
+        assert_array_equal(file["velocity"][...], -file["position"][...])
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
@@ -319,7 +318,7 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
                 predictions.frames(*place)
             assert caught.value.where.endswith("valid.nc")
     assert got.dtype == np.float32
-    np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
+    assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
     assert header.split == "cavity"
     assert header.size == "tiny"
     assert header.method == "truth"
@@ -338,7 +337,7 @@ def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:
     with open_predictions(path) as shuffled, open_predictions(bench.valid) as plain:
         assert shuffled.header.scenarios == (5, 3, 4)
         for scenario in TESTS:
-            np.testing.assert_array_equal(
+            assert_array_equal(
                 *(f.frames(scenario, GIVEN, HORIZON) for f in (shuffled, plain))
             )
         assert shuffled.content_sha256() == plain.content_sha256()
@@ -377,7 +376,7 @@ def test_packing_does_not_matter(bench: Bench, name: str) -> None:
     with open_predictions(path) as packed, open_predictions(bench.valid) as plain:
         got = packed.frames(3, GIVEN, HORIZON)
         assert got.dtype.isnative
-        np.testing.assert_array_equal(got, truth(3))
+        assert_array_equal(got, truth(3))
         assert packed.content_sha256() == plain.content_sha256()
 
 
