@@ -55,11 +55,17 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Those of train have unequal lengths and particle numbers.
     """
     folder = tmp_path_factory.mktemp("windows")
-    for scenario, frames in FRAMES.items():
+    for scenario, frame_count in FRAMES.items():
         key = make_key(scenario, subset="train")
-        write_scenario(folder, key, frames=frames, particles=PARTICLES[scenario])
+        write_scenario(
+            folder,
+            key,
+            frames=frame_count,
+            particles=PARTICLES[scenario],
+        )
     for scenario in (4, 5):
-        write_scenario(folder, make_key(scenario, subset="test"), frames=26)
+        key = make_key(scenario, subset="test")
+        write_scenario(folder, key, frames=26)
     return folder
 
 
@@ -69,9 +75,18 @@ def registry(
 ) -> Registry:
     """A registry that describes these scenarios as cavity tiny."""
     content = read_yaml(unmeasured_path)
-    tiny = content["splits"]["cavity"]["sizes"]["tiny"]
-    tiny["subsets"] = {"train": "0-2", "valid": 3, "test": "4-5"}
-    tiny["frames"] = {40: "0", 26: "1,3-5", 31: "2"}
+    cavity = content["splits"]["cavity"]
+    tiny = cavity["sizes"]["tiny"]
+    tiny["subsets"] = {
+        "train": "0-2",
+        "valid": 3,
+        "test": "4-5",
+    }
+    tiny["frames"] = {
+        40: "0",
+        26: "1,3-5",
+        31: "2",
+    }
     path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
     path.write_text(yaml.safe_dump(content))
     return load(path)
@@ -90,17 +105,36 @@ def train(root: Path, registry: Registry) -> Open:
         subset: str | list[str] = "train",
         **changes: int,
     ) -> WindowDataset:
-        options: dict[str, Any] = {"history": 6, "future": 1} | changes
+        lengths: dict[str, Any] = {"history": 6, "future": 1}
         return WindowDataset(
             "cavity",
             size="tiny",
             subset=subset,
             root=folder,
             registry=registry,
-            **options,
+            **(lengths | changes),
         )
 
     return open_windows
+
+
+Location = dict[str, Any]
+
+
+@pytest.fixture
+def location(root: Path, registry: Registry) -> Location:
+    """Where the scenarios lie, as all routes to them take it."""
+    return {
+        "size": "tiny",
+        "root": root,
+        "registry": registry,
+    }
+
+
+def batch_of(data: WindowDataset, *numbers: int) -> Batch:
+    """Return a batch of some windows."""
+    windows = [data[number] for number in numbers]
+    return collate(windows)
 
 
 def assert_same(batch: Batch, expected: Batch) -> None:
@@ -113,12 +147,16 @@ def assert_same(batch: Batch, expected: Batch) -> None:
         "scenario",
         "frame",
     ):
-        assert torch.equal(getattr(batch, name), getattr(expected, name)), name
+        values = getattr(batch, name)
+        expected_values = getattr(expected, name)
+        assert torch.equal(values, expected_values), name
 
 
 def stored_frames(scenario: int) -> Any:
     """Return the positions of a scenario of train, shape [frame, particle, 2]."""
-    return frames_of(scenario, FRAMES[scenario], PARTICLES[scenario])
+    frame_count = FRAMES[scenario]
+    particle_count = PARTICLES[scenario]
+    return frames_of(scenario, frame_count, particle_count)
 
 
 def test_every_window_is_the_stored_frames(train: Open) -> None:
@@ -132,8 +170,10 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
             window = data[number]
             assert window.scenario == scenario
             assert window.frame == first
-            expected = frames[first : first + LENGTH].transpose(1, 0, 2)
-            assert_array_equal(window.position.numpy(), expected)
+            in_window = frames[first : first + LENGTH]
+            expected = in_window.transpose(1, 0, 2)
+            position = window.position.numpy()
+            assert_array_equal(position, expected)
             assert window.position.is_contiguous()
             assert window.origin is None
             number += 1
@@ -143,7 +183,8 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
 def test_windows_say_what_they_hold(train: Open) -> None:
     """In a terminal and in a notebook."""
     data = train(history=2, future=1)
-    for text in (repr(data), data._repr_html_()):
+    texts = (repr(data), data._repr_html_())
+    for text in texts:
         assert data.size.split in text
         assert str(len(data)) in text
         assert "2 given + 1 to predict" in text
@@ -155,17 +196,21 @@ def test_windows_have_the_first_frame_on_request(train: Open) -> None:
     assert len(with_origin) == WINDOWS
     for number in range(WINDOWS):
         window = with_origin[number]
-        assert_array_equal(window.origin, stored_frames(window.scenario)[0])
-        assert torch.equal(window.position, data[number].position)
+        first_frame = stored_frames(window.scenario)[0]
+        assert_array_equal(window.origin, first_frame)
+        expected = data[number].position
+        assert torch.equal(window.position, expected)
 
 
 def test_batches_put_first_frames_side_by_side(train: Open) -> None:
     """All windows of a batch need one."""
     with_origin = train(origin=True)
-    batch = collate([with_origin[3], with_origin[40]])
-    assert batch.origin[PARTICLES[0] :].equal(with_origin[40].origin)
+    batch = batch_of(with_origin, 3, 40)
+    of_second = batch.origin[PARTICLES[0] :]
+    assert of_second.equal(with_origin[40].origin)
+    without_origin = train()[40]
     with pytest.raises(UsageError):
-        collate([with_origin[3], train()[40]])
+        collate([with_origin[3], without_origin])
 
 
 def test_windows_of_several_subsets_follow_each_other(train: Open) -> None:
@@ -178,23 +223,33 @@ def test_windows_of_several_subsets_follow_each_other(train: Open) -> None:
 
 def test_a_window_has_materials_and_velocities_of_walls(train: Open) -> None:
     """The velocities of the walls are those of its own frames."""
-    window = train(history=2, future=0)[3]
-    assert window.material.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+    data = train(history=2, future=0)
+    window = data[3]
+    materials = window.material.tolist()
+    assert materials == [0, 1, 2, 3, 0, 1, 2, 3]
     assert window.material.dtype == torch.int64
     assert window.wall_velocity is not None
-    of_one_frame = [[0, 0], [0, 0], [0, 0], [0.125, 0]]
-    assert window.wall_velocity.tolist() == [of_one_frame, of_one_frame]
+    at_rest = [0, 0]
+    top = [0.125, 0]
+    of_one_frame = [at_rest, at_rest, at_rest, top]
+    wall_velocity = window.wall_velocity.tolist()
+    assert wall_velocity == [of_one_frame, of_one_frame]
 
 
 def test_without_material_all_is_liquid(tmp_path: Path, train: Open) -> None:
     """Without moving walls there is no velocity of walls."""
     for scenario, frames in FRAMES.items():
         key = make_key(scenario, subset="train")
-        path, _ = write_scenario(tmp_path, key, frames=frames, walls=False)
+        path, _ = write_scenario(
+            tmp_path,
+            key,
+            frames=frames,
+            walls=False,
+        )
         with h5py.File(path, "a") as file:
             del file["material"]
     data = train(tmp_path)
-    batch = collate([data[0], data[40]])
+    batch = batch_of(data, 0, 40)
     assert not batch.material.any()
     assert batch.material.dtype == torch.int64
     assert batch.wall_velocity is None
@@ -222,25 +277,30 @@ def test_arrays_tensors_and_open_split_agree(
         window_count = sum(truth.frame_count.values - 4)
         assert len(arrays) == window_count
         assert len(tensors) == window_count
-        for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
-            assert arrays.place(number) == (array.scenario, array.frame)
+        windows = zip(arrays, tensors, strict=True)
+        for number, (array, tensor) in enumerate(windows):
+            place = arrays.place(number)
+            assert place == (array.scenario, array.frame)
             assert tensor.scenario == array.scenario
             assert tensor.frame == array.frame
             scenario = truth.sel(scenario=array.scenario)
-            frames = scenario.isel(frame=slice(array.frame, array.frame + 5))
+            end = array.frame + 5
+            frames = scenario.isel(frame=slice(array.frame, end))
+            position = frames.position
             expected = {
-                "position": frames.position.transpose("particle", "frame", "space"),
+                "position": position.transpose("particle", "frame", "space"),
                 "origin": scenario.position.isel(frame=0),
                 "material": frames.material,
                 "wall_velocity": frames.wall_velocity,
             }
-            for name, values in expected.items():
-                assert_array_equal(getattr(array, name), values.values)
-                assert_array_equal(getattr(tensor, name), values.values)
+            for name, variable in expected.items():
+                values = variable.values
+                assert_array_equal(getattr(array, name), values)
+                assert_array_equal(getattr(tensor, name), values)
 
 
-def test_the_task_gives_the_default_history(root: Path, registry: Registry) -> None:
-    data = lagbench.windows("cavity", size="tiny", root=root, registry=registry)
+def test_the_task_gives_the_default_history(location: Location) -> None:
+    data = lagbench.windows("cavity", **location)
     assert data.history == 6
     assert data.future == 1
     assert data.length == 7
@@ -253,9 +313,14 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
 ) -> None:
     size = unmeasured.size("fluid", "tiny")
     for scenario in size.subsets["valid"]:
-        key = make_key(scenario, subset="valid", split="fluid", version=size.version)
-        frames = size.frame_count(scenario)
-        write_scenario(tmp_path, key, frames=frames, walls=False)
+        key = make_key(
+            scenario,
+            subset="valid",
+            split="fluid",
+            version=size.version,
+        )
+        frame_count = size.frame_count(scenario)
+        write_scenario(tmp_path, key, frames=frame_count, walls=False)
     data = lagbench.windows(
         "fluid",
         subset="valid",
@@ -290,12 +355,24 @@ def write_viscous(
         )
 
 
+@pytest.fixture
+def viscous(tmp_path: Path, unmeasured: Registry) -> int:
+    """A scenario of cavity that states a viscosity; others of its subset do not."""
+    size = unmeasured.size("cavity", "tiny")
+    scenario = size.subsets["valid"][0]
+    write_viscous(
+        tmp_path,
+        unmeasured,
+        split="cavity",
+        stated={scenario: 2e-3},
+    )
+    return scenario
+
+
 def test_windows_have_the_viscosity_of_their_scenario(
-    tmp_path: Path, unmeasured: Registry
+    tmp_path: Path, unmeasured: Registry, viscous: int
 ) -> None:
     """Windows of loaders and of rollouts agree."""
-    (scenario,) = unmeasured.size("cavity", "tiny").subsets["valid"][:1]
-    write_viscous(tmp_path, unmeasured, split="cavity", stated={scenario: 2e-3})
     options: dict[str, Any] = {
         "subset": "valid",
         "size": "tiny",
@@ -303,10 +380,12 @@ def test_windows_have_the_viscosity_of_their_scenario(
         "registry": unmeasured,
     }
     data = WindowDataset("cavity", **options)
-    path = scenario_paths("cavity", **options)[scenario]
+    path = scenario_paths("cavity", **options)[viscous]
     expected = torch.tensor([2e-3])
-    torch.testing.assert_close(collate([data[0]]).viscosity, expected)
-    torch.testing.assert_close(scenario_batch(path).viscosity, expected)
+    of_loader = batch_of(data, 0)
+    of_rollout = scenario_batch(path)
+    torch.testing.assert_close(of_loader.viscosity, expected)
+    torch.testing.assert_close(of_rollout.viscosity, expected)
 
 
 def test_windows_have_the_viscosity_of_the_data_set_where_files_state_none(
@@ -323,16 +402,25 @@ def test_windows_have_the_viscosity_of_the_data_set_where_files_state_none(
     )
     task = unmeasured.size("curl-noise", "tiny").task
     assert task.effective_viscosity is not None
-    assert data[0].viscosity == data.viscosity == task.effective_viscosity
+    assert data.viscosity == task.effective_viscosity
+    assert data[0].viscosity == task.effective_viscosity
 
 
-@pytest.mark.parametrize("stated", [-1e-3, float("nan"), "thick"])
+@pytest.mark.parametrize(
+    "stated",
+    [
+        -1e-3,
+        float("nan"),
+        "thick",
+    ],
+)
 def test_a_viscosity_that_is_none_is_damage(
-    tmp_path: Path, unmeasured: Registry, stated: object
+    tmp_path: Path,
+    unmeasured: Registry,
+    viscous: int,
+    stated: object,
 ) -> None:
-    (scenario,) = unmeasured.size("cavity", "tiny").subsets["valid"][:1]
-    write_viscous(tmp_path, unmeasured, split="cavity", stated={scenario: 1e-3})
-    path = tmp_path / f"cavity/tiny/v2/valid/{scenario:04d}.nc"
+    path = tmp_path / f"cavity/tiny/v2/valid/{viscous:04d}.nc"
     with h5py.File(path, "r+") as file:
         file.attrs["viscosity"] = stated
     data = lagbench.windows(
@@ -353,13 +441,17 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
     first = data[2]  # of 8 particles
     second = data[34 + 20 + 1]  # of 11 particles
     batch = collate([first, second])
-    assert batch.sample.tolist() == 8 * [0] + 11 * [1]
+    of_first = 8 * [0]
+    of_second = 11 * [1]
+    assert batch.sample.tolist() == of_first + of_second
     assert batch.scenario.tolist() == [0, 2]
     assert batch.frame.tolist() == [2, 1]
-    assert torch.equal(batch.position[8:], second.position)
+    position_of_second = batch.position[8:]
+    assert torch.equal(position_of_second, second.position)
     assert batch.material.shape == (19,)
     assert batch.wall_velocity is not None
-    assert batch.wall_velocity.shape == (2, LENGTH, 4, 2)
+    expected_shape = (2, LENGTH, 4, 2)
+    assert batch.wall_velocity.shape == expected_shape
 
 
 def test_windows_that_do_not_fit_are_not_collated(train: Open) -> None:
@@ -384,28 +476,40 @@ def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None
     stored = path.read_bytes()
     position = data[0].position.clone()
     changed = data[0]
-    for values in (changed.position, changed.material, changed.wall_velocity):
+    for values in (
+        changed.position,
+        changed.material,
+        changed.wall_velocity,
+    ):
         assert values is not None
         values.fill_(7)
     assert torch.equal(data[0].position, position)
-    batch = collate([data[0]])
+    batch = batch_of(data, 0)
     assert batch.material.max() == 3
     assert batch.wall_velocity is not None
     assert batch.wall_velocity.max() == 0.125
     assert path.read_bytes() == stored
 
 
-@pytest.mark.parametrize("limit", [0, 100, 10 * 8 * 8])
+SOME_FRAMES = 10 * 8 * 8
+"""Bytes of ten frames of eight particles."""
+
+
+@pytest.mark.parametrize("limit", [0, 100, SOME_FRAMES])
 def test_memory_is_bounded(train: Open, limit: int) -> None:
     """With any limit of the cache windows are the same."""
     data = train(cache_bytes=limit)
     whole = train()
-    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    order = torch.randperm(len(data), generator=generator)
     for number in order.tolist():
-        assert torch.equal(data[number].position, whole[number].position)
+        position = data[number].position
+        expected = whole[number].position
+        assert torch.equal(position, expected)
         assert data.store.cached_bytes <= limit
     frames = data.store._cached_frames.values()
-    assert sum(frame.nbytes for frame in frames) == data.store.cached_bytes
+    bytes_of_frames = sum(frame.nbytes for frame in frames)
+    assert bytes_of_frames == data.store.cached_bytes
     for frame in frames:
         assert frame.base is None
 
@@ -413,7 +517,11 @@ def test_memory_is_bounded(train: Open, limit: int) -> None:
 def list_open_scenarios() -> set[Path]:
     """Return the descriptors of this process that lead to scenario files."""
     descriptors = Path("/proc/self/fd").iterdir()
-    return {path for path in descriptors if path.resolve().suffix == ".nc"}
+    scenarios = set()
+    for path in descriptors:
+        if path.resolve().suffix == ".nc":
+            scenarios.add(path)
+    return scenarios
 
 
 def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -421,11 +529,13 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
     before = list_open_scenarios()
     monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
     data = train(cache_bytes=0)
-    for number in (0, 40, 60, 0, 40, 60):
+    numbers = [0, 40, 60]  # one window of each scenario
+    for number in numbers + numbers:
         scenario, _ = data.place(number)
         assert data[number].scenario == scenario
         assert len(data.store._open_scenarios) == 1
-        assert len(list_open_scenarios() - before) <= 1
+        newly_open = list_open_scenarios() - before
+        assert len(newly_open) <= 1
 
 
 def test_the_systems_limit_of_files_is_no_damage(train: Open) -> None:
@@ -452,18 +562,22 @@ def test_every_epoch_draws_every_window_once(train: Open) -> None:
         assert sorted(epoch) == list(range(WINDOWS))
     assert epochs[0] != epochs[1]
     assert epochs[1] != epochs[2]
-    assert sampler.state_dict() == {"seed": 5, "epoch": 3, "position": 0}
+    state = sampler.state_dict()
+    assert state == {"seed": 5, "epoch": 3, "position": 0}
 
-    same_seed = WindowSampler(train(cache_bytes=0), seed=5)
-    assert [list(same_seed) for _ in range(3)] == epochs
+    without_cache = train(cache_bytes=0)
+    same_seed = WindowSampler(without_cache, seed=5)
+    same_epochs = [list(same_seed) for _ in range(3)]
+    assert same_epochs == epochs
     another_seed = WindowSampler(data, seed=6)
     assert list(another_seed) != epochs[0]
 
 
 def test_the_order_of_a_seed_stays(train: Open) -> None:
     """A change would break the resumption of older runs."""
-    order = WindowSampler(train(), seed=0).order(0)
-    assert order[:8].tolist() == [61, 70, 63, 8, 2, 53, 11, 18]
+    sampler = WindowSampler(train(), seed=0)
+    beginning = sampler.order(0)[:8]
+    assert beginning.tolist() == [61, 70, 63, 8, 2, 53, 11, 18]
 
 
 @pytest.mark.parametrize("wrong", [-1, 1.5, None, "1"])
@@ -476,16 +590,20 @@ def test_seeds_epochs_and_positions_are_whole_numbers_from_0(
     sampler = WindowSampler(train(), seed=0)
     sampler.seek(3, 10)
     before = sampler.state_dict()
+    wrong_epoch = {"seed": 9, "epoch": wrong, "position": 0}
+    wrong_position = {"seed": 9, "epoch": 0, "position": wrong}
     with pytest.raises(UsageError):
-        sampler.load_state_dict({"seed": 9, "epoch": wrong, "position": 0})
+        sampler.load_state_dict(wrong_epoch)
     with pytest.raises(UsageError):
-        sampler.load_state_dict({"seed": 9, "epoch": 0, "position": wrong})
+        sampler.load_state_dict(wrong_position)
     assert sampler.state_dict() == before
 
 
 def test_the_last_position_is_the_end_of_the_epoch(train: Open) -> None:
     sampler = WindowSampler(train(), seed=0)
-    sampler.seek(np.int64(3), np.int64(WINDOWS))  # type: ignore[arg-type]
+    epoch = np.int64(3)
+    position = np.int64(WINDOWS)
+    sampler.seek(epoch, position)  # type: ignore[arg-type]
     state = sampler.state_dict()
     assert state == {"seed": 0, "epoch": 3, "position": WINDOWS}
     assert json.loads(json.dumps(state)) == state
@@ -514,30 +632,47 @@ def repeat_epochs(sampler: WindowSampler) -> Iterator[int]:
     return itertools.chain.from_iterable(itertools.repeat(sampler))
 
 
-@pytest.mark.parametrize("drawn", [0, 1, 30, WINDOWS - 1, WINDOWS, WINDOWS + 3])
+def next_of(windows: Iterator[int], count: int) -> list[int]:
+    """Return the next windows that a sampler draws."""
+    return list(itertools.islice(windows, count))
+
+
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        0,
+        1,
+        30,
+        WINDOWS - 1,
+        WINDOWS,
+        WINDOWS + 3,
+    ],
+)
 def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
     """A sampler loaded from a state in mid-epoch goes on as the first would have."""
     first = WindowSampler(train(), seed=3)
     windows = repeat_epochs(first)
-    assert len(list(itertools.islice(windows, drawn))) == drawn
-    state = json.loads(json.dumps(first.state_dict()))
+    assert len(next_of(windows, drawn)) == drawn
+    stored_state = json.dumps(first.state_dict())
     second = WindowSampler(train(), seed=0)
-    second.load_state_dict(state)
+    second.load_state_dict(json.loads(stored_state))
 
-    expected = list(itertools.islice(windows, 2 * WINDOWS))
     resumed = repeat_epochs(second)
-    assert list(itertools.islice(resumed, 2 * WINDOWS)) == expected
+    expected = next_of(windows, 2 * WINDOWS)
+    assert next_of(resumed, 2 * WINDOWS) == expected
 
 
 def test_ranks_share_out_one_order(train: Open) -> None:
     """Three ranks draw every third window each, together all but the last few."""
     data = train()
-    order = WindowSampler(data, seed=1).order(0).tolist()
+    alone = WindowSampler(data, seed=1)
+    order = alone.order(0).tolist()
     share = WINDOWS // 3
     for rank in range(3):
         sampler = WindowSampler(data, seed=1, rank=rank, ranks=3)
         assert len(sampler) == share
-        assert list(sampler) == order[rank : 3 * share : 3]
+        of_rank = order[rank::3]
+        assert list(sampler) == of_rank[:share]
 
 
 @pytest.mark.parametrize(
@@ -561,7 +696,8 @@ def test_a_sampler_asks_torch_for_its_rank(
     train: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = train()
-    expected = list(WindowSampler(data, seed=1, rank=1, ranks=3))
+    second_of_three = WindowSampler(data, seed=1, rank=1, ranks=3)
+    expected = list(second_of_three)
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
@@ -570,10 +706,10 @@ def test_a_sampler_asks_torch_for_its_rank(
 
 def test_one_rank_draws_what_two_ranks_have_left(train: Open) -> None:
     data = train()
-    order = WindowSampler(data, seed=1).order(0).tolist()
-    of_two = WindowSampler(data, seed=1, rank=1, ranks=2)
-    assert len(list(itertools.islice(of_two, 5))) == 5
     alone = WindowSampler(data, seed=1)
+    order = alone.order(0).tolist()
+    of_two = WindowSampler(data, seed=1, rank=1, ranks=2)
+    assert len(next_of(iter(of_two), 5)) == 5
     alone.load_state_dict(of_two.state_dict())
     assert list(alone) == order[10:]
 
@@ -583,9 +719,15 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
 
     Without a pool it would read each frame seven times.
     """
-    monkeypatch.setattr(lagbench_torch, "RUN", 8)
-    data = train(cache_bytes=3 * 14 * 11 * 8)
-    monkeypatch.setattr(lagbench_torch, "POOL_BYTES", 3 * 14 * data.frame_bytes)
+    # A run of 8 windows of 7 frames has 14 frames.
+    run = 8
+    run_frames = 14
+    runs_of_a_pool = 3
+    largest_frame = 11 * 8  # bytes
+    monkeypatch.setattr(lagbench_torch, "RUN", run)
+    data = train(cache_bytes=runs_of_a_pool * run_frames * largest_frame)
+    pool_bytes = runs_of_a_pool * run_frames * data.frame_bytes
+    monkeypatch.setattr(lagbench_torch, "POOL_BYTES", pool_bytes)
     frames_read: list[int] = []
     read = store_windows.FrameStore._read
 
@@ -601,14 +743,14 @@ def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(store_windows.FrameStore, "_read", read_and_count)
     order = list(WindowSampler(data, seed=0))
     assert sorted(order) == list(range(WINDOWS))
-    for start in range(0, WINDOWS, 24):
-        pool = order[start : start + 24]
+    windows_of_a_pool = runs_of_a_pool * run
+    for start in range(0, WINDOWS, windows_of_a_pool):
+        pool = order[start : start + windows_of_a_pool]
         scenarios = {data.place(number)[0] for number in pool}
         assert len(scenarios) <= 3
     for number in order:
         data[number]
-    # A run of 8 windows has 14 frames: 79 windows at 14/8 frames, and a few more of
-    # shorter runs.
+    # 79 windows at 14/8 frames, and a few more of shorter runs.
     assert len(frames_read) <= 2 * WINDOWS
 
 
@@ -639,46 +781,60 @@ def test_worker_processes_read_the_same(train: Open) -> None:
         )
         return list(loader)
 
-    expected = load_batches(0)
+    expected_batches = load_batches(0)
     batches = load_batches(2)
-    assert len(expected) == 16
-    for batch, expected_batch in zip(batches, expected, strict=True):
-        assert_same(batch, expected_batch)
+    assert len(expected_batches) == 16
+    for batch, expected in zip(batches, expected_batches, strict=True):
+        assert_same(batch, expected)
+
+
+Paths = dict[int, Path]
 
 
 @pytest.fixture
-def paths_of_test(root: Path, registry: Registry) -> dict[int, Path]:
+def paths_of_test(location: Location) -> Paths:
     """The files of the test scenarios."""
-    return scenario_paths("cavity", size="tiny", root=root, registry=registry)
+    return scenario_paths("cavity", **location)
 
 
-def test_whole_scenarios_lie_side_by_side(paths_of_test: dict[int, Path]) -> None:
-    batch = scenario_batch(list(paths_of_test.values()), slice(3, 9))
+def test_whole_scenarios_lie_side_by_side(paths_of_test: Paths) -> None:
+    files = list(paths_of_test.values())
+    batch = scenario_batch(files, slice(3, 9))
     assert list(paths_of_test) == [4, 5]
     assert batch.windows == 2
     assert batch.frames == 6
     assert batch.scenario.tolist() == [4, 5]
     assert batch.frame.tolist() == [3, 3]
     for row, scenario in enumerate(paths_of_test):
-        expected = frames_of(scenario, 26, 8)[3:9].transpose(1, 0, 2)
-        position = batch.position[batch.sample == row]
+        all_frames = frames_of(scenario, 26, 8)
+        expected = all_frames[3:9].transpose(1, 0, 2)
+        is_of_scenario = batch.sample == row
+        position = batch.position[is_of_scenario]
         assert_array_equal(position.numpy(), expected)
 
 
-def test_a_whole_scenario_has_all_frames_by_default(
-    paths_of_test: dict[int, Path],
-) -> None:
-    assert scenario_batch(paths_of_test[4]).frames == 26
-    assert scenario_batch(paths_of_test[4], slice(-2, None)).frame.tolist() == [24]
+def test_a_whole_scenario_has_all_frames_by_default(paths_of_test: Paths) -> None:
+    path = paths_of_test[4]
+    assert scenario_batch(path).frames == 26
+    last_two = scenario_batch(path, slice(-2, None))
+    assert last_two.frame.tolist() == [24]
 
 
-@pytest.mark.parametrize("frames", [slice(50, 60), slice(0, 10, 2), slice(5, 5)])
+@pytest.mark.parametrize(
+    "frames",
+    [
+        slice(50, 60),
+        slice(0, 10, 2),
+        slice(5, 5),
+    ],
+)
 def test_frames_that_do_not_follow_each_other_are_refused(
-    paths_of_test: dict[int, Path], frames: slice
+    paths_of_test: Paths, frames: slice
 ) -> None:
+    path = paths_of_test[4]
     with pytest.raises(UsageError) as caught:
-        scenario_batch(paths_of_test[4], frames)
-    assert caught.value.where == str(paths_of_test[4])
+        scenario_batch(path, frames)
+    assert caught.value.where == str(path)
 
 
 def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
@@ -704,25 +860,23 @@ def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
     ],
 )
 def test_options_without_data_are_refused(
-    root: Path,
-    registry: Registry,
-    options: dict[str, object],
-    words: str,
+    location: Location, options: dict[str, object], words: str
 ) -> None:
     """The error says what to do."""
-    all_options: dict[str, Any] = {
+    right_options = {
         "split": "cavity",
-        "size": "tiny",
         "history": 6,
-    } | options
+    }
+    all_options: dict[str, Any] = location | right_options | options
     with pytest.raises(LagbenchError, match="(?s)" + words):
-        WindowDataset(**all_options, root=root, registry=registry)
+        WindowDataset(**all_options)
 
 
 def write_train(root: Path) -> Path:
     """Write the scenarios of train and return their folder."""
-    for scenario, frames in FRAMES.items():
-        write_scenario(root, make_key(scenario, subset="train"), frames=frames)
+    for scenario, frame_count in FRAMES.items():
+        key = make_key(scenario, subset="train")
+        write_scenario(root, key, frames=frame_count)
     return next(root.rglob("train"))
 
 
@@ -743,7 +897,8 @@ def test_bytes_that_are_no_netcdf_file_are_damage(tmp_path: Path, train: Open) -
 def test_a_scenario_of_another_length_is_refused(tmp_path: Path, train: Open) -> None:
     write_train(tmp_path)
     key = make_key(1, subset="train")
-    write_scenario(tmp_path, key, frames=FRAMES[1] + 1)
+    one_more = FRAMES[1] + 1
+    write_scenario(tmp_path, key, frames=one_more)
     assert_data_error(train(tmp_path), 40, "not that of the registry")
 
 
@@ -752,7 +907,8 @@ def test_a_scenario_under_another_id_is_refused(tmp_path: Path, train: Open) -> 
     folder = write_train(tmp_path)
     path = folder / "0002.nc"
     content = path.read_bytes()
-    path.write_bytes((folder / "0000.nc").read_bytes())
+    other_content = (folder / "0000.nc").read_bytes()
+    path.write_bytes(other_content)
     data = train(tmp_path)
     assert_data_error(data, 60, "not that of the registry")
     path.unlink()
@@ -769,9 +925,11 @@ def test_a_scenario_of_another_hash_is_refused(
     tmp_path: Path, registry: Registry
 ) -> None:
     path = write_train(tmp_path) / "0002.nc"
-    measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
-    size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
-    store = store_windows.FrameStore(size, {2: path})
+    another_hash = "0" * 16
+    measured = SimpleNamespace(scenario_sha256={2: another_hash})
+    tiny = registry.size("cavity", "tiny")
+    measured_tiny = tiny.model_copy(update={"measured": measured})
+    store = store_windows.FrameStore(measured_tiny, {2: path})
     with pytest.raises(DataError) as caught:
         store.frames(2, 0, 2)
     assert caught.value.where == str(path)
@@ -783,7 +941,9 @@ def test_a_changed_value_is_noticed_where_asked(tmp_path: Path, train: Open) -> 
     Files that were hashed are noted, and a change after that is noticed too.
     """
     folder = write_train(tmp_path)
-    assert len(train(tmp_path, verify=True)) == len(train(tmp_path))
+    unverified = train(tmp_path)
+    verified = train(tmp_path, verify=True)
+    assert len(verified) == len(unverified)
     path = folder / "0001.nc"
     with h5py.File(path, "r+") as file:
         file["position"][3, 2, 0] += np.float32(1e-3)
@@ -796,7 +956,8 @@ def test_a_changed_value_is_noticed_where_asked(tmp_path: Path, train: Open) -> 
 
 def extrapolate(batch: Batch) -> torch.Tensor:
     """Move particles on as before, plus the walls' velocities of the next frame."""
-    before, now = batch.position[:, -2:].unbind(1)
+    last_two = batch.position[:, -2:]
+    before, now = last_two.unbind(1)
     assert batch.wall_velocity is not None
     next_wall_velocity = batch.wall_velocity[batch.sample, batch.frames]
     return 2 * now - before + next_wall_velocity.sum(1)
@@ -805,10 +966,12 @@ def extrapolate(batch: Batch) -> torch.Tensor:
 def test_a_window_is_followed_by_a_frame(train: Open) -> None:
     """The first frame leaves, the new one joins, with forcing and frame number."""
     data = train(history=3, future=2)
-    batch = collate([data[0], data[4]])
+    batch = batch_of(data, 0, 4)
     window = batch.part(slice(3))
-    later = window.followed_by(batch.position[:, 3])
-    assert_same(later, batch.part(slice(1, 4)))
+    next_position = batch.position[:, 3]
+    later = window.followed_by(next_position)
+    expected = batch.part(slice(1, 4))
+    assert_same(later, expected)
     assert later.frame.tolist() == [1, 5]
     assert window.frames == 3
     assert later.frames == 3
@@ -826,7 +989,7 @@ def test_a_window_is_followed_by_a_frame(train: Open) -> None:
 def test_parts_are_consecutive_frames(train: Open, frames: slice) -> None:
     """With steps the forcing would be that of another frame."""
     data = train(history=3, future=2)
-    batch = collate([data[0], data[4]])
+    batch = batch_of(data, 0, 4)
     with pytest.raises(UsageError):
         batch.part(frames)
 
@@ -834,43 +997,58 @@ def test_parts_are_consecutive_frames(train: Open, frames: slice) -> None:
 def test_a_rollout_feeds_on_itself(train: Open) -> None:
     """By hand: x2 = 2 x1 - x0 + w2 and x3 = 2 x2 - x1 + w3, with gradients."""
     data = train(history=2, future=2)
-    batch = collate([data[0], data[40]])
+    batch = batch_of(data, 0, 40)
     assert batch.wall_velocity is not None
     x0 = batch.position[:, 0].requires_grad_()
     x1 = batch.position[:, 1]
-    w2 = batch.wall_velocity[batch.sample, 2].sum(1)
-    w3 = batch.wall_velocity[batch.sample, 3].sum(1)
+    wall_velocity = batch.wall_velocity[batch.sample]
+    w2 = wall_velocity[:, 2].sum(1)
+    w3 = wall_velocity[:, 3].sum(1)
     x2 = 2 * x1 - x0 + w2
     x3 = 2 * x2 - x1 + w3
     expected = torch.stack([x2, x3], 1)
 
-    window = replace(batch.part(slice(2)), position=torch.stack([x0, x1], 1))
+    given = torch.stack([x0, x1], 1)
+    window = replace(batch.part(slice(2)), position=given)
     path = roll_out(extrapolate, window, 2)
     assert torch.equal(path, expected)
     path.sum().backward()
     assert x0.grad is not None
-    assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
+    expected_gradient = torch.full_like(x0, -3.0)
+    assert torch.equal(x0.grad, expected_gradient)
 
 
 @pytest.fixture
 def two_frames(train: Open) -> Batch:
     """A window of two frames with the forcing of three more."""
-    return collate([train(history=2, future=3)[0]]).part(slice(2))
+    data = train(history=2, future=3)
+    return batch_of(data, 0).part(slice(2))
+
+
+def last_position(batch: Batch) -> torch.Tensor:
+    """Leave every particle where it is."""
+    return batch.position[:, -1]
 
 
 def test_a_rollout_ends_where_the_forcing_does(two_frames: Batch) -> None:
     """A model that takes the last known velocity of walls would be wrong unseen."""
-    assert roll_out(extrapolate, two_frames, 3).shape[1] == 3
+    path = roll_out(extrapolate, two_frames, 3)
+    assert path.shape[1] == 3
     with pytest.raises(UsageError) as caught:
-        roll_out(lambda batch: batch.position[:, -1], two_frames, 4)
+        roll_out(last_position, two_frames, 4)
     assert caught.value.where == "roll_out"
 
 
 def test_a_model_may_use_the_memory_of_its_output_again(two_frames: Batch) -> None:
     """Every frame of the rollout is as the model returned it."""
-    memory = torch.empty_like(two_frames.position[:, -1])
-    path = roll_out(lambda batch: memory.copy_(extrapolate(batch)), two_frames, 3)
-    assert torch.equal(path, roll_out(extrapolate, two_frames, 3))
+    memory = torch.empty_like(last_position(two_frames))
+
+    def extrapolate_into_memory(batch: Batch) -> torch.Tensor:
+        return memory.copy_(extrapolate(batch))
+
+    path = roll_out(extrapolate_into_memory, two_frames, 3)
+    expected = roll_out(extrapolate, two_frames, 3)
+    assert torch.equal(path, expected)
 
 
 @pytest.mark.parametrize(
@@ -886,8 +1064,11 @@ def test_a_model_may_use_the_memory_of_its_output_again(two_frames: Batch) -> No
 def test_outputs_that_are_no_positions_are_refused(
     two_frames: Batch, change_output: Callable[[Any], Any]
 ) -> None:
+    def step(batch: Batch) -> Any:
+        return change_output(last_position(batch))
+
     with pytest.raises(UsageError):
-        roll_out(lambda batch: change_output(batch.position[:, -1]), two_frames, 2)
+        roll_out(step, two_frames, 2)
 
 
 def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:
@@ -897,7 +1078,7 @@ def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:
 
 @pytest.mark.parametrize("history", [None, 2])
 def test_predictions_are_rollouts_of_the_task(
-    root: Path, registry: Registry, history: int | None
+    location: Location, registry: Registry, history: int | None
 ) -> None:
     """They start from the last input frames of every test scenario.
 
@@ -909,26 +1090,31 @@ def test_predictions_are_rollouts_of_the_task(
         batches.append(batch)
         return extrapolate(batch)
 
-    location: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
-    predictions = dict(
-        predict(step, "cavity", history=history, device="cpu", **location)
+    rollouts = predict(
+        step,
+        "cavity",
+        history=history,
+        device="cpu",
+        **location,
     )
+    predictions = dict(rollouts)
     assert list(predictions) == [4, 5]
 
     task = registry.size("cavity", "tiny").task
-    start = task.input_frames - (history or task.input_frames)
+    input_frames = task.input_frames
+    start = input_frames - (history or input_frames)
     paths = scenario_paths("cavity", **location)
     for row, (scenario, path) in enumerate(paths.items()):
-        window = scenario_batch(path).part(slice(start, task.input_frames))
+        window = scenario_batch(path).part(slice(start, input_frames))
         assert_same(batches[row * task.horizon], window)
-        expected = roll_out(extrapolate, window, task.horizon).transpose(0, 1)
-        assert predictions[scenario].dtype == np.float32
-        assert_array_equal(predictions[scenario], expected.numpy())
+        rollout = roll_out(extrapolate, window, task.horizon)
+        expected = rollout.transpose(0, 1).numpy()
+        prediction = predictions[scenario]
+        assert prediction.dtype == np.float32
+        assert_array_equal(prediction, expected)
 
 
-def test_predictions_that_are_no_numbers_are_refused(
-    root: Path, registry: Registry
-) -> None:
+def test_predictions_that_are_no_numbers_are_refused(location: Location) -> None:
     """The scenario, the first such frame and the particle are named."""
 
     def step(batch: Batch) -> torch.Tensor:
@@ -937,26 +1123,19 @@ def test_predictions_that_are_no_numbers_are_refused(
             position[3, 1] = torch.nan
         return position
 
+    predictions = predict(step, "cavity", history=2, **location)
     with pytest.raises(UsageError) as caught:
-        next(
-            predict(
-                step,
-                "cavity",
-                size="tiny",
-                root=root,
-                registry=registry,
-                history=2,
-            )
-        )
-    assert "scenario 4" in str(caught.value.where)
-    assert "particle 3" in str(caught.value.where)
+        next(predictions)
+    where = str(caught.value.where)
+    assert "scenario 4" in where
+    assert "particle 3" in where
 
 
 @pytest.mark.parametrize("history", [0, 7])
 def test_predictions_start_from_the_input_frames_of_the_task(
-    root: Path, registry: Registry, history: int
+    location: Location, history: int
 ) -> None:
-    location: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
+    predictions = predict(extrapolate, "cavity", history=history, **location)
     with pytest.raises(UsageError) as caught:
-        next(predict(extrapolate, "cavity", history=history, **location))
+        next(predictions)
     assert caught.value.where == "predict"
