@@ -21,7 +21,7 @@ from lagbench.cli import output
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.figures.tables import Table
 from lagbench.metrics import differ
-from lagbench.scoring.card import digits
+from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.compare import compare
 from lagbench.scoring.tables import (
     card_tables,
@@ -30,16 +30,25 @@ from lagbench.scoring.tables import (
     flag_lines,
 )
 
+Folders = dict[str, Path]
+
+ONES = [1.0] * 6
+TWOS = [2.0] * 6
+
 
 @pytest.fixture(scope="module")
-def scored(
-    bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory
-) -> dict[str, Path]:
+def scored(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> Folders:
     """Folders of two scored submissions."""
+    methods = {
+        "still": still,
+        "straight": straight,
+    }
     folders = {}
-    for name, predict in {"still": still, "straight": straight}.items():
+    for name, predict in methods.items():
         folder = tmp_path_factory.mktemp(name)
-        bench.score(bench.submit(folder / "predictions.nc", predict, method=name))
+        path = folder / "predictions.nc"
+        bench.submit(path, predict, method=name)
+        bench.score(path)
         folders[name] = folder
     return folders
 
@@ -54,6 +63,7 @@ def rows_of(values: Sequence[object], undefined: Any = None) -> dict[str, Any]:
 
 def publish(folder: Path, values: list[float], *, method: str, **changes: Any) -> Path:
     """Write a scores.json of one metric with these values per scenario."""
+    scenarios = list(range(len(values)))
     content = {
         "lagbench_scores": 1,
         "split": "cavity",
@@ -62,7 +72,7 @@ def publish(folder: Path, values: list[float], *, method: str, **changes: Any) -
         "dataset_sha256": "0" * 64,
         "method": method,
         "predictions_sha256": method,
-        "task": {"scenarios": list(range(len(values)))},
+        "task": {"scenarios": scenarios},
         "ranking_metric": "mse_avg",
         "rows": rows_of(values),
     }
@@ -80,9 +90,14 @@ def publish_seeds(
 ) -> Path:
     """Write a folder of the seeds of a method and return it."""
     for seed, values in enumerate(rows):
-        all_changes = {"predictions_sha256": f"{method}{seed}"} | changes
+        own_hash = {"predictions_sha256": f"{method}{seed}"}
         seed_folder = folder / str(seed)
-        path = publish(seed_folder, list(values), method=method, **all_changes)
+        path = publish(
+            seed_folder,
+            list(values),
+            method=method,
+            **(own_hash | changes),
+        )
         path.rename(seed_folder / "scores.json")
     return folder
 
@@ -93,14 +108,14 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     b = publish(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
     result = compare(a, b)
     metric = result.metrics["mse_avg"]
-    assert metric.test.p == pytest.approx(2 / 64)
+    p = metric.test.p
+    assert p == pytest.approx(2 / 64)
     assert metric.test.difference == pytest.approx(-7 / 6)
     assert metric.first == pytest.approx(21 / 6)
     assert metric.second == pytest.approx(28 / 6)
     assert result.seeds == (1, 1)
-    assert result.verdict.startswith(
-        "mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each"
-    )
+    beginning = "mse_avg: a is better (p = 0.0312, 6 scenarios, one seed each"
+    assert result.verdict.startswith(beginning)
     assert compare(b, a).verdict == result.verdict
     assert result.verdict in repr(result)
 
@@ -113,7 +128,9 @@ def test_five_wins_of_six_are_not_significant(tmp_path: Path) -> None:
     a = publish(tmp_path, [1, 1, 1, 1, 1, 3], method="a")
     b = publish(tmp_path, [2] * 6, method="b")
     result = compare(a, b)
-    assert result.metrics["mse_avg"].test.p == pytest.approx(14 / 64)
+    metric = result.metrics["mse_avg"]
+    p = metric.test.p
+    assert p == pytest.approx(14 / 64)
     assert "no difference at 5 %" in result.verdict
 
 
@@ -141,10 +158,13 @@ def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
 
 def test_a_value_that_saturates_is_read_again(tmp_path: Path) -> None:
     """In nine digits the greatest of float32 is a little more than it is."""
-    greatest = digits(float(np.finfo(np.float32).max)) or 0.0
+    greatest_float32 = float(np.finfo(np.float32).max)
+    greatest = digits(greatest_float32)
+    assert greatest is not None
     a = publish(tmp_path, [greatest, 1.0, 1.0], method="a")
     b = publish(tmp_path, [1.0, 1.0, 1.0], method="b")
-    metric = compare(a, b).metrics["mse_avg"]
+    result = compare(a, b)
+    metric = result.metrics["mse_avg"]
     assert metric.first == pytest.approx(greatest / 3)
 
 
@@ -174,30 +194,35 @@ def assert_refused_on_either_side(folder: Path, other: Path) -> None:
 
 def test_copies_are_no_seeds(tmp_path: Path) -> None:
     """One file three times is one training."""
-    other = publish(tmp_path, [2.0] * 6, method="other")
+    other = publish(tmp_path, TWOS, method="other")
     copies = publish_seeds(
-        tmp_path / "copies", [[1.0] * 6] * 3, "a", predictions_sha256="a"
+        tmp_path / "copies",
+        [ONES, ONES, ONES],
+        "a",
+        predictions_sha256="a",
     )
     assert_refused_on_either_side(copies, other)
 
 
 def test_a_folder_of_two_methods_is_refused(tmp_path: Path) -> None:
     """The mean of two methods is that of neither."""
-    other = publish(tmp_path, [2.0] * 6, method="other")
-    mixed = publish_seeds(tmp_path / "mixed", [[1.0] * 6], "a")
-    publish(mixed, [1.0] * 6, method="b")
+    other = publish(tmp_path, TWOS, method="other")
+    mixed = publish_seeds(tmp_path / "mixed", [ONES], "a")
+    publish(mixed, ONES, method="b")
     assert_refused_on_either_side(mixed, other)
 
 
 def test_the_table_of_means_counts_undefined_frames(tmp_path: Path) -> None:
     """A mean over few frames is no merit."""
-    rows = rows_of([1.0] * 6, [0, 0, 0, 0, 12, 7])
-    a = publish(tmp_path, [1.0] * 6, method="a", rows=rows)
-    b = publish(tmp_path, [2.0] * 6, method="b")
+    rows = rows_of(ONES, undefined=[0, 0, 0, 0, 12, 7])
+    a = publish(tmp_path, ONES, method="a", rows=rows)
+    b = publish(tmp_path, TWOS, method="b")
     result = compare(a, b)
-    assert result.metrics["mse_avg"].undefined == (19, 0)
-    (means,) = [table for table in comparison_tables(result) if table.title == "means"]
-    ((_, first_cell, second_cell, *_),) = means.rows
+    metric = result.metrics["mse_avg"]
+    assert metric.undefined == (19, 0)
+    tables = {table.title: table for table in comparison_tables(result)}
+    (row,) = tables["means"].rows
+    _, first_cell, second_cell, *_ = row
     assert first_cell.endswith("†19")
     assert "†" not in second_cell
 
@@ -217,14 +242,14 @@ def test_other_data_are_not_compared(
     word: str,
 ) -> None:
     """The error names what differs."""
-    a = publish(tmp_path, [1.0] * 6, method="a")
-    b = publish(tmp_path, [1.0] * 6, method="b", **changes)
+    a = publish(tmp_path, ONES, method="a")
+    b = publish(tmp_path, ONES, method="b", **changes)
     with pytest.raises(error, match=f"differ in {word}"):
         compare(a, b)
 
 
 def test_folders_files_and_predictions_give_the_same_result(
-    bench: ScoreBench, scored: dict[str, Path]
+    bench: ScoreBench, scored: Folders
 ) -> None:
     """A predictions.nc is scored on the way."""
     first = scored["still"]
@@ -246,34 +271,36 @@ def test_folders_files_and_predictions_give_the_same_result(
     assert by_predictions.as_json() == expected
 
 
-def test_a_submission_equals_itself(scored: dict[str, Path]) -> None:
+def test_a_submission_equals_itself(scored: Folders) -> None:
     result = compare(scored["still"], scored["still"])
     assert result.verdict == "both hold the same predictions"
 
 
 def test_the_short_table_leads_with_the_ranking_metric(
-    scored: dict[str, Path],
+    scored: Folders,
 ) -> None:
     """All metrics come on request."""
     result = compare(scored["still"], scored["straight"])
     assert next(iter(result.metrics)) == result.ranking
     short, means = comparison_tables(result)
     whole, _ = comparison_tables(result, every=True)
-    first_row_name = short.rows[0][0].split()[0]
-    assert first_row_name == "vorticity_nrmse"
+    first_cell = short.rows[0][0]
+    metric, *_ = first_cell.split()
+    assert metric == "vorticity_nrmse"
     assert len(means.rows) == len(short.rows)
     assert len(short.rows) < len(whole.rows)
     assert len(whole.rows) == len(result.metrics)
 
 
 @pytest.fixture
-def board(scored: dict[str, Path], tmp_path: Path) -> Path:
+def board(scored: Folders, tmp_path: Path) -> Path:
     """A folder of a leaderboard with two seeds of one method."""
     folder = tmp_path / "scores" / "cavity" / "tiny"
     folder.mkdir(parents=True)
     for seed, name in enumerate(("still", "straight")):
+        scores = scored[name] / "scores.nc"
         path = folder / f"moving_{seed}.nc"
-        shutil.copy(scored[name] / "scores.nc", path)
+        shutil.copy(scores, path)
         with netCDF4.Dataset(path, "a") as file:
             file.method = "moving"
     return folder
@@ -283,7 +310,8 @@ def test_seeds_of_a_leaderboard_go_by_their_common_name(
     board: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(board)
-    assert compare("moving.nc", "constant-velocity").seeds == (2, 1)
+    result = compare("moving.nc", "constant-velocity")
+    assert result.seeds == (2, 1)
     (board / "moving_old.nc").write_bytes(b"not a seed")
     result = compare(board / "moving.nc", "constant-velocity")
     assert result.first == "moving"
@@ -291,30 +319,34 @@ def test_seeds_of_a_leaderboard_go_by_their_common_name(
 
 
 @pytest.fixture
-def entries(scored: dict[str, Path], bench: ScoreBench, tmp_path: Path) -> Path:
+def entries(scored: Folders, bench: ScoreBench, tmp_path: Path) -> Path:
     """A leaderboard with one entry, named ``moving``, for the data of the bench."""
-    folder = tmp_path / "board" / "scores" / bench.size.split / bench.size.name
+    board = tmp_path / "board"
+    folder = board / "scores" / bench.size.split / bench.size.name
     folder.mkdir(parents=True)
-    shutil.copy(scored["straight"] / "scores.nc", folder / "moving.nc")
-    return tmp_path / "board"
+    scores = scored["straight"] / "scores.nc"
+    shutil.copy(scores, folder / "moving.nc")
+    return board
 
 
 def test_an_entry_of_the_leaderboard_goes_by_its_name(
-    scored: dict[str, Path], entries: Path, bench: ScoreBench
+    scored: Folders, entries: Path, bench: ScoreBench
 ) -> None:
     """On the right its name is enough; on the left the data set belongs to it."""
     result = compare(scored["still"], "moving", board=entries)
     assert result.second == "straight"
-    assert result.metrics[result.ranking].side == "worse"
+    metric = result.metrics[result.ranking]
+    assert metric.side == "worse"
     name = f"{bench.size.split}/{bench.size.name}/moving"
     swapped = compare(name, scored["still"], board=entries)
-    assert swapped.metrics[swapped.ranking].side == "better"
+    metric = swapped.metrics[swapped.ranking]
+    assert metric.side == "better"
     with pytest.raises(UsageError, match=name):
         compare("moving", "persistence", board=entries)
 
 
 def test_an_unknown_entry_is_refused_before_predictions_are_scored(
-    scored: dict[str, Path],
+    scored: Folders,
     entries: Path,
     bench: ScoreBench,
     monkeypatch: pytest.MonkeyPatch,
@@ -334,71 +366,87 @@ def test_an_unknown_entry_is_refused_before_predictions_are_scored(
     assert "'moving'" in str(caught.value.fix)
 
 
-def test_a_named_board_must_be_one(scored: dict[str, Path], tmp_path: Path) -> None:
+def test_a_named_board_must_be_one(scored: Folders, tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         compare(scored["still"], "moving", board=tmp_path)
     assert str(tmp_path) in str(caught.value.where)
 
 
+WORSE_AND_BETTER = [0.5, 1.5, 1.5, 1.5, 1.5, 1.5]
+
+
+def side_of(first: Path, second: Path) -> str:
+    """Return what the table says of the first method beside the second."""
+    result = compare(first, second)
+    table, *_ = comparison_tables(result)
+    column = table.columns.index("first is")
+    return table.rows[0][column]
+
+
 def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
     """A difference that may be chance has a question mark."""
-    a = publish(tmp_path, [1.0] * 6, method="a")
-    b = publish(tmp_path, [2.0] * 6, method="b")
-    c = publish(tmp_path, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], method="c")
-    sides = []
-    for first, second in ((a, b), (b, a), (a, c), (a, a)):
-        table = next(iter(comparison_tables(compare(first, second))))
-        column = table.columns.index("first is")
-        sides.append(table.rows[0][column])
-    assert sides == ["better", "worse", "better?", "same"]
+    a = publish(tmp_path, ONES, method="a")
+    b = publish(tmp_path, TWOS, method="b")
+    c = publish(tmp_path, WORSE_AND_BETTER, method="c")
+    assert side_of(a, b) == "better"
+    assert side_of(b, a) == "worse"
+    assert side_of(a, c) == "better?"
+    assert side_of(a, a) == "same"
 
 
 def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
     """Five scenarios cannot reach 5 %: neither column nor verdict claims anything."""
-    a = publish(tmp_path, [1.0] * 5, method="a")
-    b = publish(tmp_path, [2.0] * 5, method="b")
+    a = publish(tmp_path, ONES[:5], method="a")
+    b = publish(tmp_path, TWOS[:5], method="b")
+    assert side_of(a, b) == "too few"
     result = compare(a, b)
-    table, _ = comparison_tables(result)
-    assert table.rows[0][table.columns.index("first is")] == "too few"
     assert result.verdict.startswith("5 scenarios decide nothing")
-    assert any("too few" in line for line in comparison_lines(result))
+    text = "\n".join(comparison_lines(result))
+    assert "too few" in text
     # scenarios in which both have equal values are the same, however few
-    table, _ = comparison_tables(compare(a, publish(tmp_path, [1.0] * 5, method="c")))
-    assert table.rows[0][table.columns.index("first is")] == "same"
+    c = publish(tmp_path, ONES[:5], method="c")
+    assert side_of(a, c) == "same"
 
 
 def test_lines_explain_only_what_the_tables_show(tmp_path: Path) -> None:
-    a = publish(tmp_path, [1.0] * 6, method="a")
-    b = publish(tmp_path, [2.0] * 6, method="b")
-    assert len(list(comparison_lines(compare(a, b)))) == 1
-    c = publish(tmp_path, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], method="c")
-    rows = rows_of([1.0] * 6, [2] + [0] * 5)
-    d = publish(tmp_path, [1.0] * 6, method="d", rows=rows)
+    a = publish(tmp_path, ONES, method="a")
+    b = publish(tmp_path, TWOS, method="b")
+    lines = list(comparison_lines(compare(a, b)))
+    assert len(lines) == 1
+    c = publish(tmp_path, WORSE_AND_BETTER, method="c")
+    rows = rows_of(ONES, undefined=[2, 0, 0, 0, 0, 0])
+    d = publish(tmp_path, ONES, method="d", rows=rows)
     _, undefined, chance = comparison_lines(compare(d, c))
     assert undefined.startswith("†")
     assert chance.startswith("?")
 
 
 @pytest.mark.parametrize("every", [False, True])
-def test_a_comparison_fits_a_terminal(scored: dict[str, Path], every: bool) -> None:
+def test_a_comparison_fits_a_terminal(scored: Folders, every: bool) -> None:
     """Each of both tables is one block of 80 columns, whatever the digits are."""
     result = compare(scored["still"], scored["straight"])
     metrics = {}
     for name, comparison in result.metrics.items():
         test = replace(
-            comparison.test, difference=-1.23e-06, interval=(-2.34e-06, -1.11e-07)
+            comparison.test,
+            difference=-1.23e-06,
+            interval=(-2.34e-06, -1.11e-07),
         )
         metrics[name] = replace(comparison, test=test)
-    for table in comparison_tables(replace(result, metrics=metrics), every=every):
-        assert len(list(output.split_table(table, gap=output.NARROW_GAP))) == 1
+    wide = replace(result, metrics=metrics)
+    for table in comparison_tables(wide, every=every):
+        blocks = list(output.split_table(table, gap=output.NARROW_GAP))
+        assert len(blocks) == 1
 
 
-def test_scores_nc_has_the_best_reference(scored: dict[str, Path]) -> None:
+def test_scores_nc_has_the_best_reference(scored: Folders) -> None:
     """It has the ranking metric of it, while scores.json has all metrics."""
-    from_file = compare(scored["still"] / "scores.nc", "constant-velocity").as_json()
-    from_folder = compare(scored["still"], "constant-velocity").as_json()
-    expected = {"vorticity_nrmse": from_folder["metrics"]["vorticity_nrmse"]}
-    assert from_file["metrics"] == expected
+    folder = scored["still"]
+    file = folder / "scores.nc"
+    from_file = compare(file, "constant-velocity").as_json()
+    from_folder = compare(folder, "constant-velocity").as_json()
+    nrmse = from_folder["metrics"]["vorticity_nrmse"]
+    assert from_file["metrics"] == {"vorticity_nrmse": nrmse}
 
 
 def test_a_method_that_a_terminal_would_obey_is_unreadable(board: Path) -> None:
@@ -412,7 +460,8 @@ def test_a_method_that_a_terminal_would_obey_is_unreadable(board: Path) -> None:
 
 def test_a_truncated_file_is_unreadable(board: Path) -> None:
     path = board / "moving_1.nc"
-    path.write_bytes(path.read_bytes()[:9000])
+    content = path.read_bytes()
+    path.write_bytes(content[:9000])
     with pytest.raises(UnreadableFileError):
         compare(path, "constant-velocity")
 
@@ -423,52 +472,54 @@ def test_outside_a_leaderboard_a_name_stands_for_itself(board: Path) -> None:
         compare(outside / "predictions.nc", "constant-velocity")
 
 
-def test_links_are_followed(scored: dict[str, Path], tmp_path: Path) -> None:
+def test_links_are_followed(scored: Folders, tmp_path: Path) -> None:
     link = tmp_path / "linked.nc"
     link.symlink_to(scored["still"] / "scores.nc")
-    assert compare(link, scored["straight"]).first == "still"
+    result = compare(link, scored["straight"])
+    assert result.first == "still"
 
 
 @pytest.fixture
-def seed_folder(scored: dict[str, Path], tmp_path: Path) -> Path:
+def seed_folder(scored: Folders, tmp_path: Path) -> Path:
     """A folder of two seeds, of which one has lost its scores.json."""
     first = tmp_path / "0"
     second = tmp_path / "1"
     for folder in (first, second, tmp_path / "notes"):
         folder.mkdir()
-    content = json.loads((scored["still"] / "scores.json").read_text())
-    (first / "scores.json").write_text(json.dumps(content | {"method": "straight"}))
-    shutil.copy(scored["straight"] / "scores.nc", second)
+    text = (scored["still"] / "scores.json").read_text()
+    content = json.loads(text)
+    content["method"] = "straight"
+    (first / "scores.json").write_text(json.dumps(content))
+    scores = scored["straight"] / "scores.nc"
+    shutil.copy(scores, second)
     return tmp_path
 
 
 def test_either_file_makes_a_seed(seed_folder: Path) -> None:
     """A folder without scores is passed over."""
-    assert compare(seed_folder, "persistence").seeds == (2, 1)
+    result = compare(seed_folder, "persistence")
+    assert result.seeds == (2, 1)
 
 
-def test_a_seed_is_not_compared_with_itself(
-    scored: dict[str, Path], seed_folder: Path
-) -> None:
+def test_a_seed_is_not_compared_with_itself(scored: Folders, seed_folder: Path) -> None:
     with pytest.raises(UsageError) as caught:
         compare(seed_folder, scored["straight"])
     assert str(seed_folder) in str(caught.value.where)
 
 
-def test_a_reference_goes_second(scored: dict[str, Path]) -> None:
+def test_a_reference_goes_second(scored: Folders) -> None:
     with pytest.raises(UsageError):
         compare("persistence", scored["still"])
 
 
-def test_scores_nc_has_no_other_reference(scored: dict[str, Path]) -> None:
+def test_scores_nc_has_no_other_reference(scored: Folders) -> None:
+    path = scored["still"] / "scores.nc"
     with pytest.raises(UsageError) as caught:
-        compare(scored["still"] / "scores.nc", "analog")
+        compare(path, "analog")
     assert caught.value.expected == "analog"
 
 
-def test_an_empty_file_is_no_submission(
-    scored: dict[str, Path], tmp_path: Path
-) -> None:
+def test_an_empty_file_is_no_submission(scored: Folders, tmp_path: Path) -> None:
     path = tmp_path / "scores.nc"
     path.touch()
     with pytest.raises(UnreadableFileError) as caught:
@@ -476,27 +527,31 @@ def test_an_empty_file_is_no_submission(
     assert caught.value.where == str(path)
 
 
-def test_a_reference_is_as_good_as_its_submission(scored: dict[str, Path]) -> None:
+def test_a_reference_is_as_good_as_its_submission(scored: Folders) -> None:
     """A reference's name compares with the row beside the submission."""
-    by_name = compare(scored["still"], "constant-velocity").as_json()
-    by_file = compare(scored["still"], scored["straight"]).as_json()
+    folder = scored["still"]
+    other = scored["straight"]
+    by_name = compare(folder, "constant-velocity").as_json()
+    by_file = compare(folder, other).as_json()
     assert by_name["metrics"] == by_file["metrics"]
     assert by_name["second"] == "constant-velocity"
     assert by_file["second"] == "straight"
 
 
-def test_a_misspelt_metric_or_reference_is_refused(
-    scored: dict[str, Path],
-) -> None:
+def test_a_misspelt_metric_or_reference_is_refused(scored: Folders) -> None:
+    first = scored["still"]
+    second = scored["straight"]
     with pytest.raises(UsageError) as caught:
-        compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
+        compare(first, second, metrics=["vorticity_rsme"])
     assert caught.value.where == "--metric"
     with pytest.raises(UsageError):
-        compare(scored["still"], "constant-velocty")
+        compare(first, "constant-velocty")
 
 
-def test_chosen_metrics_come_after_the_ranking_metric(scored: dict[str, Path]) -> None:
-    result = compare(scored["still"], scored["straight"], metrics=["mse_end"])
+def test_chosen_metrics_come_after_the_ranking_metric(scored: Folders) -> None:
+    first = scored["still"]
+    second = scored["straight"]
+    result = compare(first, second, metrics=["mse_end"])
     assert list(result.metrics) == ["vorticity_nrmse", "mse_end"]
 
 
@@ -524,40 +579,56 @@ def test_two_submissions_of_one_method_are_numbered(tmp_path: Path) -> None:
 
 def test_a_reference_keeps_its_name(tmp_path: Path) -> None:
     """A submission that borrows its name is numbered."""
-    rows = rows_of([1] * 6)
+    rows = rows_of(ONES)
     rows["floor"] = rows["submission"]
-    path = publish(tmp_path, [1] * 6, method="floor", rows=rows)
+    path = publish(tmp_path, ONES, method="floor", rows=rows)
     result = compare(path, "floor")
     assert result.first == "floor (1)"
     assert result.second == "floor"
     assert not result.namesakes
 
 
-ENERGY_ROWS = {
-    "submission": {"energy_true": {"values": [1] * 6, "undefined": [0] * 6}},
-}
+INFINITE = float("inf")
+
+
+def first_value(value: object) -> dict[str, Any]:
+    """Return changes after which the value of the first scenario is another."""
+    return {"rows": rows_of([value, *ONES[1:]])}
+
+
+def undefined_frames(*undefined: float) -> dict[str, Any]:
+    """Return changes after which so many frames of each scenario are undefined."""
+    return {"rows": rows_of(ONES, list(undefined))}
+
+
+def scenario_ids(*ids: object) -> dict[str, Any]:
+    """Return changes after which the scenarios have other ids."""
+    return {"task": {"scenarios": list(ids)}}
+
+
+ENERGY = {"values": ONES, "undefined": [0] * 6}
 MALFORMED: dict[str, dict[str, Any]] = {
-    "a number beyond float64": {"rows": rows_of([10**400, 1, 1, 1, 1, 1])},
-    "an infinite value": {"rows": rows_of([float("inf"), 1, 1, 1, 1, 1])},
-    "infinitely many undefined frames": {"rows": rows_of([1] * 6, [float("inf")] * 6)},
-    "undefined frames of one scenario": {"rows": rows_of([1] * 6, [0])},
-    "ids that occur twice": {"task": {"scenarios": [28] * 6}},
-    "an id that is no integer": {"task": {"scenarios": [0, 1, 2, 3, 4, 5.5]}},
+    "a number beyond float64": first_value(10**400),
+    "an infinite value": first_value(INFINITE),
+    "a boolean as value": first_value(True),
+    "infinitely many undefined frames": undefined_frames(*[INFINITE] * 6),
+    "undefined frames of one scenario": undefined_frames(0),
+    "ids that occur twice": scenario_ids(*[28] * 6),
+    "an id that is no integer": scenario_ids(0, 1, 2, 3, 4, 5.5),
+    "an id that is text": scenario_ids("a"),
+    "fewer ids than values": scenario_ids(3),
     "booleans as ids": {
         "task": {"scenarios": [False, True]},
         "rows": rows_of([1.0, 2.0]),
     },
-    "a boolean as value": {"rows": rows_of([True, 1, 1, 1, 1, 1])},
     "an observable that ranks": {
         "ranking_metric": "energy_true",
-        "rows": ENERGY_ROWS,
+        "rows": {"submission": {"energy_true": ENERGY}},
     },
     "a name that is no text": {"method": 5},
     "a name with an escape": {"method": "\x1b[31m"},
     "rows in a list": {"rows": [1]},
     "no rows": {"rows": []},
-    "an id that is text": {"task": {"scenarios": ["a"]}},
-    "fewer ids than values": {"task": {"scenarios": [3]}},
     "a layout of its own": {"lagbench_scores": 2},
 }
 
@@ -567,8 +638,8 @@ def test_malformed_scores_are_unreadable(
     tmp_path: Path, changes: dict[str, Any]
 ) -> None:
     """On either side of the comparison."""
-    good = publish(tmp_path, [1.0] * 6, method="good")
-    bad = publish(tmp_path, [1.0] * 6, method="bad")
+    good = publish(tmp_path, ONES, method="good")
+    bad = publish(tmp_path, ONES, method="bad")
     content = json.loads(bad.read_text())
     bad.write_text(json.dumps(content | changes))
     with pytest.raises(UnreadableFileError):
@@ -580,7 +651,7 @@ def test_malformed_scores_are_unreadable(
 def test_a_folder_without_scores_is_unreadable(tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
-    good = publish(tmp_path, [1.0] * 6, method="good")
+    good = publish(tmp_path, ONES, method="good")
     with pytest.raises(UnreadableFileError) as caught:
         compare(good, empty)
     assert caught.value.where == str(empty)
@@ -601,42 +672,63 @@ def test_rows_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
 
 
 def test_references_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
-    rows = rows_of([1] * 6) | {"persistence": {}}
-    path = publish(tmp_path, [1.0] * 6, method="b", rows=rows)
+    rows = rows_of(ONES)
+    rows["persistence"] = {}
+    path = publish(tmp_path, ONES, method="b", rows=rows)
     with pytest.raises(UnreadableFileError):
         compare(path, "persistence")
 
 
+@pytest.fixture(scope="module")
+def half_right_card(
+    bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory
+) -> ScoreCard:
+    """The scores of a method that is right in half of the frames."""
+    folder = tmp_path_factory.mktemp("half-right")
+    path = bench.submit(folder / "predictions.nc", half_right)
+    return bench.evaluate(path)
+
+
+def row_name(row: Sequence[str]) -> str:
+    """Return the name of the metric that a row begins with."""
+    name, *_ = row[0].split()
+    return name
+
+
 def test_tables_show_references_undefined_frames_and_units(
-    bench: ScoreBench, tmp_path: Path
+    half_right_card: ScoreCard,
 ) -> None:
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
+    card = half_right_card
     horizon, at_frames, per_scenario = card_tables(card)
-    rows = {row[0].split()[0]: row for row in horizon.rows}
-    assert list(rows)[:2] == ["skill", card.ranking]
-    reference_columns = [column.replace("\n", "") for column in horizon.columns[2:]]
-    assert reference_columns == [card.skill.reference]
-    assert rows["vorticity_pearson"][1].endswith("†")
-    assert rows["vorticity_rmse"][0].endswith("[1/frame]")
+    rows = {row_name(row): row for row in horizon.rows}
+    first_names = list(rows)[:2]
+    assert first_names == ["skill", card.ranking]
+    (reference_column,) = horizon.columns[2:]
+    assert reference_column.replace("\n", "") == card.skill.reference
+    pearson_row = rows["vorticity_pearson"]
+    assert pearson_row[1].endswith("†")
+    rmse_row = rows["vorticity_rmse"]
+    assert rmse_row[0].endswith("[1/frame]")
     assert at_frames.columns == ("metric", "15", "25")
-    assert [row[0] for row in per_scenario.rows] == ["3", "4"]
+    scenarios = [row[0] for row in per_scenario.rows]
+    assert scenarios == ["3", "4"]
 
 
 def test_the_whole_table_shows_all_metrics_and_references(
-    bench: ScoreBench, tmp_path: Path
+    half_right_card: ScoreCard,
 ) -> None:
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
+    card = half_right_card
     whole, *_ = card_tables(card, every=True, floors=True)
-    names = [row[0].split()[0] for row in whole.rows]
+    names = [row_name(row) for row in whole.rows]
     assert names == ["skill", *card.submission]
     assert len(whole.columns) == len(card.scores) + 1
 
 
 def test_lines_below_the_tables_tell_flags_and_undefined_frames(
-    bench: ScoreBench, tmp_path: Path
+    half_right_card: ScoreCard,
 ) -> None:
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
-    text = "\n".join(flag_lines(card))
+    lines = flag_lines(half_right_card)
+    text = "\n".join(lines)
     assert re.search("^flag copy_suspect: raised", text, re.MULTILINE)
     assert "2 scenarios: no p-value" in text
     assert "vorticity_pearson 20" in text
@@ -663,8 +755,10 @@ def test_wide_tables_come_in_blocks() -> None:
         widths = []
         for cells in zip(block.columns, *block.rows, strict=True):
             widths.append(max(map(len, cells)))
-        assert sum(widths) + 3 * len(widths) <= 80
-        assert [row[0] for row in block.rows] == ["row 0", "row 1", "row 2"]
+        separators = 3 * len(widths)
+        assert sum(widths) + separators <= 80
+        row_names = [row[0] for row in block.rows]
+        assert row_names == ["row 0", "row 1", "row 2"]
         block_columns.extend(block.columns[1:])
         second_row.extend(block.rows[1][1:])
     assert block_columns == columns[1:]
@@ -678,7 +772,7 @@ def test_metrics_that_cannot_be_loaded(
 ) -> None:
     """The error names the entry point, not the file of scores."""
     package("metrics", "broken_metric:METRICS", "raise KeyError('mine')\n")
-    scores = publish(tmp_path, [1.0] * 6, method="a")
+    scores = publish(tmp_path, ONES, method="a")
     result = run("compare", scores, scores)
     assert result.exit_code == 2
     assert "broken_metric:METRICS" in result.stderr
@@ -712,7 +806,8 @@ def test_a_file_that_is_too_long_is_refused_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["", ".json"])
 def test_a_name_that_is_too_long_is_unreadable(tmp_path: Path, suffix: str) -> None:
-    assert_unreadable(tmp_path / ("x" * 300 + suffix))
+    name = "x" * 300 + suffix
+    assert_unreadable(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -730,15 +825,19 @@ def test_lines_say_how_much_better_a_submission_is(
     word: str,
 ) -> None:
     """The number is the size of the difference, and the word its sign."""
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
+    path = bench.submit(tmp_path / "predictions.nc", predict)
+    card = bench.evaluate(path)
     lines = [line for line in flag_lines(card) if line.startswith("against ")]
     against_persistence = lines[0]
-    assert against_persistence.endswith("is the same") is (predict is still)
+    is_the_same = against_persistence.endswith("is the same")
+    assert is_the_same == (predict is still)
 
     pattern = rf"{word} by ([\d.e-]+) \(2 scenarios: no p-value\)"
     match = re.search(pattern, lines[row])
     assert match, lines[row]
     reference = list(card.scores)[1 + row]
     difference = card.against(reference).difference
-    assert float(match[1]) == pytest.approx(abs(difference), rel=1e-3)
-    assert (difference < 0.0) == (word == "better")
+    size = float(match[1])
+    assert size == pytest.approx(abs(difference), rel=1e-3)
+    is_better = difference < 0.0
+    assert is_better == (word == "better")
