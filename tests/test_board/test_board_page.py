@@ -48,9 +48,26 @@ def first_tab(board: Board, *rows: BoardRow, **changes: Any) -> Tab:
     return replace(board.tabs[0], rows=rows, **changes)
 
 
-def with_rows(board: Board, *rows: BoardRow, **changes: Any) -> str:
+def page_of(board: Board, *tabs: Tab) -> str:
+    """Return the page of a board with other tabs."""
+    return render(replace(board, tabs=tabs))
+
+
+def with_rows(board: Board, *rows: BoardRow) -> str:
     """Return the page of the first tab with other rows."""
-    return render(replace(board, tabs=(first_tab(board, *rows, **changes),)))
+    return page_of(board, first_tab(board, *rows))
+
+
+def row_data_of(page: str) -> list[dict[str, Any]]:
+    """Return what the script reads of the rows of the first tab."""
+    first = read_page_data(page).tabs[0]
+    rows: list[dict[str, Any]] = first["rows"]
+    return rows
+
+
+def by_id(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return what the script reads of rows by their ids."""
+    return {row["id"]: row for row in rows}
 
 
 def cells_of(board: Board, tab: Tab, key: str) -> list[Cell]:
@@ -62,23 +79,27 @@ def cells_of(board: Board, tab: Tab, key: str) -> list[Cell]:
 def test_curves_and_films_arrive_at_the_script(board: Board, page: str) -> None:
     """They are what the board holds, up to the steps of their encoding."""
     data = read_page_data(page)
-    assert [tab["id"] for tab in data.tabs] == ["cavity-full", "fluid-mini"]
+    tab_ids = [tab["id"] for tab in data.tabs]
+    assert tab_ids == ["cavity-full", "fluid-mini"]
     for tab, plain_tab in zip(board.tabs, data.tabs, strict=True):
-        plain_rows = {row["id"]: row for row in plain_tab["rows"]}
+        plain_rows = by_id(plain_tab["rows"])
+        name_of_curve = tab.curves[0]
         for row in tab.rows:
             plain_row = plain_rows[row.id]
-            curve = row.curves[tab.curves[0]]
-            plain_curve = plain_row["curves"][tab.curves[0]]
-            frames = data.array(plain_curve["frames"])[:, 0]
-            assert frames.tolist() == list(curve.frames)
+            curve = row.curves[name_of_curve]
+            plain_curve = plain_row["curves"][name_of_curve]
+            frames = data.array(plain_curve["frames"])
+            assert frames[:, 0].tolist() == list(curve.frames)
             values = data.array(plain_curve["values"])
-            assert_allclose(values[:, 0], curve.mean, rtol=2e-3)
-            assert_allclose(values[:, 1], curve.low, rtol=2e-3)
-            assert_allclose(values[:, 2], curve.high, rtol=2e-3)
+            mean, low, high = values.T
+            assert_allclose(mean, curve.mean, rtol=2e-3)
+            assert_allclose(low, curve.low, rtol=2e-3)
+            assert_allclose(high, curve.high, rtol=2e-3)
 
             pictures = plain_row["pictures"]
             film = data.array(pictures["film"])
-            film = film.reshape(len(pictures["filmFrames"]), -1, 2)
+            frame_count = len(pictures["filmFrames"])
+            film = film.reshape(frame_count, -1, 2)
             assert film.shape[1] == len(pictures["material"])
             first_particle = row.pictures.film[0, 0]
             last_particle = row.pictures.film[-1, -1]
@@ -90,25 +111,28 @@ def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:
     """Every metric of every row, to nine digits; entries tell who scored them."""
     tab = board.tabs[0]
     plain_tab = read_page_data(page).tabs[0]
+    columns = columns_of(tab, board.metrics)
     keys = [column["key"] for column in plain_tab["columns"]]
-    assert keys == list(columns_of(tab, board.metrics))
-    plain_rows = {row["id"]: row for row in plain_tab["rows"]}
-    plain_references = {row["id"]: row for row in plain_tab["references"]}
+    assert keys == list(columns)
+    plain_rows = by_id(plain_tab["rows"])
+    plain_references = by_id(plain_tab["references"])
     assert len(plain_rows) + len(plain_references) == len(tab.lines)
     for row in tab.lines:
         if isinstance(row, BoardRow):
             plain_row = plain_rows[row.id]
         else:
             plain_row = plain_references[row.name]
-        values = dict(zip(keys, plain_row["values"], strict=True))
+        numbers = zip(keys, plain_row["values"], strict=True)
+        values = dict(numbers)
         for metric, value in row.values.items():
             number = values[metric]
             if number is None:
                 number = math.nan
-            assert number == pytest.approx(value.mean, rel=1e-8, nan_ok=True)
+            expected = pytest.approx(value.mean, rel=1e-8, nan_ok=True)
+            assert number == expected
         if isinstance(row, BoardRow):
-            expected = "scored again" if row.verified else "as submitted"
-            assert values["checked"] == expected
+            check = "scored again" if row.verified else "as submitted"
+            assert values["checked"] == check
 
 
 def test_equal_boards_give_equal_pages(page: str) -> None:
@@ -121,28 +145,37 @@ def test_equal_boards_give_equal_pages(page: str) -> None:
 def test_pages_are_compared_by_content(page: str) -> None:
     """Another zlib gives other bytes; another content, a bomb or no data differ."""
     text_of_data = element_text(page, "page-data")
-    content = zlib.decompress(base64.b64decode(text_of_data), wbits=31)
+    compressed_data = base64.b64decode(text_of_data)
+    content = zlib.decompress(compressed_data, wbits=31)
+
+    def with_text(text: str) -> bytes:
+        return page.replace(text_of_data, text).encode()
 
     def with_data(data: bytes, level: int) -> bytes:
         compressor = zlib.compressobj(level, wbits=31)
         compressed = compressor.compress(data) + compressor.flush()
-        new_text = base64.b64encode(compressed).decode()
-        return page.replace(text_of_data, new_text).encode()
+        encoded = base64.b64encode(compressed)
+        return with_text(encoded.decode())
 
     original = page.encode()
     other_zlib = with_data(content, 1)
     assert other_zlib != original
     assert same_page(other_zlib, original)
-    assert not same_page(with_data(content + b" ", 1), original)
-    assert not same_page(with_data(bytes(10 * len(content)), 9), original)
-    assert not same_page(page.replace(text_of_data, "").encode(), original)
-    assert not same_page(original.replace(b"GNS", b"GNs", 1), original)
+    other_content = with_data(content + b" ", 1)
+    assert not same_page(other_content, original)
+    bomb = with_data(bytes(10 * len(content)), 9)
+    assert not same_page(bomb, original)
+    without_data = with_text("")
+    assert not same_page(without_data, original)
+    other_name = original.replace(b"GNS", b"GNs", 1)
+    assert not same_page(other_name, original)
     assert not same_page(b"another file", original)
 
 
 def row_of(board: Board, name: str, method: str, **changes: Any) -> BoardRow:
     """Return the first row of a board under another name, with other skills."""
-    row = with_entry(board.tabs[0].rows[0], name=name, method=method)
+    first_row = board.tabs[0].rows[0]
+    row = with_entry(first_row, name=name, method=method)
     return replace(row, **changes)
 
 
@@ -163,18 +196,22 @@ def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
     tabs = []
     for number, split in enumerate(("cavity", "fluid")):
         tab = make_board(((split, "mini"),)).tabs[0]
-        value = tab.rows[0].values[tab.ranking]
+        first_row = tab.rows[0]
+        value = first_row.values[tab.ranking]
         rows = []
         for method, rank in ranks.items():
             mean = skills[method][number]
             if mean is not None:
                 skill = replace(value, mean=mean)
-                rows.append(row_of(board, method, method, skill=skill, rank=rank))
+                row = row_of(board, method, method, skill=skill, rank=rank)
+                rows.append(row)
         tabs.append(replace(tab, rows=tuple(rows)))
-    (overview,) = make_overviews(replace(board, tabs=tuple(tabs)))
+    whole_board = replace(board, tabs=tuple(tabs))
+    (overview,) = make_overviews(whole_board)
     places = []
     for method in overview.methods:
-        places.append((method.method, method.rank, method.missing))
+        place = (method.method, method.rank, method.missing)
+        places.append(place)
     assert places == [
         ("steady", 1, ()),
         ("uneven", 2, ()),
@@ -182,16 +219,17 @@ def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
     ]
     means = [method.mean_skill for method in overview.methods]
     assert means == pytest.approx([0.45, 0.3, 0.99])
-    page = render(replace(board, tabs=tuple(tabs)))
-    assert "not on fluid" in page
+    assert "not on fluid" in render(whole_board)
 
 
 def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
     """Two methods that win in turn share places; a third far behind does not."""
     tab = make_board((("cavity", "mini"),)).tabs[0]
-    value = tab.rows[0].values[tab.ranking]
+    first_row = tab.rows[0]
+    value = first_row.values[tab.ranking]
     rng = np.random.Generator(np.random.PCG64(3))
-    first_noise, second_noise = rng.random((2, len(tab.scenarios)))
+    noise = rng.random((2, len(tab.scenarios)))
+    first_noise, second_noise = noise
     losses_of_methods = {
         "a": 1.0 + second_noise,
         "b": 1.0 + first_noise,
@@ -199,16 +237,27 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
     }
     rows = []
     for method, losses in losses_of_methods.items():
-        skill = replace(value, mean=1.0 - losses.mean() / 10)
-        row = row_of(board, method, method, losses=losses[None], skill=skill)
-        rows.append(replace(row, rank=len(rows) + 1))
+        mean_skill = 1.0 - losses.mean() / 10
+        row = row_of(
+            board,
+            method,
+            method,
+            losses=losses[None],
+            skill=replace(value, mean=mean_skill),
+        )
+        rank = len(rows) + 1
+        rows.append(replace(row, rank=rank))
     naive_value = replace(value, mean=10.0)
-    naive = replace(tab.references[0], values={tab.ranking: naive_value})
+    reference = tab.references[0]
+    naive = replace(reference, values={tab.ranking: naive_value})
     tab = replace(tab, rows=tuple(rows), references=(naive,))
     (overview,) = make_overviews(replace(board, tabs=(tab,)))
-    ranges = {method.method: method.rank_range for method in overview.methods}
+    ranges = {}
+    for method in overview.methods:
+        ranges[method.method] = method.rank_range
+    assert ranges["a"] == (1, 2)
+    assert ranges["b"] == (1, 2)
     assert ranges["c"] == (3, 3)
-    assert ranges["a"] == ranges["b"] == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -229,25 +278,26 @@ def test_a_sentence_says_whether_learning_pays(
 ) -> None:
     """It follows from the best ratio of any active entry that learns."""
     row = board.tabs[0].rows[0]
-    value = replace(row.values["position_rmse"], mean=ratio, low=low, high=high)
+    rmse = row.values["position_rmse"]
+    value = replace(rmse, mean=ratio, low=low, high=high)
     worse = replace(value, mean=9.0, high=10.0)
-    rows = (
-        replace(row, against_classical=worse, solver="projection"),
-        replace(row, against_classical=value, solver="projection"),
-    )
-    tab = first_tab(board, *rows)
+    learned = replace(row, solver="projection", against_classical=value)
+    worse_learned = replace(row, solver="projection", against_classical=worse)
+    tab = first_tab(board, worse_learned, learned)
     assert conclude(tab).startswith(beginning)
-    assert conclude(first_tab(board, row)) == ""
+    without_ratio = first_tab(board, row)
+    assert conclude(without_ratio) == ""
 
 
 def test_variants_have_no_film(board: Board) -> None:
     """Their method has; the page would become too long."""
     head, variant = board.tabs[0].rows[:2]
     variant = replace(variant, variant_of=head.id, rank=None)
-    plain = read_page_data(with_rows(board, head, variant)).tabs[0]["rows"]
-    assert plain[0]["pictures"] is not None
-    assert plain[1]["pictures"] is None
-    assert plain[1]["variantOf"] == head.id
+    page = with_rows(board, head, variant)
+    head_data, variant_data = row_data_of(page)
+    assert head_data["pictures"] is not None
+    assert variant_data["pictures"] is None
+    assert variant_data["variantOf"] == head.id
 
 
 def test_the_first_film_is_of_several_materials(board: Board) -> None:
@@ -256,10 +306,13 @@ def test_the_first_film_is_of_several_materials(board: Board) -> None:
     assert hero is not None
     tab, row = hero
     assert tab.size.split == "fluid"  # the sample has four materials there
-    plain = read_page_data(render(board)).hero
+    page_data = read_page_data(render(board))
+    plain = page_data.hero
     assert plain["entry"] == row.id
-    assert len(plain["material"]) == row.pictures.film.shape[1]
-    assert [name for _, name in plain["key"]] == ["liquid", "jelly", "snow", "rope"]
+    particle_count = row.pictures.film.shape[1]
+    assert len(plain["material"]) == particle_count
+    materials = [name for _, name in plain["key"]]
+    assert materials == ["liquid", "jelly", "snow", "rope"]
 
 
 def test_the_first_film_shows_skill_where_there_is_any(board: Board) -> None:
@@ -281,16 +334,18 @@ def test_the_first_film_shows_skill_where_there_is_any(board: Board) -> None:
 def test_references_are_judged_like_entries(board: Board) -> None:
     """A reference predictor that is better than every entry takes bold and colour."""
     tab = board.tabs[0]
+    first_reference, *other_references = tab.references
     best = {}
-    for name, value in tab.references[0].values.items():
+    for name, value in first_reference.values.items():
         best[name] = replace(value, mean=1e-9)
-    reference = replace(tab.references[0], values=best)
-    other_references = tab.references[1:]
+    reference = replace(first_reference, values=best)
     changed = replace(tab, references=(reference, *other_references))
-    first_line = make_table(changed, board.metrics).lines[0]
+    view = make_table(changed, board.metrics)
+    first_line = view.lines[0]
     assert first_line.row is reference
-    assert first_line.cells[tab.ranking].classes == ("best", "heat0")
-    page = render(replace(board, tabs=(changed,)))
+    cell = first_line.cells[tab.ranking]
+    assert cell.classes == ("best", "heat0")
+    page = page_of(board, changed)
     (opening_tag,) = re.findall(r"<tbody>(<tr class=\"reference\"[^>]*>)", page)
     assert f'data-reference="{reference.name}"' in opening_tag
 
@@ -298,12 +353,18 @@ def test_references_are_judged_like_entries(board: Board) -> None:
 def test_values_below_and_above_an_aim_do_not_cancel(board: Board) -> None:
     """Energy ratios 0 and 2 have the mean 1; 0.9 and 0.9 are nearer to the aim."""
     rows = []
-    scenario_means = ((0.0, 2.0), (0.9, 0.9), (0.5, 0.5))
-    for row, per_scenario in zip(board.tabs[0].rows, scenario_means, strict=False):
+    energy_ratios = (
+        (0.0, 2.0),
+        (0.9, 0.9),
+        (0.5, 0.5),
+    )
+    first_rows = board.tabs[0].rows[:3]
+    for row, per_scenario in zip(first_rows, energy_ratios, strict=True):
         mean = sum(per_scenario) / 2
         value = row.values["energy_ratio"]
-        value = replace(value, mean=mean, per_scenario=per_scenario)
-        rows.append(replace(row, values={**row.values, "energy_ratio": value}))
+        changed = replace(value, mean=mean, per_scenario=per_scenario)
+        values = {**row.values, "energy_ratio": changed}
+        rows.append(replace(row, values=values))
     tab = first_tab(board, *rows, references=())
     losses = {}
     best = []
@@ -317,50 +378,66 @@ def test_values_below_and_above_an_aim_do_not_cancel(board: Board) -> None:
 
 def line_of(page: str, row: BoardRow) -> str:
     """Return the line of an entry in the table."""
-    return str(re.findall(f'<tr[^>]*data-entry="{row.id}".*?</tr>', page)[0])
+    pattern = f'<tr[^>]*data-entry="{row.id}".*?</tr>'
+    lines: list[str] = re.findall(pattern, page)
+    return lines[0]
 
 
 def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
     """A link each where the entry has one, and to nothing but the web."""
+    link = r'<a href="(http[^"]*)"[^>]*>(\w+)</a>'
     for row in board.tabs[0].rows:
-        actual = re.findall(r'<a href="(http[^"]*)"[^>]*>(\w+)</a>', line_of(page, row))
-        links = {label: address for address, label in actual}
+        line = line_of(page, row)
+        links = {}
+        for address, label in re.findall(link, line):
+            links[label] = address
         expected = {}
         for key in ("code", "paper", "weights"):
             address = getattr(row.entry, key)
             if address:
                 expected[key] = address
         assert links == expected
-    bad = with_entry(board.tabs[0].rows[0], code="javascript:alert(1)")
-    assert 'href="javascript' not in with_rows(board, bad)
+    first_row = board.tabs[0].rows[0]
+    bad = with_entry(first_row, code="javascript:alert(1)")
+    bad_page = with_rows(board, bad)
+    assert 'href="javascript' not in bad_page
 
 
 def test_weights_beside_the_entry_have_a_link_a_seed(board: Board) -> None:
     """The links lead to where the leaderboard's folder keeps them."""
     row = board.tabs[0].rows[0]
-    files = 2 * row.entry.score.files[:1]
-    score = row.entry.score.model_copy(update={"files": files})
+    entry = row.entry
+    seed_mean = row.seed_means[0]
+    two_files = 2 * entry.score.files[:1]
+    score = entry.score.model_copy(update={"files": two_files})
     weights = Weights(path="x", sha256="0" * 64)
-    prediction = row.entry.predictions[0]
+    prediction = entry.predictions[0]
     predictions = []
     for seed in (0, 1):
         update = {"seed": seed, "weights": weights}
         predictions.append(prediction.model_copy(update=update))
-    row = with_entry(row, predictions=tuple(predictions), score=score, weights=None)
-    seed_mean = row.seed_means[0]
-    page = with_rows(board, replace(row, seed_means=(seed_mean, seed_mean)))
-    place = "/".join(row.entry.place)
-    expected = [f"weights/{place}_{seed}.pt" for seed in (0, 1)]
-    assert re.findall(r'href="(weights/[^"]*)"', page) == expected
+    row = with_entry(
+        row,
+        predictions=tuple(predictions),
+        score=score,
+        weights=None,
+    )
+    row = replace(row, seed_means=(seed_mean, seed_mean))
+    page = with_rows(board, row)
+    links = re.findall(r'href="(weights/[^"]*)"', page)
+    place = "/".join(entry.place)
+    assert links == [f"weights/{place}_0.pt", f"weights/{place}_1.pt"]
 
 
 def test_skill_below_nothing_is_not_shaded_as_skill(board: Board) -> None:
     """Of skills 0.8, 0.1 and -50 the second is far from the first."""
     rows = []
-    for row, skill in zip(board.tabs[0].rows, (0.8, 0.1, -50.0), strict=False):
-        if row.skill:
-            value = replace(row.skill, mean=skill)
-            rows.append(replace(row, skill=value))
+    skills = (0.8, 0.1, -50.0)
+    first_rows = board.tabs[0].rows[:3]
+    for row, skill in zip(first_rows, skills, strict=True):
+        assert row.skill is not None
+        value = replace(row.skill, mean=skill)
+        rows.append(replace(row, skill=value))
     tab = first_tab(board, *rows, references=())
     shades = {}
     for cell in cells_of(board, tab, "skill"):
@@ -376,20 +453,26 @@ def test_a_warning_shows_a_few_reasons_and_a_flag_all(board: Board) -> None:
         "flags": (EntryFlag(name="copy_suspect", reasons=reasons),),
         "warnings": (EntryFlag(name="max_displacement", reasons=reasons),),
     }
-    file = row.entry.score.files[0].model_copy(update=update)
-    score = row.entry.score.model_copy(update={"files": (file,)})
-    page = with_rows(board, with_entry(row, score=score))
+    score = row.entry.score
+    file = score.files[0].model_copy(update=update)
+    flagged_score = score.model_copy(update={"files": (file,)})
+    flagged = with_entry(row, score=flagged_score)
+    page = with_rows(board, flagged)
     counts = []
     for element in read_html(page).named("span"):
         title = element.attributes.get("title") or ""
         counts.append(title.count("reason"))
-    assert sorted(counts)[-2:] == [MOST_REASONS, len(reasons)]
+    counts.sort()
+    assert counts[-2:] == [MOST_REASONS, len(reasons)]
 
 
 def sorters(page: str) -> list[Element]:
     """Return the headings of columns."""
-    buttons = read_html(page).named("button")
-    return [button for button in buttons if button.attributes.get("data-sort")]
+    buttons = []
+    for button in read_html(page).named("button"):
+        if button.attributes.get("data-sort"):
+            buttons.append(button)
+    return buttons
 
 
 def test_budgets_are_marked_as_self_reported(page: str) -> None:
@@ -412,15 +495,24 @@ def test_budgets_are_marked_as_self_reported(page: str) -> None:
     }
 
 
-@pytest.mark.parametrize(("speed", "word"), [(0.1, "slower"), (17.25, "faster")])
+@pytest.mark.parametrize(
+    ("speed", "word"),
+    [
+        (0.1, "slower"),
+        (17.25, "faster"),
+    ],
+)
 def test_speed_is_told_against_the_solver(
     board: Board, speed: float, word: str
 ) -> None:
     """The tile of the fastest entry says on which side of the solver it is."""
     cost = EntryCost(
-        seconds_per_frame=2.0, device="a machine", solver_seconds_per_frame=2.0 * speed
+        seconds_per_frame=2.0,
+        device="a machine",
+        solver_seconds_per_frame=2.0 * speed,
     )
-    page = with_rows(board, with_entry(board.tabs[0].rows[0], cost=cost))
+    first_row = board.tabs[0].rows[0]
+    page = with_rows(board, with_entry(first_row, cost=cost))
     items = [element.text for element in read_html(page).named("li")]
     (tile,) = [item for item in items if "fastest" in item]
     assert f"{word} than the solver" in tile
@@ -429,17 +521,21 @@ def test_speed_is_told_against_the_solver(
 
 def test_policy_allows_only_our_script_and_style(page: str) -> None:
     """The policy forbids all but the hashes of what the page holds."""
-    policy = read_html(page).named("meta")[1].attributes["content"]
+    reading = read_html(page)
+    _, meta, *_ = reading.named("meta")
+    policy = meta.attributes["content"]
     assert policy.startswith("default-src 'none';")
     assert "unsafe" not in policy
     inline = re.findall(r"<(script|style)>(.*?)</\1>", page, re.DOTALL)
-    assert [name for name, _ in inline] == ["style", "script", "script"]
+    names = [name for name, _ in inline]
+    assert names == ["style", "script", "script"]
     for _, body in inline:
         digest = hashlib.sha256(body.encode()).digest()
-        assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
+        encoded = base64.b64encode(digest).decode()
+        assert f"'sha256-{encoded}'" in policy
     assert not re.search(r"""src=["']?(https?:)?//""", page)
-    links = read_html(page).named("link")
-    assert [link.attributes.get("rel") for link in links] == ["icon"]
+    (link,) = reading.named("link")
+    assert link.attributes.get("rel") == "icon"
     forbidden = r"url\(|@import|innerHTML|eval\(|\bfetch\(|XMLHttpRequest|new Function"
     assert not re.search(forbidden, page)
 
@@ -455,10 +551,13 @@ def test_hostile_text_stays_text(board: Board) -> None:
         command=HOSTILE,
     )
     page = with_rows(board, bad)
-    names = [element.name for element in read_html(page).elements]
-    plain = read_html(with_rows(board, first))
-    assert names == [element.name for element in plain.elements]
-    assert read_page_data(page).tabs[0]["rows"][0]["command"] == HOSTILE
+    plain_page = with_rows(board, first)
+    elements = read_html(page).elements
+    plain_elements = read_html(plain_page).elements
+    names = [element.name for element in elements]
+    assert names == [element.name for element in plain_elements]
+    (row_data,) = row_data_of(page)
+    assert row_data["command"] == HOSTILE
 
 
 @pytest.mark.parametrize("entries", [16, 32])
