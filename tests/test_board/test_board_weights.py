@@ -37,7 +37,13 @@ from lagbench.scoring.score import score
 from lagbench.submission import open_predictions
 from lagbench.submission.budget import Budget
 
-BUDGET = Budget(windows=48, epochs=0.5, steps=6, cpu_hours=0.1, gpu_hours=0.0)
+BUDGET = Budget(
+    windows=48,
+    epochs=0.5,
+    steps=6,
+    cpu_hours=0.1,
+    gpu_hours=0.0,
+)
 
 
 @pytest.fixture
@@ -46,7 +52,8 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path)
 
 
-KEPT, GLIDE = (f"weights/cavity/tiny/{name}_0" for name in ("drift", "glide"))
+KEPT = "weights/cavity/tiny/drift_0"
+GLIDE = "weights/cavity/tiny/glide_0"
 """Weights and record of a run, and those of another method, without their endings."""
 
 OURS = "cavity tiny train, recipe cavity/tiny, step 6"
@@ -65,15 +72,18 @@ def trained(
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}-{share}"
     folder.mkdir()
-    labels: dict[str, Any] = {"seed": seed, "budget": BUDGET.model_dump_json()}
+    labels: dict[str, Any] = {
+        "seed": seed,
+        "budget": BUDGET.model_dump_json(),
+    }
     if training is not None:
         labels["training"] = training
     if parameters is not None:
         labels["parameters"] = parameters
 
-    def between(truth: Any, n: int, h: int) -> Any:
-        future = truth[n : n + h]
-        error = noisy(truth, n, h) - future
+    def between(truth: Any, given: int, horizon: int) -> Any:
+        future = truth[given : given + horizon]
+        error = noisy(truth, given, horizon) - future
         return future + (share + 0.1 * seed) * error
 
     predictions = own.predict(between, "drift", **labels)
@@ -86,17 +96,27 @@ def trained(
         size=header.size,
         dataset_sha256=header.dataset_sha256,
     )
-    recipe = {"name": "cavity/tiny", "training": {"seed": seed}}
+    recipe = {
+        "name": "cavity/tiny",
+        "training": {"seed": seed},
+    }
+    model = Drift.build({}, info)
     checkpoint = Checkpoint(
         baseline="drift",
         options={},
         info=info,
-        weights=round_weights(Drift.build({}, info)),
+        weights=round_weights(model),
         training={"step": 6, "recipe": recipe},
     )
     save(folder / "weights.pt", checkpoint)
-    (folder / "training.json").write_text(json.dumps({"step": 6}))
+    write_record(folder, {"step": 6})
     return folder
+
+
+def write_record(folder: Path, content: dict[str, Any]) -> None:
+    """Write the record of a run."""
+    text = json.dumps(content)
+    (folder / "training.json").write_text(text)
 
 
 def submitted(
@@ -110,36 +130,51 @@ def submitted(
     files = [folder / "predictions.nc" for folder in folders]
     if weights is None:
         weights = tuple(folder / "weights.pt" for folder in folders)
-    meta = Meta(authors=("A. Author",), command="make", method=method, name=method)
+    meta = Meta(
+        authors=("A. Author",),
+        command="make",
+        method=method,
+        name=method,
+    )
     return submit(files, meta, weights=weights, **own.where, **options)
 
 
+def resubmitted(own: BoardBench, *folders: Path, **options: Any) -> SubmitResult:
+    """Replace an entry by one with the weights that the board has."""
+    return submitted(own, *folders, weights=(), replace=True, **options)
+
+
+First = tuple[BoardBench, Path]
+
+
 @pytest.fixture(scope="module")
-def first_submission(
-    home: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[BoardBench, Path]:
+def first_submission(home: Path, tmp_path_factory: pytest.TempPathFactory) -> First:
     """A leaderboard with the entry of a run and its weights, and the run.
 
     Do not change the files.
     """
-    bench = copied(home, tmp_path_factory.mktemp("first"))
+    folder = tmp_path_factory.mktemp("first")
+    bench = copied(home, folder)
     run = trained(bench, 0)
     submitted(bench, run)
     return bench, run
 
 
 @pytest.fixture
-def first(own: BoardBench, first_submission: tuple[BoardBench, Path]) -> Path:
+def first(own: BoardBench, first_submission: First) -> Path:
     """A run whose entry is on the board, with its weights."""
     bench, run = first_submission
     shutil.copytree(bench.folder, own.folder, dirs_exist_ok=True)
-    return Path(shutil.copytree(run, own.folder.parent / run.name))
+    own_run = own.folder.parent / run.name
+    shutil.copytree(run, own_run)
+    return own_run
 
 
 def hashes(own: BoardBench, method: str = "drift") -> list[str | None]:
     """Return the SHA-256 of the weights of each seed, as the entry has them."""
     weight_hashes: list[str | None] = []
-    for prediction in read_entry(own.entry(method)).predictions:
+    entry = read_entry(own.entry(method))
+    for prediction in entry.predictions:
         if prediction.weights is None:
             weight_hashes.append(None)
         else:
@@ -155,12 +190,21 @@ def kept_files(own: BoardBench) -> dict[str, bytes]:
     return contents
 
 
+def kept_weights(own: BoardBench) -> Path:
+    """Return the file of the weights on the board."""
+    return own.folder / f"{KEPT}.pt"
+
+
 def claim(own: BoardBench, path: str, source: Path) -> None:
     """Let the entry glide name a file as its weights, with the hash of another."""
-    weights = {"path": path, "sha256": file_sha256(source)}
+    weights = {
+        "path": path,
+        "sha256": file_sha256(source),
+    }
 
     def name_weights(entry: dict[str, Any]) -> None:
-        entry["predictions"][0]["weights"] = weights
+        prediction = entry["predictions"][0]
+        prediction["weights"] = weights
 
     own.edit("glide", name_weights)
 
@@ -169,6 +213,11 @@ def failing_checks(own: BoardBench) -> set[str]:
     """Return the names of the checks that find something."""
     result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
     return {finding.check for finding in result.findings}
+
+
+def assert_sound(own: BoardBench) -> None:
+    """Assert that no check finds anything."""
+    assert failing_checks(own) == set()
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
@@ -181,32 +230,37 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     runs = [trained(own, 0), trained(own, 3)]
     submitted(own, *runs)
     entry = read_entry(own.entry("drift"))
-    for run, prediction, seed in zip(runs, entry.predictions, (0, 3), strict=True):
+    seeds = (0, 3)
+    for run, prediction, seed in zip(runs, entry.predictions, seeds, strict=True):
         assert prediction.weights is not None
         assert prediction.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
         file = own.folder / prediction.weights.path
-        assert file.read_bytes() == (run / "weights.pt").read_bytes()
+        weights = (run / "weights.pt").read_bytes()
+        assert file.read_bytes() == weights
         assert file_sha256(file) == prediction.weights.sha256
         assert prediction.budget == BUDGET
-        record = json.loads(file.with_suffix(".json").read_text())
+        record_text = file.with_suffix(".json").read_text()
+        record = json.loads(record_text)
         assert record == {"step": 6}
     assert entry.budget is not None
     assert entry.budget.windows == 48
     assert entry.budget.cpu_hours == 0.1
     assert entry.budget.track is None  # tiny has none
-    assert failing_checks(own) == set()
+    assert_sound(own)
     first, second = (run / "weights.pt" for run in runs)
+    first_hash = file_sha256(first)
+    second_hash = file_sha256(second)
     own.entry("drift").unlink()
     submitted(own, *runs, weights=(second, first))
-    assert hashes(own) == [file_sha256(first), file_sha256(second)]
+    assert hashes(own) == [first_hash, second_hash]
     submitted(own, *runs, weights=(second,), replace=True)
-    assert hashes(own) == [file_sha256(first), file_sha256(second)]
+    assert hashes(own) == [first_hash, second_hash]
     own.entry("drift").unlink()
     submitted(own, *runs, weights=(second,))
-    assert hashes(own) == [None, file_sha256(second)]
-    for end in ("pt", "json"):
-        (own.folder / f"{KEPT}.{end}").unlink()
-    assert failing_checks(own) == set()
+    assert hashes(own) == [None, second_hash]
+    kept_weights(own).unlink()
+    kept_weights(own).with_suffix(".json").unlink()
+    assert_sound(own)
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
@@ -214,85 +268,99 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> No
     behind.
     """
     before = kept_files(own)
-    file = own.folder / f"{KEPT}.pt"
+    file = kept_weights(own)
+    record = file.with_suffix(".json")
     assert json.loads(before["drift_0.json"]) == {"step": 6}
-    for weights in ((), (file,)):  # those of the board, told or not, keep their record
+    # those of the board, told or not, keep their record
+    for weights in ((), (file,)):
         again = submitted(own, first, weights=weights, replace=True)
         assert kept_files(own) == before
         assert again.removed == ()
-        assert failing_checks(own) == set()
+        assert_sound(own)
     # new weights without a record leave none of the old
     (first / "training.json").unlink()
-    assert submitted(own, first, replace=True).removed == (file.with_suffix(".json"),)
+    without_record = submitted(own, first, replace=True)
+    assert without_record.removed == (record,)
     assert list(kept_files(own)) == ["drift_0.pt"]
-    assert failing_checks(own) == set()
-    later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
+    assert_sound(own)
+    other = trained(own, 0, share=0.3)
+    later = resubmitted(own, other)
     assert later.removed == (file,)
     assert kept_files(own) == {}
-    assert failing_checks(own) == set()
+    assert_sound(own)
 
 
 @pytest.mark.parametrize("damage", ["lost", "edited", "linked"])
 def test_only_sound_weights_are_kept(own: BoardBench, first: Path, damage: str) -> None:
     """What is wrong with those of before is mended by submitting anew."""
-    file = own.folder / f"{KEPT}.pt"
+    file = kept_weights(own)
     file.unlink()
     if damage == "edited":
         file.write_bytes(b"1")
     if damage == "linked":
         file.symlink_to(first / "weights.pt")
-    submitted(own, first, weights=(), replace=True)
+    resubmitted(own, first)
     assert hashes(own) == [None]
-    assert failing_checks(own) == set()
+    assert_sound(own)
 
 
 def test_weights_of_another_are_not_kept(own: BoardBench, first: Path) -> None:
     """Nor those that lie elsewhere: what the old entry says of them is not believed."""
     second = trained(own, 0, share=0.3)
     submitted(own, second, weights=(), method="glide")
-    source = own.folder / f"{KEPT}.pt"
+    source = kept_weights(own)
     target = own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
-    for path, alone in ((GLIDE, False), (KEPT, False), (KEPT, True)):
-        if alone:
+    for path, is_alone in (
+        (GLIDE, False),
+        (KEPT, False),
+        (KEPT, True),
+    ):
+        if is_alone:
             target.unlink(missing_ok=True)
             own.entry("drift").unlink()  # nobody else's now, and still not in its place
         claim(own, f"{path}.pt", source)
-        submitted(own, second, weights=(), method="glide", replace=True)
+        resubmitted(own, second, method="glide")
         assert hashes(own, "glide") == [None]
+
+
+def supersede(entry: dict[str, Any]) -> None:
+    """Let an entry name its successor."""
+    entry["status"] = "superseded"
+    entry["superseded_by"] = "glide"
 
 
 def test_a_new_name_takes_the_weights_along(own: BoardBench, first: Path) -> None:
     """A superseded entry and its successor have one file of weights each, with the same
     bytes.
     """
-    own.edit(
-        "drift", lambda entry: entry.update(status="superseded", superseded_by="glide")
-    )
+    own.edit("drift", supersede)
     submitted(own, first, method="glide")
-    assert failing_checks(own) == set()
+    assert_sound(own)
 
 
 def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None:
     """Nothing is written behind one; the entry before stays."""
     run = trained(own, 0)
     submitted(own, run, weights=())
+    weights = own.folder / "weights"
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    (own.folder / "weights").symlink_to(elsewhere)
+    weights.symlink_to(elsewhere)
     before = own.state()
     with pytest.raises(UsageError) as caught:
         submitted(own, run, replace=True)
-    assert caught.value.where == str(own.folder / "weights")
+    assert caught.value.where == str(weights)
     assert own.state() == before
     assert list(elsewhere.iterdir()) == []
-    (own.folder / "weights").unlink()
+    weights.unlink()
     submitted(own, run, replace=True)
-    (own.folder / "weights").rename(elsewhere / "weights")
-    (own.folder / "weights").symlink_to(elsewhere / "weights")
+    weights.rename(elsewhere / "weights")
+    weights.symlink_to(elsewhere / "weights")
     files_before = sorted(elsewhere.rglob("*.*"))
+    other = trained(own, 0, share=0.3)
     with pytest.raises(UsageError):
-        submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
+        resubmitted(own, other)
     assert sorted(elsewhere.rglob("*.*")) == files_before
 
 
@@ -300,7 +368,8 @@ def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> N
     """A folder where a record was: told before anything moves. A link that leads
     nowhere just goes.
     """
-    record = next((own.folder / "weights").rglob("*.json"))
+    records = (own.folder / "weights").rglob("*.json")
+    record = next(records)
     record.unlink()
     record.mkdir()
     second = trained(own, 0, share=0.3)
@@ -310,8 +379,10 @@ def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> N
         submitted(own, second, replace=True)
     assert own.state() == before
     record.rmdir()
-    record.symlink_to(own.folder.parent / "nowhere")
-    assert submitted(own, second, replace=True).removed == (record,)
+    nowhere = own.folder.parent / "nowhere"
+    record.symlink_to(nowhere)
+    result = submitted(own, second, replace=True)
+    assert result.removed == (record,)
     assert not record.is_symlink()
 
 
@@ -322,11 +393,12 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
     second = trained(own, 0, share=0.3)
     before = own.state()
     long_note = "x" * (kept.MOST_LOG_BYTES - 100)
-    record = json.dumps({"step": 6, "note": long_note})
-    (second / "training.json").write_text(record)
+    write_record(second, {"step": 6, "note": long_note})
     score_files = (own.folder / "scores").rglob("drift*")
-    room = 1000 + max(path.stat().st_size for path in score_files)
-    assert room < (second / "training.json").stat().st_size
+    largest_score_file = max(path.stat().st_size for path in score_files)
+    room = 1000 + largest_score_file
+    record = second / "training.json"
+    assert room < record.stat().st_size
     with largest_file(room), pytest.raises(WorkFailedError):
         submitted(own, second, replace=True)
     assert own.state() == before
@@ -366,16 +438,22 @@ def test_weights_are_those_of_the_predictions(
 
 
 @pytest.mark.parametrize(
-    ("change", "fits"), [("", True), (", model.noise_std=0.001", False)]
+    ("change", "fits"),
+    [
+        ("", True),
+        (", model.noise_std=0.001", False),
+    ],
 )
 def test_seeds_differ_in_nothing_else(own: BoardBench, change: str, fits: bool) -> None:
     """The step of the best weights is each seed's own; a changed recipe is another
     method.
     """
     words = "cavity tiny train, recipe cavity/tiny, step"
-    runs = [trained(own, 0, f"{words} 6"), trained(own, 3, f"{words} 9{change}")]
-    with nullcontext() if fits else pytest.raises(UsageError, match=r"noise_std"):
-        submitted(own, *runs, weights=())
+    first = trained(own, 0, f"{words} 6")
+    second = trained(own, 3, f"{words} 9{change}")
+    refusal = pytest.raises(UsageError, match=r"noise_std")
+    with nullcontext() if fits else refusal:
+        submitted(own, first, second, weights=())
 
 
 @pytest.mark.usefixtures("first")
@@ -386,7 +464,7 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
         submitted(own, second, method="glide")
     assert caught.value.where == str(second / "weights.pt")
     submitted(own, second, weights=(), method="glide")
-    source = own.folder / f"{KEPT}.pt"
+    source = kept_weights(own)
     target = own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
     claim(own, f"{GLIDE}.pt", source)
@@ -397,54 +475,83 @@ def test_other_weights_are_refused(own: BoardBench) -> None:
     """Weights of another seed, one twice, a state to go on from, files that are none;
     nothing is written.
     """
-    runs = [trained(own, 0), trained(own, 3)]
+    run = trained(own, 0)
+    other_run = trained(own, 3)
     before = own.state()
-    first, second = (run / "weights.pt" for run in runs)
-    state = runs[0] / "checkpoint.pt"
-    save(state, replace(load(first), optimizer={"state": {}}))
+    first = run / "weights.pt"
+    second = other_run / "weights.pt"
+    state = run / "checkpoint.pt"
+    to_go_on_from = replace(load(first), optimizer={"state": {}})
+    save(state, to_go_on_from)
     for folders, weights in (
-        (runs[:1], (second,)),
-        (runs, (first, first)),
-        (runs[:1], (state,)),
+        ([run], (second,)),
+        ([run, other_run], (first, first)),
+        ([run], (state,)),
     ):
         with pytest.raises(UsageError) as caught:
             submitted(own, *folders, weights=weights)
         assert caught.value.where == str(weights[0])
+    no_weights = run / "training.json"
     with pytest.raises(UnreadableFileError):
-        submitted(own, *runs, weights=(first, runs[0] / "training.json"))
+        submitted(own, run, other_run, weights=(first, no_weights))
     assert own.state() == before
 
 
-def put(end: str, data: bytes) -> Callable[[BoardBench], object]:
+Damage = Callable[[BoardBench], object]
+
+
+def put(end: str, data: bytes) -> Damage:
     """Return what writes the weights or the record of the run anew."""
-    return lambda bench: (bench.folder / f"{KEPT}.{end}").write_bytes(data)
+    return lambda own: (own.folder / f"{KEPT}.{end}").write_bytes(data)
 
 
-DAMAGE: dict[str, Callable[[BoardBench], object]] = {
-    "weights: edited": lambda b: put("pt", kept_files(b)["drift_0.pt"][:-1] + b"x")(b),
-    "weights: a sparse file of a terabyte": lambda b: os.truncate(
-        b.folder / f"{KEPT}.pt", 2**40
+def edit_weights(own: BoardBench) -> None:
+    """Change the last byte of the weights."""
+    path = kept_weights(own)
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + b"x")
+
+
+def name_weights_of_another(entry: dict[str, Any]) -> None:
+    """Let an entry name the weights of another method."""
+    weights = entry["predictions"][0]["weights"]
+    weights["path"] = "weights/cavity/tiny/a_0.pt"
+
+
+def add_weights_of_no_entry(own: BoardBench) -> None:
+    """Leave weights on the board that no entry has."""
+    path = own.folder / "weights/cavity/tiny/other_0.pt"
+    path.write_bytes(b"1")
+
+
+def claim_track(entry: dict[str, Any]) -> None:
+    """Claim a track that the budget does not give."""
+    entry["budget"]["track"] = "converged"
+
+
+def claim_track_alone(entry: dict[str, Any]) -> None:
+    """Claim a track without a budget."""
+    entry["budget"] = {"track": "equal compute"}
+
+
+LONG_RECORD = json.dumps({"note": "x" * kept.MOST_LOG_BYTES})
+TERABYTE = 2**40
+DAMAGE: dict[str, Damage] = {
+    "weights: edited": edit_weights,
+    "weights: a sparse file of a terabyte": lambda own: os.truncate(
+        kept_weights(own), TERABYTE
     ),
-    "weights: lost": lambda b: (b.folder / f"{KEPT}.pt").unlink(),
-    "weights: those of another method": lambda b: b.edit(
-        "drift",
-        lambda entry: entry["predictions"][0]["weights"].update(
-            path="weights/cavity/tiny/a_0.pt"
-        ),
+    "weights: lost": lambda own: kept_weights(own).unlink(),
+    "weights: those of another method": lambda own: own.edit(
+        "drift", name_weights_of_another
     ),
-    "weights: of no entry": lambda b: (
-        b.folder / "weights/cavity/tiny/other_0.pt"
-    ).write_bytes(b"1"),
-    "weights: long record": put(
-        "json", json.dumps({"note": "x" * kept.MOST_LOG_BYTES}).encode()
-    ),
+    "weights: of no entry": add_weights_of_no_entry,
+    "weights: long record": put("json", LONG_RECORD.encode()),
     "weights: record nested far deeper than one is": put("json", b"[" * 100_000),
     "weights: JSON that is no record": put("json", b"[1]"),
-    "budget: track claimed": lambda b: b.edit(
-        "drift", lambda entry: entry["budget"].update(track="converged")
-    ),
-    "budget: track claimed without a budget": lambda b: b.edit(
-        "noisy", lambda entry: entry.update(budget={"track": "equal compute"})
+    "budget: track claimed": lambda own: own.edit("drift", claim_track),
+    "budget: track claimed without a budget": lambda own: own.edit(
+        "noisy", claim_track_alone
     ),
 }
 
@@ -455,8 +562,10 @@ def test_what_the_check_finds(own: BoardBench, name: str) -> None:
     """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that
     no budget gives.
     """
-    DAMAGE[name](own)
-    assert failing_checks(own) == {name.partition(":")[0]}
+    damage = DAMAGE[name]
+    damage(own)
+    check, _, _ = name.partition(":")
+    assert failing_checks(own) == {check}
 
 
 def test_what_is_no_record_is_not_copied(
@@ -467,15 +576,17 @@ def test_what_is_no_record_is_not_copied(
     """
     run = trained(own, 0)
     (run / "training.json").unlink()
+    cost = json.dumps({"seconds_per_frame": 1.0})
     for name, record in (
-        ("training.json", {"note": "x" * kept.MOST_LOG_BYTES}),
-        ("weights.json", {"seconds_per_frame": 1.0}),
+        ("training.json", LONG_RECORD),
+        ("weights.json", cost),
     ):
-        (run / name).write_text(json.dumps(record))
+        path = run / name
+        path.write_text(record)
         submitted(own, run, replace=True)
         assert list(kept_files(own)) == ["drift_0.pt"]
-        (run / name).unlink()
-    assert failing_checks(own) == set()
+        path.unlink()
+    assert_sound(own)
     monkeypatch.setattr(kept, "MOST_BYTES", 1000)
     assert failing_checks(own) == {"weights"}
 
@@ -491,10 +602,16 @@ def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
         prediction["budget"]["cpu_hours"] = 0.05
 
     own.edit("drift", shorten)
-    assert failing_checks(own) == set()
-    where = {"registry": own.registry, "root": own.data.root, "page": False}
-    again = check_board(own.folder, predictions=[first / "predictions.nc"], **where)
-    assert {finding.check for finding in again.findings} == {"rescored"}
+    assert_sound(own)
+    again = check_board(
+        own.folder,
+        predictions=[first / "predictions.nc"],
+        registry=own.registry,
+        root=own.data.root,
+        page=False,
+    )
+    checks = {finding.check for finding in again.findings}
+    assert checks == {"rescored"}
 
 
 def test_seeds_that_come_later_make_the_entry_of_all_at_once(
@@ -503,24 +620,29 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     """Byte for byte, weights included, though the predictions of the first seeds are
     gone by then.
     """
-    runs = [trained(own, seed) for seed in (0, 3, 5)]
-    submitted(own, runs[0])
-    (runs[0] / "predictions.nc").rename(tmp_path / "gone.nc")
-    for run in runs[1:]:
+    first, *others = [trained(own, seed) for seed in (0, 3, 5)]
+    first_predictions = first / "predictions.nc"
+    gone = tmp_path / "gone.nc"
+    submitted(own, first)
+    first_predictions.rename(gone)
+    for run in others:
         result = submitted(own, run, add=True)
-    assert failing_checks(own) == set()
+    assert_sound(own)
     # the others stay as they lie
-    assert sorted(path.name for path in result.files) == [
+    names = sorted(path.name for path in result.files)
+    assert names == [
         "drift.yaml",
         "drift_5.json",
         "drift_5.nc",
         "drift_5.pt",
     ]
-    assert not (own.folder / "scores/cavity/tiny/drift.nc").exists()
-    (tmp_path / "gone.nc").rename(runs[0] / "predictions.nc")
-    (tmp_path / "other").mkdir()
-    other = copied(home, tmp_path / "other")
-    submitted(other, *runs)
+    scores_of_one_seed = own.folder / "scores/cavity/tiny/drift.nc"
+    assert not scores_of_one_seed.exists()
+    gone.rename(first_predictions)
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
+    other = copied(home, other_folder)
+    submitted(other, first, *others)
     assert own.state() == other.state()
 
 
@@ -530,13 +652,16 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     """
     first = trained(own, 0)
     same = trained(own, 3)
-    other = trained(own, 4, training="cavity tiny train, recipe cavity/other, step 6")
+    other_recipe = "cavity tiny train, recipe cavity/other, step 6"
+    other = trained(own, 4, training=other_recipe)
     many = trained(own, 6, parameters=7)
+    predictions_of_many = many / "predictions.nc"
 
     def refused(*folders: Path, **options: Any) -> str:
         before = own.state()
+        all_options = {"add": True, **options}
         with pytest.raises(LagbenchError) as caught:
-            submitted(own, *folders, weights=(), **{"add": True, **options})
+            submitted(own, *folders, weights=(), **all_options)
         assert own.state() == before
         return f"{caught.value.what} {caught.value.fix}"
 
@@ -546,9 +671,11 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     assert "training" in refused(other)
     assert "parameters" in refused(many)
     assert "such a seed already" in refused(first)
-    own.predict(noisy, "another", seed=9, training=OURS).rename(many / "predictions.nc")
+    another = own.predict(noisy, "another", seed=9, training=OURS)
+    another.rename(predictions_of_many)
     assert "method" in refused(many)
-    own.predict(noisy, "drift", training=OURS).rename(many / "predictions.nc")
+    without_seed = own.predict(noisy, "drift", training=OURS)
+    without_seed.rename(predictions_of_many)
     assert "need numbers" in refused(many)
     file = own.folder / "scores/cavity/tiny/drift.nc"
     content = file.read_bytes()
@@ -556,31 +683,45 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     assert "score file" in refused(same)
     file.write_bytes(content)
     submitted(own, same, add=True)
-    assert failing_checks(own) == set()
+    assert_sound(own)
 
 
 def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) -> None:
     """Budget and parameters of meta.yaml too, where the files say none; what is said
     anew wins.
     """
-    files = [own.predict(nearer, "mine", seed=0), own.predict(still, "mine", seed=1)]
+    first = own.predict(nearer, "mine", seed=0)
+    second = own.predict(still, "mine", seed=1)
     budget = EntryBudget(epochs=10.0, gpu_hours=2.5)
     own.submit(
-        files[0],
+        first,
         parameters=1000,
         budget=budget,
         notes="first",
         hardware="a GPU",
     )
-    files[0].unlink()
-    own.submit(files[1], add=True, notes="both")
+    first.unlink()
+    own.submit(second, add=True, notes="both")
     entry = read_entry(own.entry("mine"))
     assert entry.budget == budget
     assert entry.parameters == 1000
     assert entry.notes == "both"
     assert entry.hardware == "a GPU"
-    assert [prediction.seed for prediction in entry.predictions] == [0, 1]
-    assert failing_checks(own) == set()
+    seeds = [prediction.seed for prediction in entry.predictions]
+    assert seeds == [0, 1]
+    assert_sound(own)
+
+
+def withdraw(entry: dict[str, Any]) -> None:
+    """Withdraw an entry."""
+    entry["status"] = "withdrawn"
+    entry["reason"] = "a mistake"
+
+
+def restore(entry: dict[str, Any]) -> None:
+    """Take the withdrawal back."""
+    entry["status"] = "active"
+    entry["reason"] = "it was none"
 
 
 def test_only_sound_active_entries_get_seeds(
@@ -589,33 +730,33 @@ def test_only_sound_active_entries_get_seeds(
     """Not a withdrawn one, nor one whose weights changed. A seed that somebody else
     added while files were scored stays.
     """
-    runs = [trained(own, seed) for seed in (0, 3, 5)]
-    submitted(own, runs[0])
-    content = kept_files(own)["drift_0.pt"]
-    put("pt", content + b"more")(own)
+    first, second, third = [trained(own, seed) for seed in (0, 3, 5)]
+    submitted(own, first)
+    weights = kept_weights(own)
+    content = weights.read_bytes()
+    weights.write_bytes(content + b"more")
     with pytest.raises(ChecksFailedError) as caught:
-        submitted(own, runs[1], add=True)
+        submitted(own, second, add=True)
     assert caught.value.where.endswith("leaderboard/weights/cavity/tiny/drift_0.pt")
-    put("pt", content)(own)
-    own.edit(
-        "drift", lambda entry: entry.update(status="withdrawn", reason="a mistake")
-    )
+    weights.write_bytes(content)
+    own.edit("drift", withdraw)
     with pytest.raises(UsageError) as caught:
-        submitted(own, runs[1], add=True)
+        submitted(own, second, add=True)
     assert caught.value.where.endswith("leaderboard/submissions/cavity/tiny/drift.yaml")
-    own.edit("drift", lambda entry: entry.update(status="active", reason="it was none"))
+    own.edit("drift", restore)
 
     def meanwhile(*args: Any, **options: Any) -> ScoreCard:
         monkeypatch.undo()
-        submitted(own, runs[1], add=True)
+        submitted(own, second, add=True)
         return score(*args, **options)
 
     monkeypatch.setattr(submitting, "score", meanwhile)
-    submitted(own, runs[2], add=True)
+    submitted(own, third, add=True)
     entry = read_entry(own.entry("drift"))
-    assert [prediction.seed for prediction in entry.predictions] == [0, 3, 5]
+    seeds = [prediction.seed for prediction in entry.predictions]
+    assert seeds == [0, 3, 5]
     assert entry.reason == "it was none"
-    assert failing_checks(own) == set()
+    assert_sound(own)
 
 
 def test_each_seed_has_its_own_step_and_start(
@@ -631,9 +772,21 @@ def test_each_seed_has_its_own_step_and_start(
     first = own.predict(nearer, "mine", seed=0, training=training)
     own.submit(first, name="My model")
     added = own.predict(still, "mine", seed=1, training=other_training)
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.registry.files["cavity"]))
-    where = ["--board", own.folder, "--root", own.data.root, "--method", "mine"]
-    result = run("submit", added, "--add", *where, "--command", "make both")
+    registry_file = own.registry.files["cavity"]
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(registry_file))
+    where = [
+        *("--board", own.folder),
+        *("--root", own.data.root),
+        *("--method", "mine"),
+    ]
+    result = run(
+        "submit",
+        added,
+        "--add",
+        *where,
+        "--command",
+        "make both",
+    )
     assert result.exit_code == 0, result.output
     entry = read_entry(own.entry("mine"))
     assert entry.name == "My model"
