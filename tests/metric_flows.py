@@ -27,26 +27,29 @@ CONFIG = TaskConfig(
 def lattice(side: int = 20) -> Floats:
     """Fill the unit box with side x side particles."""
     axis = (np.arange(side) + 0.5) / side
-    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    points = np.stack([x, y], axis=-1)
+    return points.reshape(-1, 2)
 
 
 def swirl(position: Floats) -> Floats:
     """Return the Taylor-Green velocity that closes at the walls of the unit box."""
-    s = np.pi * position
-    return np.stack(
-        [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1
-    )
+    phase_x, phase_y = np.pi * position.T
+    u = np.sin(phase_x) * np.cos(phase_y)
+    v = -np.cos(phase_x) * np.sin(phase_y)
+    return np.stack([u, v], axis=1)
 
 
 def rollout(frames: int = 8, side: int = 20, speed: float = 0.01) -> Floats:
     """Return positions carried by the swirl, whose speed wavers, shape [frame,
     particle, 2].
     """
-    positions = [lattice(side)]
+    position = lattice(side)
+    positions = [position]
     for frame in range(frames - 1):
-        positions.append(
-            positions[-1] + speed * (1 + 0.3 * np.sin(frame)) * swirl(positions[-1])
-        )
+        frame_speed = speed * (1 + 0.3 * np.sin(frame))
+        position = position + frame_speed * swirl(position)
+        positions.append(position)
     return np.array(positions)
 
 
@@ -59,17 +62,15 @@ def scenario_of(
     """Return the scenario whose given frames are the first two; ``changes`` go to the
     config.
     """
-    kinds = (
-        np.zeros(positions.shape[1], np.int8)
-        if material is None
-        else np.asarray(material, np.int8)
-    )
+    particle_count = positions.shape[1]
+    if material is None:
+        material = np.zeros(particle_count)
     config = replace(CONFIG, **changes)
     return Scenario(
         config=config,
         input_positions=positions[: config.input_frames],
-        material=kinds,
-        particle_mass=1.0 / positions.shape[1],
+        material=np.asarray(material, np.int8),
+        particle_mass=1.0 / particle_count,
         area=1.0,
     )
 
@@ -78,12 +79,16 @@ def pairs_of(scenario: Scenario, truth: Floats, prediction: Floats) -> list[Fram
     """Return the frame pairs of whole trajectories; the prediction's given frames are
     not read.
     """
-    first = scenario.config.input_frames
-    sides = (
-        snapshots(scenario, positions[first:]) for positions in (truth, prediction)
-    )
-    numbered = zip(scenario.config.predicted_frames, *sides, strict=True)
-    return [FramePair(scenario, frame, t, p) for frame, t, p in numbered]
+    config = scenario.config
+    first = config.input_frames
+    true_snapshots = snapshots(scenario, truth[first:])
+    predicted_snapshots = snapshots(scenario, prediction[first:])
+    pairs = []
+    for frame, true, predicted in zip(
+        config.predicted_frames, true_snapshots, predicted_snapshots, strict=True
+    ):
+        pairs.append(FramePair(scenario, frame, true, predicted))
+    return pairs
 
 
 def pair_of(
@@ -99,14 +104,24 @@ def pair_of(
 
     The mass of each particle is 1 / particles.
     """
+    if predicted_position is None:
+        predicted_position = position
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
-    y = x if predicted_position is None else np.asarray(predicted_position, np.float64)
-    scenario = scenario_of(np.stack([x - 2 * u, x - u]), material=material, **changes)
-    predicted = scenario.snapshot(y, y - np.asarray(predicted_velocity, np.float64))
-    return FramePair(scenario, 2, scenario.snapshot(x, x - u), predicted)
+    y = np.asarray(predicted_position, np.float64)
+    v = np.asarray(predicted_velocity, np.float64)
+    input_positions = np.stack([x - 2 * u, x - u])
+    scenario = scenario_of(input_positions, material=material, **changes)
+    truth = scenario.snapshot(x, x - u)
+    prediction = scenario.snapshot(y, y - v)
+    return FramePair(scenario, 2, truth, prediction)
+
+
+def measure(pair: FramePair, name: str) -> float:
+    """Measure a metric of one pair."""
+    return METRICS[name].measure(pair)
 
 
 def measured(pair: FramePair, *names: str) -> list[float]:
     """Measure metrics of one pair."""
-    return [METRICS[name].measure(pair) for name in names]
+    return [measure(pair, name) for name in names]

@@ -29,16 +29,25 @@ from lagbench.metrics import (
 from lagbench.metrics.aggregate import quantile
 from lagbench.metrics.significance import mean_loss, rank_ranges
 
-DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
+NUMBERS = st.integers(-5, 5).map(float)
+DIFFERENCES = st.lists(NUMBERS, min_size=1, max_size=9)
 
 
 def score_of(*values: float, metric: str = "vorticity_mse", first: int = 0) -> Score:
     """Return a score with these values over consecutive scenarios."""
     count = len(values)
     scenarios = tuple(range(first, first + count))
-    x = np.array(values)
-    missing = (0,) * count
-    return Score(METRICS[metric], scenarios, (2,), x[:, None], x, missing)
+    means = np.array(values)
+    frames = (2,)
+    undefined = (0,) * count
+    return Score(
+        METRICS[metric],
+        scenarios,
+        frames,
+        means[:, None],
+        means,
+        undefined,
+    )
 
 
 def shifted_score(values: Sequence[float], shift: float) -> Score:
@@ -49,10 +58,12 @@ def shifted_score(values: Sequence[float], shift: float) -> Score:
 def enumerated(differences: list[float]) -> float:
     """Return the p-value by going through all sign patterns."""
     observed = abs(sum(differences))
-    patterns = list(itertools.product((1, -1), repeat=len(differences)))
+    count = len(differences)
+    patterns = list(itertools.product((1, -1), repeat=count))
     extreme_count = 0
     for pattern in patterns:
-        total = sum(map(operator.mul, pattern, differences))
+        terms = map(operator.mul, pattern, differences)
+        total = sum(terms)
         if abs(total) >= observed:
             extreme_count += 1
     return extreme_count / len(patterns)
@@ -89,7 +100,12 @@ def test_losses_that_no_p_value_fits() -> None:
     It is no evidence: a p-value of 0 would be below the least there is.
     """
     too_many = [1.0] * 41
-    for differences in ([], too_many, [1.0, math.nan], [1.0, math.inf]):
+    for differences in (
+        [],
+        too_many,
+        [1.0, math.nan],
+        [1.0, math.inf],
+    ):
         with pytest.raises(UsageError):
             sign_flip_p(differences)
     plain = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
@@ -109,14 +125,16 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
     """SciPy's percentiles about the mean, stretched by sqrt(n/(n-1)) and Student's
     quantile.
     """
-    x = np.random.default_rng(1).gamma(2.0, size=12)
+    rng = np.random.default_rng(1)
+    x = rng.gamma(2.0, size=12)
     low, high = bootstrap_interval(x)
     options = {
         "n_resamples": 20_000,
         "method": "percentile",
         "rng": np.random.default_rng(2),
     }
-    theirs = scipy.stats.bootstrap((x,), np.mean, **options).confidence_interval
+    bootstrap = scipy.stats.bootstrap((x,), np.mean, **options)
+    theirs = bootstrap.confidence_interval
     student = scipy.stats.t.ppf(0.975, 11)
     normal = scipy.stats.norm.ppf(0.975)
     stretch = math.sqrt(12 / 11) * student / normal
@@ -186,12 +204,18 @@ def test_intervals_repeat_and_scale() -> None:
 
     shifted = bootstrap_interval(x, minus=[1.0] * 6)
     assert shifted == pytest.approx((low - 1.0, high - 1.0))
-    scaled = bootstrap_interval([2 * value + 1 for value in x])
+    twice_and_one = [2 * value + 1 for value in x]
+    scaled = bootstrap_interval(twice_and_one)
     assert scaled == pytest.approx((2 * low + 1, 2 * high + 1))
     with_nan = [*x[:2], math.nan, *x[2:]]
     assert bootstrap_interval(with_nan) == (low, high)
 
-    for few in ([], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]):
+    for few in (
+        [],
+        [1.0],
+        [1.0, 2.0, 4.0],
+        [math.nan, 2.0, 1.0, 1.0],
+    ):
         low, high = bootstrap_interval(few)
         assert math.isnan(low)
         assert math.isnan(high)
@@ -211,8 +235,11 @@ def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
     welch = scipy.stats.ttest_ind(a, b, equal_var=False)
     assert differ(a_seeds, b_seeds) == pytest.approx(welch.pvalue)
 
-    a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
-    equal_seeds = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
+    rng = np.random.default_rng(3)
+    a, b = rng.gamma(3.0, size=(2, 9))
+    a_seeds = np.tile(a, (3, 1))
+    b_seeds = np.tile(b, (3, 1))
+    equal_seeds = differ(a_seeds, b_seeds)
     paired = scipy.stats.ttest_rel(a, b)
     assert equal_seeds == pytest.approx(paired.pvalue)
 
@@ -248,12 +275,8 @@ def test_seeds_of_one_method_seldom_differ() -> None:
     [
         [0.03],
         [0.0, 1.0],
-        [
-            0.04,
-            0.01,
-            0.03,
-            0.005,
-        ],  # the third is held up by the second: 0.06, 0.03, 0.06, 0.02
+        # the third is held up by the second: 0.06, 0.03, 0.06, 0.02
+        [0.04, 0.01, 0.03, 0.005],
         [0.2, 0.01, 0.01, 0.2, 1.0, 0.6],
         np.random.default_rng(0).beta(0.5, 3.0, 9).tolist(),
     ],
@@ -281,10 +304,11 @@ def test_comparison_over_common_scenarios() -> None:
     assert found.p == 2.0**-5
     assert found.significant
     gappy = score_of(math.nan, 1.0)
-    assert compare(one, gappy).scenarios == (1,)
+    common = compare(one, gappy)
+    assert common.scenarios == (1,)
     # its smallest p would be 0.0625
-    ones = score_of(*[1.0] * 5)
-    five = compare(ones, shifted_score([1.0] * 5, 1.0))
+    ones = [1.0] * 5
+    five = compare(score_of(*ones), shifted_score(ones, 1.0))
     assert math.isnan(five.p)
     assert not five.significant
     assert five.difference == -1.0
@@ -301,7 +325,8 @@ def test_direction_decides_who_is_better() -> None:
     ):
         score = score_of(value, value, metric=metric)
         worse = score_of(worse_value, worse_value, metric=metric)
-        assert compare(score, worse).difference == pytest.approx(-gain)
+        result = compare(score, worse)
+        assert result.difference == pytest.approx(-gain)
     for metric, other_metric in (
         ("energy_true", "energy_true"),
         ("vorticity_mse", "vorticity_mae"),
@@ -319,7 +344,7 @@ def test_ranks_are_numbers_in_order() -> None:
     c and d win no scenario: p = 2/64 each, times the comparisons left: 3 and 2 of
     three.
     """
-    a = [float(v) for v in range(1, 10)]
+    a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
     scores = {
         "d": shifted_score(a, 2.001),
         "c": shifted_score(a, 2.0),
@@ -328,13 +353,15 @@ def test_ranks_are_numbers_in_order() -> None:
     }
     places = standings(scores)
     assert list(places) == ["a", "b", "c", "d"]
-    assert [place.rank for place in places.values()] == [1, 2, 3, 4]
+    ranks = [place.rank for place in places.values()]
+    assert ranks == [1, 2, 3, 4]
     tied = [name for name, place in places.items() if place.tied]
     assert tied == ["b"]
     assert math.isnan(places["a"].p)
     assert places["b"].p == pytest.approx(0.5)
-    assert places["c"].p == pytest.approx(3 * 2.0**-8)
-    assert places["d"].p == pytest.approx(3 * 2.0**-8)
+    smallest = 2.0**-8
+    assert places["c"].p == pytest.approx(3 * smallest)
+    assert places["d"].p == pytest.approx(3 * smallest)
 
 
 def test_ranks_without_significance_or_values() -> None:
@@ -358,7 +385,10 @@ def test_ranks_without_significance_or_values() -> None:
         ("y", 2, True),
         ("none", 3, False),
     ]
-    gappy = [score_of(1.0, math.nan), score_of(1.0, 4.0)]
+    gappy = [
+        score_of(1.0, math.nan),
+        score_of(1.0, 4.0),
+    ]
     even = [score_of(2.2, 2.2)]
     assert mean_loss(gappy) == 2.5
     ranked = standings({"gappy": gappy, "even": even})
@@ -372,17 +402,19 @@ def test_one_training_used_in_two_ways_is_paired() -> None:
     gains = np.array([0.021, 0.014, 0.026])
     scatter = np.array([0.2, 0.5, 0.35])
     base = np.linspace(1.0, 2.0, 20)
-    ways = [
-        [score_of(*(base + shift)) for shift in scatter - by]
-        for by in (gains, 0 * gains)
-    ]
-    found = compare(*ways, paired=True)
+    used_one_way = []
+    used_another_way = []
+    for shift, gain in zip(scatter, gains, strict=True):
+        used_one_way.append(score_of(*(base + shift - gain)))
+        used_another_way.append(score_of(*(base + shift)))
+    found = compare(used_one_way, used_another_way, paired=True)
     expected = scipy.stats.ttest_1samp(-gains, 0.0)
     assert found.p == pytest.approx(expected.pvalue)
     assert found.difference == pytest.approx(-gains.mean())
     low, high = found.interval
     assert low < found.difference < high < 0.0
-    assert compare(*ways).p > 0.5
+    unpaired = compare(used_one_way, used_another_way)
+    assert unpaired.p > 0.5
 
 
 def test_seeds_of_a_method_are_compared_together() -> None:
@@ -408,17 +440,21 @@ def test_ranges_of_ranks_are_those_of_all_draws() -> None:
         "c": np.array([2.1, 2.9, 3.1, 5.2, 5.9, 7.2]),
     }
     names = sorted(losses)
-    values = np.array([losses[name] for name in names])  # shape [method, scenario]
+    # shape [method, scenario]
+    values = np.array([losses[name] for name in names])
     stretch = math.sqrt(6 / 5)
-    middle = values.mean(axis=1)
-    draws = np.indices((6,) * 6).reshape(6, -1).T  # shape [draw, scenario]
-    deviation = values[:, draws].mean(axis=2) - middle[:, None]
-    means = middle[:, None] + stretch * deviation  # shape [method, draw]
+    middle = values.mean(axis=1)[:, None]
+    # shape [draw, scenario]
+    draws = np.indices((6,) * 6).reshape(6, -1).T
+    means_of_draws = values[:, draws].mean(axis=2)
+    # shape [method, draw]
+    means = middle + stretch * (means_of_draws - middle)
     is_better = means[None] < means[:, None]
     ranks = 1 + is_better.sum(axis=1)
+    sorted_ranks = np.sort(ranks, axis=1)
     tail = int(0.025 * len(draws))
     expected = {}
-    for name, ranks_of_name in zip(names, np.sort(ranks, axis=1), strict=True):
+    for name, ranks_of_name in zip(names, sorted_ranks, strict=True):
         low = ranks_of_name[tail]
         high = ranks_of_name[-1 - tail]
         expected[name] = (low, high)
@@ -451,7 +487,13 @@ def test_ranges_of_ranks_know_ties_gaps_and_few_scenarios() -> None:
     assert rank_ranges({"a": few, "b": few}) == {}
 
     scatter = np.array([[-2.0], [0.0], [2.0]])
-    sure = {"a": [same], "b": [same + 0.5]}
-    unsure = {"a": [same + scatter], "b": [same + 0.5 + scatter]}
+    sure = {
+        "a": [same],
+        "b": [same + 0.5],
+    }
     assert rank_ranges(sure) == {"a": (1, 1), "b": (2, 2)}
+    unsure = {
+        "a": [same + scatter],
+        "b": [same + 0.5 + scatter],
+    }
     assert rank_ranges(unsure) == {"a": (1, 2), "b": (1, 2)}
