@@ -25,7 +25,8 @@ def lattice(grid: Grid, per_cell: int = 2) -> Floats:
     """Return per_cell x per_cell particles in every cell of the unit box."""
     count = grid.cells * per_cell
     axis = (np.arange(count) + 0.5) / count
-    return square_points(axis).reshape(-1, 2)
+    points = square_points(axis)
+    return points.reshape(-1, 2)
 
 
 def square_points(axis: Floats) -> Floats:
@@ -48,7 +49,9 @@ def deep(field: Floats) -> Floats:
 
 def rotation(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Return the velocity of a solid-body rotation with Omega = 0.3."""
-    return -0.3 * (y - 0.5), 0.3 * (x - 0.5)
+    arm_x = x - 0.5
+    arm_y = y - 0.5
+    return -0.3 * arm_y, 0.3 * arm_x
 
 
 def shear(x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -64,7 +67,11 @@ def expansion(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 @BOTH
 @pytest.mark.parametrize(
     ("flow", "vorticity", "divergence"),
-    [(rotation, 0.6, 0.0), (shear, -0.7, 0.0), (expansion, 0.0, 2.0)],
+    [
+        (rotation, 0.6, 0.0),
+        (shear, -0.7, 0.0),
+        (expansion, 0.0, 2.0),
+    ],
 )
 def test_linear_flows_have_their_rates(
     placement: Placement,
@@ -75,10 +82,13 @@ def test_linear_flows_have_their_rates(
     """Both are exact to rounding on a lattice; the signs are not swapped."""
     grid = Grid(20, placement)
     position = lattice(grid)
-    velocity = np.stack(flow(*position.T), axis=-1)
+    x, y = position.T
+    velocity = np.stack(flow(x, y), axis=-1)
     fields = fields_of(position, velocity, grid)
-    assert_allclose(deep(fields.vorticity), vorticity, atol=1e-12)
-    assert_allclose(deep(fields.divergence), divergence, atol=1e-12)
+    inner_vorticity = deep(fields.vorticity)
+    assert_allclose(inner_vorticity, vorticity, atol=1e-12)
+    inner_divergence = deep(fields.divergence)
+    assert_allclose(inner_divergence, divergence, atol=1e-12)
 
 
 @BOTH
@@ -86,13 +96,16 @@ def test_rigid_translation_is_exact_for_any_particles(placement: Placement) -> N
     """Every node with particles carries the common velocity; the field is constant."""
     rng = np.random.default_rng(1)
     position = rng.random((900, 2))
-    velocity = np.broadcast_to([0.3, -0.2], position.shape)
+    common = [0.3, -0.2]
+    velocity = np.broadcast_to(common, position.shape)
     fields = fields_of(position, velocity, Grid(12, placement))
-    filled = fields.weight >= gridding.EMPTY_SHARE * fields.full
-    count = filled.sum()
+    least_weight = gridding.EMPTY_SHARE * fields.full
+    is_filled = fields.weight >= least_weight
+    count = is_filled.sum()
     assert count > 100
-    expected = np.tile([0.3, -0.2], (count, 1))
-    assert_allclose(fields.velocity[filled], expected, rtol=1e-14)
+    expected = np.tile(common, (count, 1))
+    actual = fields.velocity[is_filled]
+    assert_allclose(actual, expected, rtol=1e-14)
 
 
 def taylor_green(position: Floats) -> tuple[Floats, Floats]:
@@ -101,7 +114,9 @@ def taylor_green(position: Floats) -> tuple[Floats, Floats]:
     phase = k * np.moveaxis(position, -1, 0)
     sin_x, sin_y = np.sin(phase)
     cos_x, cos_y = np.cos(phase)
-    velocity = np.stack([sin_x * cos_y, -cos_x * sin_y], axis=-1)
+    u = sin_x * cos_y
+    v = -cos_x * sin_y
+    velocity = np.stack([u, v], axis=-1)
     vorticity = 2.0 * k * sin_x * sin_y
     return velocity, vorticity
 
@@ -119,7 +134,8 @@ def test_taylor_green_converges_with_second_order(placement: Placement) -> None:
     for cells in (20, 40, 80):
         grid = Grid(cells, placement)
         fields = taylor_green_fields(lattice(grid), grid)
-        _, exact = taylor_green(square_points(grid.axis))
+        nodes = square_points(grid.axis)
+        _, exact = taylor_green(nodes)
         error = deep(fields.vorticity - exact)
         errors.append(np.abs(error).max())
     ratios = np.divide(errors[:-1], errors[1:])
@@ -132,19 +148,24 @@ def test_taylor_green_of_scattered_particles_converges_with_their_number() -> No
     """The error of random particles falls like one over the root of their number."""
     rng = np.random.default_rng(2)
     grid = Grid(20)
-    reference = taylor_green_fields(lattice(grid, 8), grid)
+    even = lattice(grid, 8)
+    reference = taylor_green_fields(even, grid)
     errors = []
     for count in (10_000, 160_000):
         position = rng.random((count, 2))
         fields = taylor_green_fields(position, grid)
         error = deep(fields.vorticity - reference.vorticity)
-        errors.append(np.sqrt(np.mean(error**2)))
+        mean_square = np.mean(error**2)
+        errors.append(np.sqrt(mean_square))
     ratio = errors[0] / errors[1]
     assert 3.0 < ratio < 5.0  # sqrt(16) = 4
 
 
+SEEDS = st.integers(0, 2**32 - 1)
+
+
 @BOTH
-@given(seed=st.integers(0, 2**32 - 1), cells=st.integers(2, 9))
+@given(seed=SEEDS, cells=st.integers(2, 9))
 @settings(max_examples=30, deadline=None)
 def test_weights_are_a_partition_of_unity(
     placement: Placement, seed: int, cells: int
@@ -158,7 +179,8 @@ def test_weights_are_a_partition_of_unity(
     u = rng.normal(size=x.shape)
     sums = gridding.transfer(x, u, grid)
     assert sums.weight.min() >= 0.0
-    assert sums.weight.sum() == pytest.approx(50.0, rel=1e-13)
+    total = sums.weight.sum()
+    assert total == pytest.approx(50.0, rel=1e-13)
     momentum = sums.momentum.sum(axis=(0, 1))
     expected = u.sum(axis=0)
     assert_allclose(momentum, expected, atol=1e-12)
@@ -174,7 +196,7 @@ def spline(s: Floats) -> Floats:
 
 
 @BOTH
-@given(seed=st.integers(0, 2**32 - 1))
+@given(seed=SEEDS)
 @settings(max_examples=20, deadline=None)
 def test_transfer_equals_the_sum_over_all_pairs(
     placement: Placement, seed: int
@@ -194,11 +216,14 @@ def test_transfer_equals_the_sum_over_all_pairs(
     # [node, particle, axis]
     distance = grid.axis[:, None, None] - x
     along = spline(distance / grid.spacing)
-    weight = np.einsum("ip,kp->ikp", along[..., 0], along[..., 1])
+    along_x = along[..., 0]
+    along_y = along[..., 1]
+    weight = np.einsum("ip,kp->ikp", along_x, along_y)
     sums = gridding.transfer(x, u, grid)
     total_weight = weight.sum(axis=-1)
     assert_allclose(sums.weight, total_weight, atol=1e-13)
-    assert_allclose(sums.momentum, weight @ u, atol=1e-12)
+    momentum = weight @ u
+    assert_allclose(sums.momentum, momentum, atol=1e-12)
 
 
 def test_a_batch_has_the_bits_of_its_frames() -> None:
@@ -208,18 +233,26 @@ def test_a_batch_has_the_bits_of_its_frames() -> None:
     """
     rng = np.random.default_rng(4)
     grid = Grid(9, Placement.NODES)
-    x = rng.random((2, 3, 200, 2)).astype(np.float32)
-    u = rng.normal(size=(2, 3, 200, 2))
+    shape = (2, 3, 200, 2)  # [scenario, frame, particle, axis]
+    x = rng.random(shape).astype(np.float32)
+    u = rng.normal(size=shape)
     batch = fields_of(x, u, grid)
     assert batch.vorticity.shape == (2, 3, 10, 10)
     order = rng.permutation(200)
     for frame in np.ndindex(2, 3):
-        single = fields_of(x[frame], u[frame], grid)
-        for name in ("weight", "velocity", "vorticity", "divergence"):
+        position = x[frame]
+        velocity = u[frame]
+        single = fields_of(position, velocity, grid)
+        for name in (
+            "weight",
+            "velocity",
+            "vorticity",
+            "divergence",
+        ):
             batch_field = getattr(batch, name)
             expected = getattr(single, name)
             assert_array_equal(batch_field[frame], expected)
-        permuted = fields_of(x[frame][order], u[frame][order], grid)
+        permuted = fields_of(position[order], velocity[order], grid)
         assert_allclose(permuted.velocity, single.velocity, atol=1e-12)
         assert_allclose(permuted.vorticity, single.vorticity, atol=1e-10)
         assert_array_equal(permuted.counted, single.counted)
@@ -229,9 +262,11 @@ def test_wall_nodes_count_and_corner_nodes_do_not() -> None:
     """Walls through nodes have half a full weight, corners a quarter."""
     grid = Grid(40)
     lo = 2.5 / 40  # cavity full: node 2 lies on the wall
-    x = lo + 0.875 * lattice(Grid(35))
-    full = grid.full_weight(len(x), 0.875**2)
-    fields = gridding.fields(x, np.zeros_like(x), grid, full=full)
+    length = 0.875
+    x = lo + length * lattice(Grid(35))
+    at_rest = np.zeros_like(x)
+    full = grid.full_weight(len(x), length**2)
+    fields = gridding.fields(x, at_rest, grid, full=full)
     assert full == pytest.approx(4.0)  # 4900 particles / 35^2 cells
     density = fields.density
     assert density[20, 20] == pytest.approx(1.0)
@@ -239,7 +274,9 @@ def test_wall_nodes_count_and_corner_nodes_do_not() -> None:
     assert density[2, 2] == pytest.approx(0.25)
     expected = np.zeros((40, 40), bool)
     expected[2:-2, 2:-2] = True
-    expected[[2, 2, -3, -3], [2, -3, 2, -3]] = False
+    for column in (2, -3):
+        for row in (2, -3):
+            expected[column, row] = False
     assert_array_equal(fields.counted, expected)
 
 
@@ -249,17 +286,29 @@ def test_vorticity_stands_where_four_neighbours_count() -> None:
     counted[2, 3] = False
     expected = np.zeros((6, 6), bool)
     expected[1:-1, 1:-1] = True
-    expected[[1, 3, 2, 2], [3, 3, 2, 4]] = False
-    assert_array_equal(gridding.differentiable_nodes(counted), expected)
+    for neighbour in ((1, 3), (3, 3), (2, 2), (2, 4)):
+        expected[neighbour] = False
+    actual = gridding.differentiable_nodes(counted)
+    assert_array_equal(actual, expected)
 
 
 def test_nodes_that_a_prediction_leaves_empty_have_velocity_zero() -> None:
     """Below a thousandth of a full weight the velocity is 0."""
     weight = np.array([[0.0, 3.9e-3, 4.1e-3]])
-    momentum = np.array([(0.0, 0.0), (1.0, 1.0), (8.2e-3, 0.0)])
+    momentum = np.array(
+        [
+            [0.0, 0.0],
+            [1.0, 1.0],
+            [8.2e-3, 0.0],
+        ]
+    )
     sums = gridding.Transfer(weight, momentum[None])
     velocity = gridding.node_velocity(sums, 4.0)
-    expected = [(0.0, 0.0), (0.0, 0.0), (2.0, 0.0)]
+    expected = [
+        [0.0, 0.0],
+        [0.0, 0.0],
+        [2.0, 0.0],
+    ]
     assert_allclose(velocity[0], expected)
 
 
@@ -275,11 +324,22 @@ def test_the_mask_of_the_truth_decides_for_a_prediction() -> None:
         full=truth.full,
         counted=truth.counted,
     )
-    assert_array_equal(np.isnan(prediction.vorticity), np.isnan(truth.vorticity))
+    missing = np.isnan(prediction.vorticity)
+    assert_array_equal(missing, np.isnan(truth.vorticity))
     assert np.isfinite(prediction.vorticity).any()
 
 
-@pytest.mark.parametrize("value", [-1e-9, 1.0 + 1e-9, np.nan, np.inf, -np.inf, 1e300])
+@pytest.mark.parametrize(
+    "value",
+    [
+        -1e-9,
+        1.0 + 1e-9,
+        np.nan,
+        np.inf,
+        -np.inf,
+        1e300,
+    ],
+)
 def test_particles_outside_the_box_carry_no_weight(value: float) -> None:
     """Particles beyond the unit box, or nowhere, change nothing and raise nothing."""
     rng = np.random.default_rng(5)
@@ -291,7 +351,8 @@ def test_particles_outside_the_box_carry_no_weight(value: float) -> None:
         (0.5, value),
     ]
     all_positions = np.concatenate([x, outside])
-    all_velocities = np.concatenate([u, np.full((2, 2), 9.0)])
+    fast = np.full((2, 2), 9.0)
+    all_velocities = np.concatenate([u, fast])
     sums = gridding.transfer(all_positions, all_velocities, grid)
     expected = gridding.transfer(x, u, grid)
     assert_array_equal(sums.weight, expected.weight)
