@@ -15,7 +15,7 @@ import pytest
 from click.testing import Result
 from conftest import SIZE, SPLIT
 
-from lagbench.data.registry import Registry, load
+from lagbench.data.registry import Registry, Size, load
 from lagbench.generators.batch import SimulationJob, SimulationPace, substep_count
 from lagbench.generators.simulate import (
     perturbed_substep_count,
@@ -32,14 +32,16 @@ HERE = {"machine": platform.node()}
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache folder of its own, in which nothing is measured yet."""
-    monkeypatch.setenv("LAGBENCH_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("LAGBENCH_CACHE", str(folder))
+    return folder
 
 
 def noted(cache: Path, **kinds: Any) -> None:
     """Write what was measured, as a generation would."""
     cache.mkdir(exist_ok=True)
-    (cache / "rates.json").write_text(json.dumps(HERE | kinds))
+    text = json.dumps(HERE | kinds)
+    (cache / "rates.json").write_text(text)
 
 
 WORK = (1_000_000, 100)
@@ -49,19 +51,32 @@ GOOD = {"256": [2 * PLAIN, *WORK]}
 
 def pace(slowness: float) -> SimulationPace:
     """Return what so slow a machine measures."""
+    particle_substeps, frames = WORK
     return SimulationPace(
-        seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1]
+        seconds=slowness * PLAIN,
+        particle_substeps=particle_substeps,
+        frames=frames,
     )
 
 
-def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
+@pytest.fixture
+def size(unmeasured: Registry) -> Size:
+    """A size with a free surface of 256 particles."""
+    return unmeasured.size("fluid", "tiny")
+
+
+def test_a_measured_rate_decides(cache: Path, size: Size) -> None:
     """Whoever took 300 s for three times the work takes 100 s: 2 * 465 * 256 particle
     substeps, 64 frames.
     """
-    size = unmeasured.size("fluid", "tiny")
-    assert not estimate(size, (0, 1)).measured
-    noted(cache, free_surface={"256": [300.0, 3 * 2 * 465 * 256, 3 * 64]})
-    expected = estimate(size, (0, 1))
+    scenarios = (0, 1)
+    assert not estimate(size, scenarios).measured
+    seconds = 300.0
+    particle_substeps = 2 * 465 * 256
+    frames = 64
+    row = [seconds, 3 * particle_substeps, 3 * frames]
+    noted(cache, free_surface={"256": row})
+    expected = estimate(size, scenarios)
     assert expected.measured
     assert expected.core_seconds == pytest.approx(100.0)
 
@@ -72,31 +87,47 @@ def test_perturbed_runs_of_test_scenarios_are_counted() -> None:
     """
     size = load().size("cavity", "mini")
     test = size.subsets["test"]
-    perturbed = sum(perturbed_substep_count(size, i) for i in test)
-    plain = sum(substep_count(size, i) for i in test)
+    perturbed = 0
+    plain = 0
+    frames = 0
+    for scenario in test:
+        perturbed += perturbed_substep_count(size, scenario)
+        plain += substep_count(size, scenario)
+        frames += size.frame_count(scenario)
+        frames += size.task.input_frames + size.task.horizon
     assert perturbed < plain
-    perturbed_frames = len(test) * (size.task.input_frames + size.task.horizon)
-    frames = sum(map(size.frame_count, test)) + perturbed_frames
-    expected = reference_seconds((plain + perturbed) * size.particles, frames)
-    assert estimate(size, test).core_seconds == pytest.approx(expected)
+    particle_substeps = (plain + perturbed) * size.particles
+    expected = reference_seconds(particle_substeps, frames)
+    seconds = estimate(size, test).core_seconds
+    assert seconds == pytest.approx(expected)
 
 
-def test_the_nearest_number_of_particles_stands_in(
-    cache: Path, unmeasured: Registry
-) -> None:
+def test_the_nearest_number_of_particles_stands_in(cache: Path, size: Size) -> None:
     """By ratio, of the same kind of solver alone; another machine's rates count for
     nothing.
     """
-    size = unmeasured.size("fluid", "tiny")
     assert size.particles == 256
     slow = [2 * PLAIN, *WORK]
     slower = [3 * PLAIN, *WORK]
-    noted(cache, free_surface={"100": slow, "600": slower}, closed_box={"256": slow})
+    noted(
+        cache,
+        free_surface={"100": slow, "600": slower},
+        closed_box={"256": slow},
+    )
     assert measured_ratio(size) == pytest.approx(3.0)
     noted(cache, closed_box={"256": slow})
     assert measured_ratio(size) is None
-    noted(cache, free_surface=GOOD, machine="another " + platform.node())
+    another_machine = "another " + platform.node()
+    noted(cache, free_surface=GOOD, machine=another_machine)
     assert measured_ratio(size) is None
+
+
+GOOD_ROW = GOOD["256"]
+
+
+def rates(particles: str, row: object) -> dict[str, Any]:
+    """Return the content of a file with one rate."""
+    return HERE | {"free_surface": {particles: row}}
 
 
 DAMAGED: dict[str, Any] = {
@@ -104,58 +135,60 @@ DAMAGED: dict[str, Any] = {
     "list": [],
     "binary": "\udc80",
     "deep": "[" * 100_000,
-    "long": {**HERE, "free_surface": GOOD, "x": "y" * 1_000_000},
+    "long": rates("256", GOOD_ROW) | {"x": "y" * 1_000_000},
     "machine": {"free_surface": GOOD},
-    "rows": {**HERE, "free_surface": GOOD["256"]},
-    "nobody": {**HERE, "free_surface": {"-256": GOOD["256"]}},
-    "words": {**HERE, "free_surface": {"many": GOOD["256"]}},
-    "digits": {**HERE, "free_surface": {"9" * 5000: GOOD["256"]}},
-    "void": {**HERE, "free_surface": {"256": []}},
-    "half": {**HERE, "free_surface": {"256": [1.0, 1000]}},
-    "text": {**HERE, "free_surface": {"256": [1.0, 1000, "100"]}},
-    "zero": {**HERE, "free_surface": {"256": [0.0, *WORK]}},
-    "negative": {**HERE, "free_surface": {"256": [1.0, -1000, 100]}},
-    "centuries": {**HERE, "free_surface": {"256": [1e8, *WORK]}},
-    "nan": {**HERE, "free_surface": {"256": [float("nan"), *WORK]}},
+    "rows": HERE | {"free_surface": GOOD_ROW},
+    "nobody": rates("-256", GOOD_ROW),
+    "words": rates("many", GOOD_ROW),
+    "digits": rates("9" * 5000, GOOD_ROW),
+    "void": rates("256", []),
+    "half": rates("256", [1.0, 1000]),
+    "text": rates("256", [1.0, 1000, "100"]),
+    "zero": rates("256", [0.0, *WORK]),
+    "negative": rates("256", [1.0, -1000, 100]),
+    "centuries": rates("256", [1e8, *WORK]),
+    "nan": rates("256", [float("nan"), *WORK]),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGED)
-def test_damaged_rates_are_passed_over(
-    damage: str, cache: Path, unmeasured: Registry
-) -> None:
+def test_damaged_rates_are_passed_over(damage: str, cache: Path, size: Size) -> None:
     """A file that is no rate, or that no machine could have, leaves the estimate; the
     next note mends it.
     """
-    size = unmeasured.size("fluid", "tiny")
     expected = estimate(size, (0,))
     cache.mkdir()
     text = DAMAGED[damage]
     if not isinstance(text, str):
         text = json.dumps(text)
-    (cache / "rates.json").write_bytes(text.encode(errors="surrogateescape"))
+    content = text.encode(errors="surrogateescape")
+    (cache / "rates.json").write_bytes(content)
     assert estimate(size, (0,)) == expected
     note_pace(size, [pace(5.0)])
     assert measured_ratio(size) == pytest.approx(5.0)
 
 
-def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
+def test_notes_add_up_and_stay_few(cache: Path, size: Size) -> None:
     """What counts is the sum of seconds over the sum of work; the file stays small
     whatever is simulated.
     """
-    size = unmeasured.size("fluid", "tiny")
     paces = [pace(1.0), pace(3.0)]
     note_pace(size, paces)
     assert measured_ratio(size) == pytest.approx(2.0)
-    noted(cache, free_surface={str(n): GOOD["256"] for n in range(1000, 1200)})
+    many = {}
+    for particles in range(1000, 1200):
+        many[str(particles)] = GOOD_ROW
+    noted(cache, free_surface=many)
     note_pace(size, paces)
     rates_file = cache / "rates.json"
-    rates = json.loads(rates_file.read_text())
-    assert len(rates["free_surface"]) <= 32
-    expected = [4 * PLAIN, 2 * WORK[0], 2 * WORK[1]]
-    assert rates["free_surface"]["256"] == pytest.approx(expected)
+    content = json.loads(rates_file.read_text())
+    rows = content["free_surface"]
+    assert len(rows) <= 32
+    particle_substeps, frames = WORK
+    expected = [4 * PLAIN, 2 * particle_substeps, 2 * frames]
+    assert rows["256"] == pytest.approx(expected)
     note_pace(size, [])
-    assert json.loads(rates_file.read_text()) == rates
+    assert json.loads(rates_file.read_text()) == content
 
 
 def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) -> None:
@@ -165,12 +198,23 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
     size = unmeasured.size(SPLIT, SIZE)
     job = SimulationJob(size=size, scenarios=(0,), root=tmp_path)
     times = itertools.accumulate(itertools.count(10, 10))
-    (scenario,) = simulate(job, lambda _: None, clock=lambda: float(next(times)))
+
+    def clock() -> float:
+        return float(next(times))
+
+    (scenario,) = simulate(job, lambda _: None, clock=clock)
     steps = size.frame_count(0) - 2
     substeps = steps * size.substeps_per_frame * size.particles
     # The clock says 10, 30, 60: before the first frame, after the second, in the end.
-    expected = SimulationPace(seconds=30.0, particle_substeps=substeps, frames=steps)
+    expected = SimulationPace(
+        seconds=30.0,
+        particle_substeps=substeps,
+        frames=steps,
+    )
     assert scenario.pace == expected
+
+
+NOT_YET = "measured after the first generate"
 
 
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
@@ -178,23 +222,33 @@ def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
     measured here.
     """
     root = ("--root", tmp_path)
-    plan = ("generate", SPLIT, "--size", SIZE, *root, "--scenarios", "1", "--dry-run")
-    assert "measured after the first generate" in run(*plan).stdout
-    assert "measured after the first generate" in run("list", *root).stdout
-    assert json.loads(run(*plan, "--json").stdout)["measured"] is False
-    assert not cache.exists()
-    assert run(*plan[:4], *root, "--scenarios", "0").exit_code == 0
-    rates = json.loads((cache / "rates.json").read_text())
-    assert rates.keys() == {"machine", "closed_box"}
-    ((particles, row),) = rates["closed_box"].items()
-    seconds, particle_substeps, frames = row
-    assert json.loads(run(*plan, "--json").stdout)["measured"] is True
-    assert "measured after the first generate" not in run(*plan).stdout
+    tiny_split = (SPLIT, "--size", SIZE, *root)
 
-    sizes = json.loads(run("list", *root, "--json").stdout)["sizes"]
+    def printed(*words: object) -> str:
+        return run(*words).stdout
+
+    def printed_data(*words: object) -> dict[str, Any]:
+        data: dict[str, Any] = json.loads(printed(*words, "--json"))
+        return data
+
+    plan = ("generate", *tiny_split, "--scenarios", "1", "--dry-run")
+    assert NOT_YET in printed(*plan)
+    assert NOT_YET in printed("list", *root)
+    assert printed_data(*plan)["measured"] is False
+    assert not cache.exists()
+    result = run("generate", *tiny_split, "--scenarios", "0")
+    assert result.exit_code == 0
+    content = json.loads((cache / "rates.json").read_text())
+    assert content.keys() == {"machine", "closed_box"}
+    ((particles, row),) = content["closed_box"].items()
+    seconds, particle_substeps, frames = row
+    assert printed_data(*plan)["measured"] is True
+    assert NOT_YET not in printed(*plan)
+
+    sizes = printed_data("list", *root)["sizes"]
     measured_splits = {size["split"] for size in sizes if size["measured"]}
     assert measured_splits == {"cavity", SPLIT}
-    information = json.loads(run("info", SPLIT, *root, "--json").stdout)
+    information = printed_data("info", SPLIT, *root)
     tiny = information["sizes"][SIZE]["overview"]
     assert tiny["measured"]
     assert int(particles) == tiny["particles"]
