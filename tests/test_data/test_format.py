@@ -37,8 +37,11 @@ TYPES = {
 }
 
 
+Written = tuple[Path, str]
+
+
 @pytest.fixture
-def written(tmp_path: Path) -> tuple[Path, str]:
+def written(tmp_path: Path) -> Written:
     """A small cavity scenario and its content hash."""
     return write_scenario(tmp_path, KEY)
 
@@ -57,32 +60,44 @@ def assert_refused(
 
 
 @pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
-def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None:
+def test_xarray_opens_it_unaided(written: Written, engine: str) -> None:
     """Plain open_dataset gives the documented dims, types and coordinates."""
     if engine == "h5netcdf":
         pytest.importorskip("h5netcdf")
     path, _ = written
     with xr.open_dataset(path, engine=engine) as scenario:
-        dims = {str(name): item.dims for name, item in scenario.variables.items()}
+        dims = {}
+        types = {}
+        for name, variable in scenario.variables.items():
+            dims[str(name)] = variable.dims
+            if name in TYPES:
+                types[str(name)] = str(variable.dtype)
         assert dims == DIMS
-        types = {name: str(scenario[name].dtype) for name in TYPES}
         assert types == TYPES
-        assert set(scenario.coords) == {"frame", "time", "particle", "space", "wall"}
-        assert list(scenario["space"].values) == ["x", "y"]
-        assert list(scenario["wall"].values) == ["left", "right", "bottom", "top"]
-        assert_array_equal(scenario["position"], frames_of(3, 4, 8))
-        assert_array_equal(scenario["time"], np.arange(4) * 0.1)
+        coordinates = {"frame", "time", "particle", "space", "wall"}
+        assert set(scenario.coords) == coordinates
+        space = list(scenario["space"].values)
+        assert space == ["x", "y"]
+        walls = list(scenario["wall"].values)
+        assert walls == ["left", "right", "bottom", "top"]
+        positions = frames_of(3, 4, 8)
+        assert_array_equal(scenario["position"], positions)
+        times = 0.1 * np.arange(4)
+        assert_array_equal(scenario["time"], times)
         top_velocity = scenario["wall_velocity"][:, 3, 0]
         assert_array_equal(top_velocity, 0.125)
         attributes = scenario.attrs
         assert attributes["Conventions"] == "CF-1.11"
-        assert {name: attributes[name] for name in PARAMETERS} == PARAMETERS
+        parameters = {name: attributes[name] for name in PARAMETERS}
+        assert parameters == PARAMETERS
         assert attributes["reynolds_number"] == 100.0
-        assert scenario["material"].attrs["flag_meanings"].split() == list(MATERIALS)
-    assert tuple(material.name.lower() for material in Material) == MATERIALS
+        meanings = scenario["material"].attrs["flag_meanings"]
+    assert meanings.split() == list(MATERIALS)
+    names = tuple(material.name.lower() for material in Material)
+    assert names == MATERIALS
 
 
-def test_plain_h5py_opens_it(written: tuple[Path, str]) -> None:
+def test_plain_h5py_opens_it(written: Written) -> None:
     """Chunks hold one frame; the only filters are shuffle and zlib level 1."""
     path, _ = written
     with h5py.File(path) as file:
@@ -92,7 +107,8 @@ def test_plain_h5py_opens_it(written: tuple[Path, str]) -> None:
             assert variable.compression == "gzip"
             assert variable.compression_opts == 1
             assert variable.shuffle
-        assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
+        velocities = -frames_of(3, 4, 8)
+        assert_array_equal(file["velocity"][...], velocities)
 
 
 def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
@@ -102,23 +118,25 @@ def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
     assert file_sha256(first) == file_sha256(second)
 
 
-def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None:
+def test_all_routes_to_the_content_hash_agree(written: Written) -> None:
     """By lagbench, from xarray, and by code written after docs/format.md."""
     path, content = written
     assert rehash(path) == content
     assert check_scenario(path) == content
     assert independent_hash.content_hash(path) == content
     with read_scenario(path) as file:
-        identity = KEY.identity(file.header.seed, file.header.parameters)
+        header = file.header
+    identity = KEY.identity(header.seed, header.parameters)
     hasher = ContentHasher(identity)
     with xr.open_dataset(path) as scenario:
-        for name, variable in scenario.variables.items():
-            hasher.declare(str(name), variable.dtype, variable.dims, variable.shape)
-            hasher.update(str(name), variable.values)
+        for key, variable in scenario.variables.items():
+            name = str(key)
+            hasher.declare(name, variable.dtype, variable.dims, variable.shape)
+            hasher.update(name, variable.values)
     assert hasher.hexdigest() == content
 
 
-def test_sixteen_digits_of_an_expected_hash_suffice(written: tuple[Path, str]) -> None:
+def test_sixteen_digits_of_an_expected_hash_suffice(written: Written) -> None:
     path, content = written
     assert check_scenario(path, content[:16]) == content
     message = r"(?s)another content hash.*expected: 0123.*got: " + content
@@ -126,7 +144,7 @@ def test_sixteen_digits_of_an_expected_hash_suffice(written: tuple[Path, str]) -
         check_scenario(path, "0123456789abcdef")
 
 
-def test_a_patch_release_may_change_a_long_name(written: tuple[Path, str]) -> None:
+def test_a_patch_release_may_change_a_long_name(written: Written) -> None:
     """No reader computes with it."""
     path, content = written
     with h5py.File(path, "r+") as file:
@@ -144,6 +162,10 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
     assert independent_hash.content_hash(path) == content
 
 
+CHARACTERS = st.characters(codec="utf-8", exclude_characters="\0")
+TEXTS = st.text(CHARACTERS, min_size=1)
+
+
 @settings(
     max_examples=20,
     deadline=None,
@@ -157,18 +179,27 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
             st.integers(-(2**63), 2**63 - 1),
             # Taichi, once started in this process, makes its thread round subnormals to
             # zero.
-            st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
-            st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
+            st.floats(
+                allow_nan=False,
+                allow_infinity=False,
+                allow_subnormal=False,
+            ),
+            TEXTS,
         ),
         max_size=4,
     ),
-    seed=st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
+    seed=TEXTS,
 )
 def test_parameters_survive_the_file(
     tmp_path: Path, parameters: dict[str, Any], seed: str
 ) -> None:
     """Two readers find the hash of the writer, whatever the parameters are."""
-    path, content = write_scenario(tmp_path, KEY, parameters=parameters, seed=seed)
+    path, content = write_scenario(
+        tmp_path,
+        KEY,
+        parameters=parameters,
+        seed=seed,
+    )
     with read_scenario(path) as file:
         expected = parameters | {"reynolds_number": 100.0}
         assert file.header.parameters == expected
@@ -179,7 +210,7 @@ def test_parameters_survive_the_file(
 
 @pytest.mark.parametrize("name", sorted(TYPES))
 def test_every_variable_is_hashed_and_named(
-    written: tuple[Path, str], name: str
+    written: Written, name: str
 ) -> None:
     """Changing one value of any variable is found, and the error names file and
     variable.
@@ -187,7 +218,8 @@ def test_every_variable_is_hashed_and_named(
     path, content = written
     with h5py.File(path, "r+") as file:
         values = file[name][()]
-        file[name][...] = values + np.ones_like(values)
+        changed = values + np.ones_like(values)
+        file[name][...] = changed
     assert rehash(path) != content
     assert_refused(path, "differ", f"variable '{name}'")
 
@@ -204,7 +236,7 @@ def test_every_variable_is_hashed_and_named(
     ],
 )
 def test_changed_attributes_are_found(
-    written: tuple[Path, str], name: str, value: object
+    written: Written, name: str, value: object
 ) -> None:
     """Parameters and identity enter the hash."""
     path, _ = written
@@ -231,7 +263,7 @@ def test_changed_attributes_are_found(
     ],
 )
 def test_attributes_that_change_the_meaning_are_refused(
-    written: tuple[Path, str],
+    written: Written,
     variable: str,
     name: str,
     value: object,
@@ -251,7 +283,8 @@ def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -
     """The error is that of the variable, not a traceback of HDF5."""
     path, _ = write_scenario(tmp_path, KEY, frames=4, particles=2000)
     with h5py.File(path) as file:
-        offset = file["velocity"].id.get_chunk_info(2).byte_offset
+        chunk = file["velocity"].id.get_chunk_info(2)
+        offset = chunk.byte_offset
     data = bytearray(path.read_bytes())
     data[offset + 100] ^= 1
     path.write_bytes(data)
@@ -262,12 +295,13 @@ def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> None:
+def test_no_flipped_byte_escapes_as_another_error(written: Written) -> None:
     """Each of 600 flips leaves the content as it is or gives a DataError."""
     path, content = written
     good = path.read_bytes()
     messages = []
-    for offset in range(0, len(good), len(good) // 600):
+    step = len(good) // 600
+    for offset in range(0, len(good), step):
         data = bytearray(good)
         data[offset] ^= 0x55
         path.write_bytes(data)
@@ -283,10 +317,11 @@ def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> 
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
-def test_a_truncated_file_is_damage(written: tuple[Path, str], share: float) -> None:
+def test_a_truncated_file_is_damage(written: Written, share: float) -> None:
     path, _ = written
     good = path.read_bytes()
-    path.write_bytes(good[: int(share * len(good))])
+    length = int(share * len(good))
+    path.write_bytes(good[:length])
     assert_refused(path, "damaged")
 
 
@@ -296,7 +331,8 @@ def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
 
 def test_other_netcdf_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.nc"
-    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(path, engine="netcdf4")
+    data = xr.Dataset({"a": ("b", [1.0])})
+    data.to_netcdf(path, engine="netcdf4")
     assert_refused(path, "not one of lagbench", check=read_scenario)
 
 
@@ -316,10 +352,11 @@ def test_a_shape_of_terabytes_in_kilobytes_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_a_compound_type_is_damage(written: tuple[Path, str]) -> None:
+def test_a_compound_type_is_damage(written: Written) -> None:
     path, _ = written
     with netCDF4.Dataset(path, "r+") as file:
-        pair = file.createCompoundType(np.dtype([("a", "i4")]), "pair")
+        integer = np.dtype([("a", "i4")])
+        pair = file.createCompoundType(integer, "pair")
         file.createVariable("odd", pair, ())
     assert_refused(path, "damaged", "variable 'odd'", check=rehash)
 
@@ -348,10 +385,14 @@ def open_writer(path: Path, **changes: Any) -> ScenarioWriter:
     return ScenarioWriter(path, KEY, **(options | changes))
 
 
-def test_other_readers_may_have_the_file_open(written: tuple[Path, str]) -> None:
+def test_other_readers_may_have_the_file_open(written: Written) -> None:
     """HDF5 opens a file twice in a process only if both openings treat locks alike."""
     path, _ = written
-    with h5py.File(path, "r"), read_scenario(path) as file, h5py.File(path, "r"):
+    with (
+        h5py.File(path, "r"),
+        read_scenario(path) as file,
+        h5py.File(path, "r"),
+    ):
         assert file.header.particles == 8
 
 
@@ -399,7 +440,7 @@ def _external_link(file: h5py.File) -> None:
     ],
 )
 def test_members_that_other_readers_would_follow_or_show_are_damage(
-    written: tuple[Path, str],
+    written: Written,
     change: Callable[[h5py.File], None],
     words: str,
 ) -> None:
@@ -410,17 +451,18 @@ def test_members_that_other_readers_would_follow_or_show_are_damage(
     assert_refused(path, "damaged", words, check=read_scenario)
 
 
-def test_texts_that_are_no_texts_are_damage(written: tuple[Path, str]) -> None:
+def test_texts_that_are_no_texts_are_damage(written: Written) -> None:
     """Bytes that are no UTF-8 change the hash, and raise no other error."""
     path, content = written
     with h5py.File(path, "r+") as file:
         del file.attrs["seed"]
-        file.attrs.create("seed", b"\xff\xfe", dtype=h5py.string_dtype("utf-8"))
+        utf8 = h5py.string_dtype("utf-8")
+        file.attrs.create("seed", b"\xff\xfe", dtype=utf8)
     assert rehash(path) != content
     assert_refused(path, "attributes differ")
 
 
-def test_frames_and_slices_can_be_read(written: tuple[Path, str]) -> None:
+def test_frames_and_slices_can_be_read(written: Written) -> None:
     path, _ = written
     truth = frames_of(3, 4, 8)
     with read_scenario(path) as file:
@@ -428,18 +470,21 @@ def test_frames_and_slices_can_be_read(written: tuple[Path, str]) -> None:
         assert file.header.particles == 8
         assert file.header.key == KEY
         assert file.read("particle_mass") == 1e-4 / 8
-        assert_array_equal(file.read("position", 2), truth[2])
-        assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
+        frame = file.read("position", 2)
+        assert_array_equal(frame, truth[2])
+        two_frames = file.read("position", slice(1, 3))
+        assert_array_equal(two_frames, truth[1:3])
 
 
-def test_blocks_stream_all_frames_in_order(written: tuple[Path, str]) -> None:
+def test_blocks_stream_all_frames_in_order(written: Written) -> None:
     path, _ = written
     with read_scenario(path) as file:
-        frames = np.concatenate(list(file.blocks("position")))
+        blocks = list(file.blocks("position"))
+    frames = np.concatenate(blocks)
     assert_array_equal(frames, frames_of(3, 4, 8))
 
 
-def test_an_unknown_variable_is_an_error(written: tuple[Path, str]) -> None:
+def test_an_unknown_variable_is_an_error(written: Written) -> None:
     path, _ = written
     with read_scenario(path) as file, pytest.raises(DataError) as caught:
         file.read("density")
@@ -463,16 +508,20 @@ def write_with_parameters(
 
 def test_a_parameter_may_be_stated_after_the_frames(tmp_path: Path) -> None:
     """The file is the one that has it from the start."""
-    at_first = write_with_parameters(tmp_path / "0.nc", {"a": 1, "b": 2}, {})
-    at_last = write_with_parameters(tmp_path / "1.nc", {"a": 1}, {"b": 2})
+    both = {"a": 1, "b": 2}
+    first_path = tmp_path / "0.nc"
+    second_path = tmp_path / "1.nc"
+    at_first = write_with_parameters(first_path, both, {})
+    at_last = write_with_parameters(second_path, {"a": 1}, {"b": 2})
     assert at_first == at_last
     for name in ("0.nc", "1.nc"):
         assert check_scenario(tmp_path / name) == at_first
         with read_scenario(tmp_path / name) as file:
-            assert file.header.parameters == {"a": 1, "b": 2}
+            assert file.header.parameters == both
 
 
 FRAME = np.zeros((8, 2), np.float32)
+FRAME_IN_DOUBLES = FRAME.astype(np.float64)
 
 
 @pytest.mark.parametrize(
@@ -481,7 +530,7 @@ FRAME = np.zeros((8, 2), np.float32)
         (FRAME, FRAME[:4], r"(?s)wrong shape.*'velocity'"),
         (FRAME[:1], FRAME, r"(?s)wrong shape.*'position'"),
         (FRAME, FRAME, r"(?s)values are missing.*'position'"),
-        (FRAME.astype(np.float64), FRAME, r"(?s)another type.*'position'"),
+        (FRAME_IN_DOUBLES, FRAME, r"(?s)another type.*'position'"),
     ],
 )
 def test_wrong_frames_are_refused(
@@ -517,7 +566,15 @@ def test_parameters_that_would_hide_an_attribute_are_refused(
     assert str(caught.value.where).endswith("0003.nc")
 
 
-@pytest.mark.parametrize("value", ["", [1], {"a": 1}, np.array([1, 2])])
+@pytest.mark.parametrize(
+    "value",
+    [
+        "",
+        [1],
+        {"a": 1},
+        np.array([1, 2]),
+    ],
+)
 def test_parameters_that_netcdf_would_change_are_refused(
     tmp_path: Path, value: object
 ) -> None:

@@ -60,7 +60,8 @@ def read_pixels(path: Path) -> Pixels:
 
 def has_colour(pixels: Pixels, colour: str) -> NDArray[np.bool_]:
     """Return which pixels have a colour."""
-    is_equal: NDArray[np.bool_] = (pixels == parse_rgb(colour)).all(axis=-1)
+    colour_of_pixel = parse_rgb(colour)
+    is_equal: NDArray[np.bool_] = (pixels == colour_of_pixel).all(axis=-1)
     return is_equal
 
 
@@ -81,11 +82,13 @@ def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
     """PNGs hold no date or software; no two kinds are the same."""
     pictures = set()
     for kind in KINDS:
-        first = plot_frame(swirl, 2, tmp_path / "first.png", kind=kind).read_bytes()
-        second = plot_frame(swirl, 2, tmp_path / "second.png", kind=kind).read_bytes()
-        assert first == second
+        first_path = plot_frame(swirl, 2, tmp_path / "first.png", kind=kind)
+        second_path = plot_frame(swirl, 2, tmp_path / "second.png", kind=kind)
+        first = first_path.read_bytes()
+        assert first == second_path.read_bytes()
         assert len(first) < 300_000
-        assert chunk_names(first) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+        chunks = chunk_names(first)
+        assert chunks == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
         pictures.add(first)
     assert len(pictures) == len(KINDS)
 
@@ -95,8 +98,9 @@ def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> No
     from_file = plot_frame(swirl, -1, tmp_path / "file.png")
     with xr.open_dataset(swirl) as data:
         from_data = plot_frame(data, 5, tmp_path / "data.png")
+        several = data.expand_dims(scenario=[0])
         with pytest.raises(UsageError) as caught:
-            plot_frame(data.expand_dims(scenario=[0]), 0, tmp_path / "x.png")
+            plot_frame(several, 0, tmp_path / "x.png")
     assert from_file.read_bytes() == from_data.read_bytes()
     assert "sel(scenario" in str(caught.value.fix)
 
@@ -116,7 +120,8 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(
             parameters={"family": "disc"},
         )
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as split:
-        from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
+        shorter = split.sel(scenario=0)
+        from_split = plot_frame(shorter, -1, tmp_path / "split.png")
     file = tmp_path / "fluid/tiny/v3/train/0000.nc"
     from_file = plot_frame(file, 3, tmp_path / "file.png")
     assert from_split.read_bytes() == from_file.read_bytes()
@@ -152,11 +157,18 @@ def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) 
     """An opened split and one of its files know the split that stands beside them."""
     runs = tmp_path / "runs.npy"
     np.save(runs, np.stack(straight_runs(3)))
-    adopted = adopt(runs, output=tmp_path / "mine", radius=0.1, frame_interval=0.25)
+    adopted = adopt(
+        runs,
+        output=tmp_path / "mine",
+        radius=0.1,
+        frame_interval=0.25,
+    )
     file = adopted.folder / "full/v1/test/0002.nc"
-    expected = plot_frame(file, 3, tmp_path / "file.png").read_bytes()
+    from_file = plot_frame(file, 3, tmp_path / "file.png")
+    expected = from_file.read_bytes()
     with open_split(str(adopted.folder)) as split, xr.open_dataset(file) as data:
-        for source in (split.isel(scenario=0), data):
+        of_split = split.isel(scenario=0)
+        for source in (of_split, data):
             picture = plot_frame(source, 3, tmp_path / "data.png")
             assert picture.read_bytes() == expected
 
@@ -174,9 +186,11 @@ def test_vorticity_of_solid_body_rotation(swirl: Path, frame: int) -> None:
         assert_allclose(per_second, expected, rtol=0.02)
 
         # the scale of its colours is in that unit too
-        magnitudes = np.abs(scene.vorticity[scene.fields.differentiable])
+        is_drawn = scene.fields.differentiable
+        magnitudes = np.abs(scene.vorticity[is_drawn])
+        expected = np.percentile(magnitudes, 99.0)
         limit = limit_of(Panel.VORTICITY, scene)
-        assert limit == pytest.approx(np.percentile(magnitudes, 99.0))
+        assert limit == pytest.approx(expected)
 
 
 def test_area_is_that_of_the_material(swirl: Path) -> None:
@@ -202,7 +216,8 @@ def test_a_figure_has_one_unit_of_time(
     texts: list[str] = []
 
     def collect(drawn: Figure, output: Path) -> Path:
-        texts.extend(text.get_text() for text in drawn.findobj(Text))
+        for text in drawn.findobj(Text):
+            texts.append(text.get_text())
         return output
 
     monkeypatch.setattr("lagbench.figures.plot.save", collect)
@@ -211,8 +226,12 @@ def test_a_figure_has_one_unit_of_time(
     else:
         source = write_swirl(tmp_path, split, materials=3, walls=None)
     plot_frame(source, 2, tmp_path / "all.png", kind="all")
-    labels = [text for text in texts if "[" in text]
-    assert sorted(label.partition("[")[2].rstrip("]") for label in labels) == units
+    drawn_units = []
+    for text in texts:
+        _, bracket, end = text.partition("[")
+        if bracket:
+            drawn_units.append(end.rstrip("]"))
+    assert sorted(drawn_units) == units
     assert not any("/frame" in text for text in texts)
 
 
@@ -222,15 +241,18 @@ def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> Non
         scene = recording.scene(1)
         angular_velocity = OMEGA / recording.size.frame_interval
         expected = angular_velocity * 0.4 * np.sqrt(0.99)
-        assert limit_of(Panel.SPEED, scene) == pytest.approx(expected, rel=1e-3)
+        limit = limit_of(Panel.SPEED, scene)
+        assert limit == pytest.approx(expected, rel=1e-3)
 
 
 def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
     """Twice the pixels per inch are twice the pixels a side."""
-    coarse = read_pixels(plot_frame(swirl, 0, tmp_path / "64.png", dpi=64))
-    fine = read_pixels(plot_frame(swirl, 0, tmp_path / "128.png", dpi=128))
-    height, width, _ = coarse.shape
-    assert fine.shape[:2] == pytest.approx((2 * height, 2 * width), abs=1)
+    coarse_path = plot_frame(swirl, 0, tmp_path / "64.png", dpi=64)
+    fine_path = plot_frame(swirl, 0, tmp_path / "128.png", dpi=128)
+    height, width, _ = read_pixels(coarse_path).shape
+    fine_height, fine_width, _ = read_pixels(fine_path).shape
+    assert fine_height == pytest.approx(2 * height, abs=1)
+    assert fine_width == pytest.approx(2 * width, abs=1)
 
 
 @pytest.mark.parametrize("dpi", [0, -1, math.nan, 1e6, "128"])
@@ -244,7 +266,8 @@ def test_pixels_per_inch_out_of_range_are_refused(
         plot_frame(swirl, 0, path, dpi=dpi)
     with pytest.raises(UsageError) as of_sheet:
         contact_sheet("cavity", "tiny", path, root=root, dpi=dpi)
-    assert of_frame.value.where == of_sheet.value.where == "--dpi"
+    assert of_frame.value.where == "--dpi"
+    assert of_sheet.value.where == "--dpi"
     assert not list(tmp_path.iterdir())
 
 
@@ -253,7 +276,13 @@ def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) ->
     with open_recording(swirl) as recording:
         assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
     parameters = {"family": "splash"}
-    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters=parameters)
+    splash = write_swirl(
+        tmp_path,
+        "fluid",
+        3,
+        walls=None,
+        parameters=parameters,
+    )
     with open_recording(splash) as recording:
         assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
 
@@ -287,11 +316,13 @@ def draw_empty_box(path: Path) -> Pixels:
 
 def test_moving_walls_are_marked(tmp_path: Path) -> None:
     """The moving wall is vermilion, the others are grey."""
-    box = draw_empty_box(write_swirl(tmp_path, walls=TOP_TO_THE_RIGHT))
+    path = write_swirl(tmp_path, walls=TOP_TO_THE_RIGHT)
+    box = draw_empty_box(path)
     side = len(box)
     middle = side // 2
     band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
-    assert has_colour(box[band, int(0.2 * side)], MOVING)
+    beside_the_arrowhead = int(0.2 * side)
+    assert has_colour(box[band, beside_the_arrowhead], MOVING)
     assert has_colour(box[-band, middle], WALL)
     assert has_colour(box[middle, middle], PAPER)
 
@@ -302,11 +333,19 @@ def test_arrowheads_point_where_a_wall_slides(tmp_path: Path) -> None:
     to_left = write_swirl(tmp_path / "left", walls=-TOP_TO_THE_RIGHT)
     right = draw_empty_box(to_right).astype(int)
     left = draw_empty_box(to_left).astype(int)
-    mirror_difference = np.abs(right[:, ::-1] - left).mean()
-    assert mirror_difference < 0.2 * np.abs(right - left).mean()
+    mirrored = right[:, ::-1]
+    mirror_difference = np.abs(mirrored - left).mean()
+    difference = np.abs(right - left).mean()
+    assert mirror_difference < 0.2 * difference
 
 
-@pytest.mark.parametrize(("ending", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+@pytest.mark.parametrize(
+    ("ending", "head"),
+    [
+        ("pdf", b"%PDF"),
+        ("svg", b"<?xml"),
+    ],
+)
 def test_vector_pictures_have_the_same_bytes_twice(
     swirl: Path,
     tmp_path: Path,
@@ -314,9 +353,10 @@ def test_vector_pictures_have_the_same_bytes_twice(
     head: bytes,
 ) -> None:
     """PDF and SVG hold no date."""
-    first = plot_frame(swirl, 0, tmp_path / f"first.{ending}").read_bytes()
-    second = plot_frame(swirl, 0, tmp_path / f"second.{ending}").read_bytes()
-    assert first == second
+    first_path = plot_frame(swirl, 0, tmp_path / f"first.{ending}")
+    second_path = plot_frame(swirl, 0, tmp_path / f"second.{ending}")
+    first = first_path.read_bytes()
+    assert first == second_path.read_bytes()
     assert first.startswith(head)
 
 
@@ -368,23 +408,33 @@ def test_sheet_of_driven_scenarios_has_a_panel_for_each(tmp_path: Path) -> None:
     path = draw_sheet("five.png")
     five = read_pixels(path)
     assert five.shape[1] > one.shape[1]
-    assert draw_sheet("again.png").read_bytes() == path.read_bytes()
+    again = draw_sheet("again.png")
+    assert again.read_bytes() == path.read_bytes()
 
     # each of the five panels shows the vermilion of its moving top wall
-    is_moving = has_colour(five, MOVING).any(axis=0)
-    starts = np.diff(is_moving.astype(int)) == 1
+    is_moving_column = has_colour(five, MOVING).any(axis=0)
+    starts = np.diff(is_moving_column.astype(int)) == 1
     assert np.count_nonzero(starts) >= 5
 
 
 def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
     """Scenarios of one family share a row, families lie below each other."""
     heights = []
-    for scenario, family in enumerate(["circle", "circle", "splash"]):
-        parameters = {"family": family}
-        write_swirl(tmp_path, "fluid", scenario, walls=None, parameters=parameters)
+    families = ["circle", "circle", "splash"]
+    for scenario, family in enumerate(families):
+        write_swirl(
+            tmp_path,
+            "fluid",
+            scenario,
+            walls=None,
+            parameters={"family": family},
+        )
         sheet = contact_sheet("fluid", "tiny", tmp_path / "s.png", root=tmp_path)
-        heights.append(read_pixels(sheet).shape[0])
-    assert heights[0] == heights[1] < heights[2]
+        height, _, _ = read_pixels(sheet).shape
+        heights.append(height)
+    one_circle, two_circles, with_splash = heights
+    assert one_circle == two_circles
+    assert two_circles < with_splash
 
 
 def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
@@ -399,8 +449,11 @@ def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
     )
     sheet = contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path)
     image = read_pixels(sheet)
-    shown = [bool(has_colour(image, colour).any()) for colour in MATERIAL_COLOURS]
-    assert shown == [True, True, True, False]
+    is_shown = []
+    for colour in MATERIAL_COLOURS:
+        pixels = has_colour(image, colour)
+        is_shown.append(bool(pixels.any()))
+    assert is_shown == [True, True, True, False]
 
 
 def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
@@ -422,9 +475,12 @@ def test_every_colour_is_in_the_palette() -> None:
     palette = build_palette()
     assert palette.shape == (256, 3)
     colours = {tuple(colour) for colour in palette.tolist()}
-    for flat in (PAPER, INK, MUTED, WALL, MOVING, *MATERIAL_COLOURS):
-        assert tuple(parse_rgb(flat).tolist()) in colours
+    flat_colours = [PAPER, INK, MUTED, WALL, MOVING, *MATERIAL_COLOURS]
+    for flat in flat_colours:
+        rgb = parse_rgb(flat).tolist()
+        assert tuple(rgb) in colours
     for colour_map in (build_speed_map(), build_vorticity_map()):
-        levels = np.asarray(colour_map.colors)[:, :3] * 255.0
-        for level in levels.round().astype(int).tolist():
+        shares = np.asarray(colour_map.colors)[:, :3]
+        levels = np.rint(255.0 * shares).astype(int)
+        for level in levels.tolist():
             assert tuple(level) in colours

@@ -33,7 +33,8 @@ SCENARIOS = range(54, 60)
 def card(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> ScoreCard:
     """The score card of constant velocity, written."""
     folder = tmp_path_factory.mktemp("card")
-    return bench.score(bench.submit(folder / "predictions.nc", straight))
+    path = bench.submit(folder / "predictions.nc", straight)
+    return bench.score(path)
 
 
 def metric_names(card: ScoreCard) -> tuple[str, ...]:
@@ -86,7 +87,8 @@ def fill_with_noise(card: ScoreCard) -> ScoreCard:
         values = rng.standard_normal(weight.shape)
         tally = Tally(names, frames, values, weight, undefined)
         tallies[scenario] = round_statistics(tally)
-    return replace(replace_tallies(card, tallies), preview=noisy_preview(card))
+    large_card = replace_tallies(card, tallies)
+    return replace(large_card, preview=noisy_preview(card))
 
 
 def scattered_tallies(
@@ -98,18 +100,25 @@ def scattered_tallies(
     transport is measured in two frames.
     """
     frames = tuple(range(2, 600))
+    shape = (len(names), len(frames))
     levels = 10.0 ** rng.uniform(-6, 0, (len(names), 1))
-    missing_materials = [("jelly", "snow"), ("snow", "rope"), ("liquid", "rope")] * 2
+    transport_row = names.index("sliced_w2")
+    missing_materials = [
+        ("jelly", "snow"),
+        ("snow", "rope"),
+        ("liquid", "rope"),
+    ]
     tallies = {}
-    for scenario, missing in zip(SCENARIOS, missing_materials, strict=True):
-        weight = np.zeros((len(names), len(frames)), np.int64)
+    for scenario, missing in zip(SCENARIOS, 2 * missing_materials, strict=True):
+        weight = np.zeros(shape, np.int64)
         for row, name in enumerate(names):
             if not name.endswith(missing):
                 weight[row] = 1
-        weight[names.index("sliced_w2"), 1:-1] = 0
-        values = levels * (1 + 0.01 * rng.standard_normal(weight.shape))
-        values = np.where(weight, values, 0.0)
-        tally = Tally(names, frames, values, weight, np.zeros_like(weight))
+        weight[transport_row, 1:-1] = 0
+        scatter = 0.01 * rng.standard_normal(shape)
+        values = np.where(weight, levels * (1 + scatter), 0.0)
+        undefined = np.zeros_like(weight)
+        tally = Tally(names, frames, values, weight, undefined)
         tallies[scenario] = round_statistics(tally)
     return tallies
 
@@ -179,11 +188,19 @@ def test_a_full_disk_is_an_error_with_a_fix(
 def test_stored_statistics_saturate_at_the_largest_float32() -> None:
     """Undefined values are counted."""
     largest = float(np.finfo(np.float32).max)
-    values = {"a": 1e300, "b": -1e300, "c": 0.1, "d": math.nan}
-    stored = round_statistics(Tally.of("abcd", (0,), {0: values}))
-    expected = [largest, -largest, float(np.float32(0.1)), 0.0]
+    tenth = float(np.float32(0.1))
+    values = {
+        "a": 1e300,
+        "b": -1e300,
+        "c": 0.1,
+        "d": math.nan,
+    }
+    tally = Tally.of("abcd", (0,), {0: values})
+    stored = round_statistics(tally)
+    expected = [largest, -largest, tenth, 0.0]
     assert_array_equal(stored.total[:, 0], expected)
-    assert stored.undefined[:, 0].tolist() == [0, 0, 0, 1]
+    undefined = stored.undefined[:, 0]
+    assert undefined.tolist() == [0, 0, 0, 1]
 
 
 def test_long_rollouts_are_stored_in_eleven_bits() -> None:
@@ -202,9 +219,11 @@ def test_long_rollouts_are_stored_in_eleven_bits() -> None:
 
     # Later values of the first row are beyond float32.
     growing = stored.total[0, :80]
-    assert_allclose(growing, tally.total[0, :80], rtol=2.0**-11)
+    expected = tally.total[0, :80]
+    assert_allclose(growing, expected, rtol=2.0**-11)
     mantissa, _ = np.frexp(growing)
-    assert len(np.unique(mantissa * 2**11 % 1)) == 1
+    bits_beyond = mantissa * 2**11 % 1
+    assert len(np.unique(bits_beyond)) == 1
     constant_rows = [set(row) for row in stored.total[1:]]
     assert constant_rows == [{0.0}, {1.0}, {-largest}]
     again = round_statistics(stored)
@@ -217,16 +236,20 @@ def test_the_preview_shows_the_truth_beside_the_prediction(
     """Xarray unpacks the positions to within one level of what they were made of."""
     task = bench.size.task
     with xr.open_dataset(card.files[1], group="preview") as preview:
-        truth = bench.truth(int(preview.attrs["scenario"]))
+        scenario = int(preview.attrs["scenario"])
         frames = preview["film_frame"].values
         particles = preview["film_particle"].values
         film = preview["film"].values
+    true_film, predicted_film = film
+    truth = bench.truth(scenario)
+    prediction = straight(truth, task.input_frames, len(frames))
     assert len(frames) == task.horizon
     assert len(particles) == PARTICLES
     level = 2.0 / 65534
-    assert_allclose(film[0], truth[frames][:, particles], atol=level)
-    prediction = straight(truth, task.input_frames, len(frames))
-    assert_allclose(film[1], prediction[:, particles], atol=level)
+    expected = truth[frames][:, particles]
+    assert_allclose(true_film, expected, atol=level)
+    expected = prediction[:, particles]
+    assert_allclose(predicted_film, expected, atol=level)
 
 
 def test_the_preview_has_histograms_of_its_vorticity(card: ScoreCard) -> None:
@@ -236,10 +259,11 @@ def test_the_preview_has_histograms_of_its_vorticity(card: ScoreCard) -> None:
         histogram = preview["histogram"].values
         frame_count = len(preview["map_frame"])
     true_vorticity, predicted_vorticity = vorticity
-    assert np.isnan(true_vorticity).any()
-    assert_array_equal(np.isnan(true_vorticity), np.isnan(predicted_vorticity))
+    is_undefined = np.isnan(true_vorticity)
+    assert is_undefined.any()
+    assert_array_equal(is_undefined, np.isnan(predicted_vorticity))
     for frame in range(frame_count):
-        is_defined = ~np.isnan(true_vorticity[frame])
+        is_defined = ~is_undefined[frame]
         shares = histograms(
             true_vorticity[frame][is_defined],
             predicted_vorticity[frame][is_defined],
@@ -260,7 +284,8 @@ def test_scores_nc_reads_back_to_the_bit(card: ScoreCard) -> None:
         assert_equal(score.interval, expected.interval)
         assert score.undefined == expected.undefined, name
 
-    for scenario, expected in card.tallies[SUBMISSION].items():
+    tallies = card.tallies[SUBMISSION]
+    for scenario, expected in tallies.items():
         tally = statistics.tallies[scenario]
         assert tally.names == expected.names
         assert tally.frames == expected.frames
@@ -277,8 +302,9 @@ def test_scores_json_has_what_a_comparison_needs(card: ScoreCard) -> None:
     for row, scores in card.scores.items():
         for name, expected in scores.items():
             score = published.scores[row][name]
-            values = [digits(value) for value in score.values.tolist()]
-            assert values == [digits(value) for value in expected.values.tolist()]
+            values = [digits(value) for value in score.values]
+            expected_values = [digits(value) for value in expected.values]
+            assert values == expected_values
             assert score.undefined == expected.undefined
 
 
@@ -307,7 +333,8 @@ def test_a_file_without_a_json_object_is_unreadable(
 
 def test_truncated_json_is_unreadable(card: ScoreCard, tmp_path: Path) -> None:
     path = tmp_path / "scores.json"
-    path.write_bytes(card.files[0].read_bytes()[:500])
+    content = card.files[0].read_bytes()
+    path.write_bytes(content[:500])
     with pytest.raises(UnreadableFileError) as caught:
         read_scores(path)
     assert caught.value.where == str(path)
@@ -318,7 +345,8 @@ def test_truncated_netcdf_is_unreadable(
     card: ScoreCard, tmp_path: Path, length: int
 ) -> None:
     path = tmp_path / "scores.nc"
-    path.write_bytes(card.files[1].read_bytes()[:length])
+    content = card.files[1].read_bytes()
+    path.write_bytes(content[:length])
     with pytest.raises(UnreadableFileError):
         read_statistics(path)
 
