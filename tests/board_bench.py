@@ -123,7 +123,8 @@ def make_report_bench(home: Path, split: str) -> ReportBench:
                 hashes[scenario] = _write(folder / "root", size, scenario)
             path.write_text(_registry(size, hashes))
     registry = load(path)
-    return ReportBench(folder / "root", registry, registry.size(split, "tiny"))
+    size = registry.size(split, "tiny")
+    return ReportBench(folder / "root", registry, size)
 
 
 def page_of(home: Path, split: str) -> Path:
@@ -154,38 +155,53 @@ def motion(size: Size, scenario: int) -> Floats:
 def _eddies(size: Size, scenario: int, frame_count: int) -> Floats:
     (low, high), _ = size.bounds
     rng = np.random.Generator(np.random.PCG64(scenario))
-    shares = [rng.random((size.particles, 2))]  # of the box, by frame
+    # positions as shares of the box, by frame
+    position = rng.random((size.particles, 2))
+    positions = [position]
     for _ in range(frame_count - 1):
-        x, y = 2.0 * np.pi * shares[-1].T
+        x, y = 2.0 * np.pi * position.T
         velocity_x = np.sin(x) * np.cos(y)
         velocity_y = -np.cos(x) * np.sin(y)
         step = 0.004 * np.stack([velocity_x, velocity_y], axis=1)
-        shares.append(np.clip(shares[-1] + step, 0.0, 1.0))
-    return low + (high - low) * np.stack(shares)
+        position = np.clip(position + step, 0.0, 1.0)
+        positions.append(position)
+    return low + (high - low) * np.stack(positions)
 
 
 def _falling_bodies(size: Size, scenario: int, frame_count: int) -> Floats:
     rng = np.random.Generator(np.random.PCG64(scenario))
-    body = 0.1 * (rng.random((size.particles, 2)) - 0.5)
+    points = rng.random((size.particles, 2))
+    body = 0.1 * (points - 0.5)
     x, y = body.T
     frame = np.arange(frame_count)[:, None]
     cos = np.cos(0.03 * frame)
     sin = np.sin(0.03 * frame)
-    turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    turned[..., 1] -= 0.0004 * frame**2
-    middle = np.where(_is_first_body(size)[:, None], [0.3, 0.7], [0.7, 0.75])
-    return np.asarray(turned + middle)
+    turned_x = cos * x - sin * y
+    turned_y = sin * x + cos * y
+    fall = 0.0004 * frame**2
+    moved = np.stack([turned_x, turned_y - fall], axis=-1)
+    is_first = _is_first_body(size)[:, None]
+    middle = np.where(is_first, [0.3, 0.7], [0.7, 0.75])
+    return np.asarray(moved + middle)
 
 
 def _is_first_body(size: Size) -> NDArray[np.bool_]:
     """Return whether a particle belongs to the first of two bodies."""
-    return np.arange(size.particles) < size.particles // 2
+    half = size.particles // 2
+    return np.arange(size.particles) < half
 
 
 def _material(size: Size, scenario: int) -> NDArray[np.int64]:
     if size.split != "multimaterial":
         return np.zeros(size.particles, np.int64)
-    pairs = [(0, 2), (3, 2), (3, 0), (2, 2), (3, 1), (0, 0)]
+    pairs = [
+        (0, 2),
+        (3, 2),
+        (3, 0),
+        (2, 2),
+        (3, 1),
+        (0, 0),
+    ]
     first, second = pairs[scenario % 6]
     return np.where(_is_first_body(size), first, second)
 
@@ -196,12 +212,15 @@ def _write(root: Path, size: Size, scenario: int) -> str:
     positions = motion(size, scenario).astype(np.float32)
     wall_velocity = None
     if size.split == "cavity":
-        wall_velocity = np.array([[0, 0], [0, 0], [0, 0], [0.1, 0]])
+        wall_velocity = np.zeros((4, 2))
+        wall_velocity[3] = [0.1, 0.0]
     parameters_by_split = {
         "cavity": {"reynolds_number": 80.0},
         "curl-noise": {"frequency": 2},
     }
-    parameters = parameters_by_split.get(size.split, {"family": "two <bodies>"})
+    parameters: dict[str, object] = {"family": "two <bodies>"}
+    if size.split in parameters_by_split:
+        parameters |= parameters_by_split[size.split]
     mass = float(size.value("density")) * _area(size)
     with ScenarioWriter(
         scenario_path(root, key),
@@ -243,10 +262,14 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
         "velocity_std": [0.002, 0.002],
     }
     predictability_limit = [1e-6 * (k + 1) for k in range(size.task.horizon)]
+    dataset_sha256 = dataset_hash(size.split, size.name, size.major, subsets)
+    scenario_hashes = {}
+    for scenario, content_hash in hashes.items():
+        scenario_hashes[scenario] = content_hash[:16]
     measured = {
-        "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
+        "dataset_sha256": dataset_sha256,
         "subset_sha256": subsets,
-        "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
+        "scenario_sha256": scenario_hashes,
         "statistics": statistics,
         "twin_floor": predictability_limit,
     }
@@ -257,15 +280,17 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
 
 def still(truth: Floats, n: int, h: int) -> Floats:
     """Predict the last given frame."""
-    return np.broadcast_to(truth[n - 1], truth[n : n + h].shape)
+    future = truth[n : n + h]
+    return np.broadcast_to(truth[n - 1], future.shape)
 
 
 def damped(truth: Floats, n: int, h: int) -> Floats:
     """Predict the true steps, each smaller than the one before."""
+    last_given = truth[n - 1]
     steps = np.diff(truth[n - 1 : n + h], axis=0)
     shrinkage = 0.95 ** np.arange(1, h + 1)
     shrunk_steps = steps * shrinkage[:, None, None]
-    return truth[n - 1] + np.cumsum(shrunk_steps, axis=0)
+    return last_given + np.cumsum(shrunk_steps, axis=0)
 
 
 def noisy(truth: Floats, n: int, h: int) -> Floats:
@@ -282,7 +307,8 @@ def runaway(truth: Floats, n: int, h: int) -> Floats:
     They end 9 lengths away, the most that is scored.
     """
     prediction = np.array(noisy(truth, n, h))
-    distance = 9.0 * 10.0 ** np.linspace(-8.0, 0.0, h - 1)
+    exponents = np.linspace(-8.0, 0.0, h - 1)
+    distance = 9.0 * 10.0**exponents
     prediction[1:, :5] += distance[:, None, None]
     return prediction
 
@@ -292,7 +318,10 @@ HOSTILE = (
     "<img src=http://example.com/x onerror=console.error(2)>"
 )
 
-METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
+METHODS: dict[str, Method] = {
+    "GNS & friends": damped,
+    HOSTILE: noisy,
+}
 """The methods of :func:`page_of`."""
 
 
@@ -378,7 +407,11 @@ class BoardBench:
         metrics = {}
         for name, summary in summarise(combine(tallies)).items():
             metrics[name] = summary.model_dump()
-        self.edit(method, lambda content: content["score"].update(metrics=metrics))
+
+        def change(content: dict[str, Any]) -> None:
+            content["score"]["metrics"] = metrics
+
+        self.edit(method, change)
 
     def rehash(self, method: str) -> None:
         """Make the hashes of an entry those of its score files, whatever these hold."""
@@ -405,9 +438,8 @@ class BoardBench:
 
 def master(home: Path) -> BoardBench:
     """Return the bench that all tests and processes share; do not change its files."""
-    bench = BoardBench(
-        home / "board-bench" / "leaderboard", make_report_bench(home, "cavity")
-    )
+    folder = home / "board-bench" / "leaderboard"
+    bench = BoardBench(folder, make_report_bench(home, "cavity"))
     finished = home / "board-bench" / "finished"
     with FileLock(home / "board-bench.lock"):
         if not finished.exists():
@@ -428,7 +460,8 @@ def master(home: Path) -> BoardBench:
                 seconds_per_frame=0.75,
             )
             bench.submit(first_seed, second_seed, solver_seconds_per_frame=2.0)
-            bench.submit(bench.predict(noisy, "noisy", parameters=5))
+            with_parameters = bench.predict(noisy, "noisy", parameters=5)
+            bench.submit(with_parameters)
             bench.submit(bench.predict(flipping, "flipping"))
             finished.touch()
     return bench
@@ -440,12 +473,14 @@ def flipping(truth: Any, n: int, h: int) -> Any:
     Its vorticity is out of all bounds.
     """
     prediction = np.array(truth[n : n + h])
-    prediction[3::2, :, 0] = 1.0 - prediction[3::2, :, 0]
+    x = prediction[3::2, :, 0]
+    prediction[3::2, :, 0] = 1.0 - x
     return prediction
 
 
 def _worse(truth: Any, n: int, h: int) -> Any:
-    error = noisy(truth, n, h) - truth[n : n + h]
+    future = truth[n : n + h]
+    error = noisy(truth, n, h) - future
     return damped(truth, n, h) + 2.0 * error
 
 
@@ -469,13 +504,15 @@ def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBen
     for name in without:
         patterns += [f"{name}.yaml", f"{name}.nc", f"{name}_*.nc"]
     target = folder / "leaderboard"
-    shutil.copytree(shared.folder, target, ignore=shutil.ignore_patterns(*patterns))
+    ignore = shutil.ignore_patterns(*patterns)
+    shutil.copytree(shared.folder, target, ignore=ignore)
     return BoardBench(target, shared.data)
 
 
 def set_mean(content: dict[str, Any], factor: float = 0.9) -> None:
     """Better the ranking metric of an entry."""
-    content["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
+    metrics = content["score"]["metrics"]
+    metrics["vorticity_rmse"]["mean"] *= factor
 
 
 def reform(
@@ -485,7 +522,8 @@ def reform(
     whole: bool = True,
 ) -> None:
     """Change the values of a score file; its hash and the aggregates follow."""
-    with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
+    path = bench.folder / SCORES / "noisy.nc"
+    with netCDF4.Dataset(path, "r+") as file:
         file.set_auto_maskandscale(False)
         change(file)
     if whole:
@@ -499,6 +537,7 @@ def scale(statistic: str, factor: float) -> Callable[[Any], object]:
 
     def change(file: Any) -> None:
         row = file.statistics.split().index(statistic)
-        file["value"][row] = factor * file["value"][row]
+        values = file["value"]
+        values[row] = factor * values[row]
 
     return change

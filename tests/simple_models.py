@@ -80,7 +80,8 @@ class Drift(Baseline):
     def __init__(self, options: Any, info: DatasetInfo) -> None:
         super().__init__(options, info)
         self.a = nn.Parameter(torch.full((1,), options.start))
-        self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
+        no_calls = torch.zeros((), dtype=torch.int64)
+        self.register_buffer("calls", no_calls)
 
     @property
     def history(self) -> int:
@@ -93,15 +94,18 @@ class Drift(Baseline):
         """Return the same mean squared error twice."""
         before, now, after = batch.position.unbind(1)
         self.calls += 1
-        error = (1e3 * (after - now - self.a * (now - before))).square().mean()
-        broken = (
-            error * float("nan") if int(self.calls) == self.options.fail_at else error
-        )
-        return {"motion": error, "swirl": broken}
+        drift = self.a * (now - before)
+        error = (1e3 * (after - now - drift)).square().mean()
+        swirl = error
+        if int(self.calls) == self.options.fail_at:
+            swirl = error * float("nan")
+        return {"motion": error, "swirl": swirl}
 
     def start(self, given: Batch) -> State:
         """Return the last two frames and the number of the next."""
-        return given.position[:, -2], given.position[:, -1], 1
+        before = given.position[:, -2]
+        now = given.position[:, -1]
+        return before, now, 1
 
     def advance(self, state: State) -> tuple[State, Tensor]:
         """Keep on drifting."""
@@ -122,8 +126,8 @@ class Bursting(Drift):
     def advance(self, state: State) -> tuple[State, Tensor]:
         """Advance by one frame; a batch with such a window is infinite altogether."""
         (now, after, frame), position = super().advance(state)
-        first = now[:: self.info.particles, 0]
-        if frame > 4 and bool((first < 0.5).any()):
+        first_x = now[:: self.info.particles, 0]
+        if frame > 4 and bool((first_x < 0.5).any()):
             position = torch.full_like(after, float("inf"))
         return (now, position, frame), position
 
@@ -131,11 +135,12 @@ class Bursting(Drift):
 def install(monkeypatch: pytest.MonkeyPatch, **models: type) -> None:
     """Let packages seem installed that add baselines, by name."""
     own = tuple(catalogue.list_entry_points(catalogue.GROUP))
-    added = tuple(
-        EntryPoint(name, f"{model.__module__}:{model.__name__}", catalogue.GROUP)
-        for name, model in models.items()
-    )
-    monkeypatch.setattr(catalogue, "list_entry_points", lambda group: own + added)
+    added = []
+    for name, model in models.items():
+        place = f"{model.__module__}:{model.__name__}"
+        added.append(EntryPoint(name, place, catalogue.GROUP))
+    points = (*own, *added)
+    monkeypatch.setattr(catalogue, "list_entry_points", lambda group: points)
 
 
 def trainer(
@@ -154,18 +159,24 @@ def trainer(
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
 
     def call(baseline: str, *settings: str, to: str = "run", **options: Any) -> Any:
-        options = {"root": root, "split": "curl-noise", "registry": registry, **options}
-        own = tuple(
-            one if one.startswith(("model.", "training.")) else f"training.{one}"
-            for one in settings
-        )
+        defaults = {
+            "root": root,
+            "split": "curl-noise",
+            "registry": registry,
+        }
+        full_settings = []
+        for setting in settings:
+            if setting.startswith(("model.", "training.")):
+                full_settings.append(setting)
+            else:
+                full_settings.append(f"training.{setting}")
         return run(
             baseline,
             size="tiny",
-            settings=own,
+            settings=tuple(full_settings),
             output=folder / to,
             threads=1,
-            **options,
+            **(defaults | options),
         )
 
     return call
@@ -176,15 +187,20 @@ def info_of(scenarios: Sequence[Floats]) -> DatasetInfo:
     particle, 2].
     """
     statistics = {}
-    for name, order in (("position", 0), ("velocity", 1), ("acceleration", 2)):
-        values = np.concatenate(
-            [np.diff(x.astype(float), order, axis=0).reshape(-1, 2) for x in scenarios]
-        )
-        for kind, (x, y) in (
-            ("mean", values.mean(axis=0)),
-            ("std", values.std(axis=0)),
-        ):
-            statistics[f"{name}_{kind}"] = float(x), float(y)
+    for name, order in (
+        ("position", 0),
+        ("velocity", 1),
+        ("acceleration", 2),
+    ):
+        differences = []
+        for positions in scenarios:
+            difference = np.diff(positions.astype(float), order, axis=0)
+            differences.append(difference.reshape(-1, 2))
+        values = np.concatenate(differences)
+        mean_x, mean_y = values.mean(axis=0)
+        std_x, std_y = values.std(axis=0)
+        statistics[f"{name}_mean"] = (float(mean_x), float(mean_y))
+        statistics[f"{name}_std"] = (float(std_x), float(std_y))
     particles = scenarios[0].shape[1]
     return replace(
         INFO,
@@ -204,19 +220,20 @@ def side_by_side(
     """Return windows of shape [frame, particle, 2] as a batch, with the materials of
     each.
     """
-    rows = [
-        torch.from_numpy(np.ascontiguousarray(w.swapaxes(0, 1), dtype=np.float32))
-        for w in windows
-    ]
+    rows = []
+    for window in windows:
+        by_particle = window.swapaxes(0, 1)
+        row = np.ascontiguousarray(by_particle, dtype=np.float32)
+        rows.append(torch.from_numpy(row))
+    window_numbers = torch.arange(len(windows))
+    particle_counts = torch.tensor([len(row) for row in rows])
     return Batch(
         position=torch.cat(rows),
-        sample=torch.arange(len(windows)).repeat_interleave(
-            torch.tensor([len(row) for row in rows])
-        ),
+        sample=window_numbers.repeat_interleave(particle_counts),
         material=torch.cat(list(kinds)),
         wall_velocity=walls,
-        scenario=torch.arange(len(windows)),
-        frame=torch.zeros(len(windows), dtype=torch.int64),
+        scenario=window_numbers,
+        frame=torch.zeros_like(window_numbers),
     )
 
 
@@ -224,10 +241,13 @@ def batch_of(windows: Sequence[Floats], material: Sequence[int] | None = None) -
     """Put windows side by side; materials repeat in every window, all is liquid by
     default.
     """
-    kinds = [
-        torch.tensor([0] * w.shape[1] if material is None else material)
-        for w in windows
-    ]
+    kinds = []
+    for window in windows:
+        particle_count = window.shape[1]
+        if material is None:
+            kinds.append(torch.zeros(particle_count, dtype=torch.int64))
+        else:
+            kinds.append(torch.tensor(material))
     return side_by_side(windows, kinds, None)
 
 
@@ -235,11 +255,13 @@ def batch(*windows: NDArray[np.float64] | Floats, walls: bool = False) -> Batch:
     """Put windows of all materials side by side; walls slide at 0.01 to 0.08 if
     asked.
     """
-    moving = (torch.arange(1.0, 9.0).reshape(4, 2) / 100.0).expand(
-        len(windows), len(windows[0]), 4, 2
-    )
-    kinds = [torch.arange(w.shape[1]) % 4 for w in windows]
-    return side_by_side(windows, kinds, moving.clone() if walls else None)
+    kinds = [torch.arange(window.shape[1]) % 4 for window in windows]
+    if not walls:
+        return side_by_side(windows, kinds, None)
+    of_a_frame = torch.arange(1.0, 9.0).reshape(4, 2) / 100.0
+    frame_count = len(windows[0])
+    wall_velocity = of_a_frame.expand(len(windows), frame_count, 4, 2)
+    return side_by_side(windows, kinds, wall_velocity.clone())
 
 
 def rotations(
@@ -253,12 +275,17 @@ def rotations(
     angles.
     """
     rng = np.random.default_rng(seed)
-    cloud = np.array([0.25, 0.0]) + rng.normal(0.0, 0.06, (particles, 2))
-    angle = rng.uniform(0.0, 2 * np.pi, scenarios)[:, None] + 0.1 * np.arange(frames)
+    middle = np.array([0.25, 0.0])
+    cloud = middle + rng.normal(0.0, 0.06, (particles, 2))
+    start = rng.uniform(0.0, 2 * np.pi, scenarios)
+    angle = start[:, None] + 0.1 * np.arange(frames)
     c = np.cos(angle)
     s = np.sin(angle)
-    turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
-    return list((0.5 + np.einsum("pi,sfij->sfpj", cloud, turn)).astype(np.float32))
+    first_row = np.stack([c, s], -1)
+    second_row = np.stack([-s, c], -1)
+    turn = np.stack([first_row, second_row], -2)
+    turned = np.einsum("pi,sfij->sfpj", cloud, turn)
+    return list((0.5 + turned).astype(np.float32))
 
 
 def train(
@@ -274,18 +301,17 @@ def train(
     generator = torch.Generator().manual_seed(0)
     optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    starts = len(scenarios[0]) - length + 1
     for _ in range(steps):
-        picks = [
-            rng.integers([len(scenarios), len(scenarios[0]) - length + 1])
-            for _ in range(batch)
-        ]
-        terms = model(
-            batch_of([scenarios[s][f : f + length] for s, f in picks]), generator
-        )
-        loss = sum(
-            (model.weights.get(name, 1.0) * term for name, term in terms.items()),
-            torch.zeros(()),
-        )
+        windows = []
+        for _ in range(batch):
+            scenario, first = rng.integers([len(scenarios), starts])
+            window = scenarios[scenario][first : first + length]
+            windows.append(window)
+        terms = model(batch_of(windows), generator)
+        loss = torch.zeros(())
+        for name, term in terms.items():
+            loss = loss + model.weights.get(name, 1.0) * term
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -313,10 +339,13 @@ def share_of_persistence(
     """Return the rollout's squared error over that of standing still, both in
     positions.
     """
-    truth = torch.from_numpy(scenario[given : given + frames].swapaxes(0, 1).copy())
+    future = scenario[given : given + frames]
+    truth = torch.from_numpy(future.swapaxes(0, 1).copy())
     start = batch_of([scenario[:given]])
-    still = (truth - start.position[:, -1:]).square().mean()
-    return float((rolled(model, start, frames) - truth).square().mean() / still)
+    last_given = start.position[:, -1:]
+    error_of_rest = (truth - last_given).square().mean()
+    error = (rolled(model, start, frames) - truth).square().mean()
+    return float(error / error_of_rest)
 
 
 def counted(widths: Sequence[int]) -> int:
@@ -338,22 +367,20 @@ def info(**changes: object) -> DatasetInfo:
     statistics = {
         "position_mean": (0.5, 0.5),
         "position_std": (0.25, 0.3),
+        "velocity_mean": (0.0, 0.0),
         "velocity_std": (0.004, 0.003),
+        "acceleration_mean": (0.0, 0.0),
         "acceleration_std": (0.0002, 0.0001),
-        **dict.fromkeys(("velocity_mean", "acceleration_mean"), (0.0, 0.0)),
     }
     plain: dict[str, Any] = {
         "split": "cavity",
         "particles": 256,
         "radius": RADIUS,
         "frame_interval": 0.5,
+        "bounds": ((0.0625, 0.9375), (0.0625, 0.9375)),
+        "statistics": statistics,
     }
-    return replace(
-        INFO,
-        **plain
-        | {"bounds": ((0.0625, 0.9375),) * 2, "statistics": statistics}
-        | changes,
-    )
+    return replace(INFO, **(plain | changes))
 
 
 def jittered(
@@ -368,8 +395,10 @@ def jittered(
     rng = np.random.default_rng(seed)
     spacing = (high - low) / side
     axis = low + (np.arange(side) + 0.5) * spacing
-    lattice = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    return lattice + rng.uniform(-0.3, 0.3, lattice.shape) * spacing
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    lattice = np.stack([x, y], axis=-1).reshape(-1, 2)
+    jitter = rng.uniform(-0.3, 0.3, lattice.shape)
+    return lattice + jitter * spacing
 
 
 def swirl(
@@ -383,10 +412,11 @@ def swirl(
     arm = jittered(seed) - 0.5
     arm *= 0.6  # the corners' circles stay in the box
     angle = np.linspace(*speeds, frames).cumsum()
-    turn = np.stack(
-        [np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1
-    )
-    return 0.5 + np.einsum("fij,pj->fpi", turn.reshape(-1, 2, 2), arm)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
+    turn = np.stack([cos, -sin, sin, cos], axis=-1)
+    rotation = turn.reshape(-1, 2, 2)
+    return 0.5 + np.einsum("fij,pj->fpi", rotation, arm)
 
 
 def network(
@@ -397,12 +427,12 @@ def network(
 ) -> Any:
     """Return a small GNS in float32; awake ones have a decoder that is not zero."""
     torch.manual_seed(0)
-    model = GraphNetwork.with_operator(GNS).build(
-        SMALL | options, info(**(changes or {}))
-    )
+    figures = info(**(changes or {}))
+    model = GraphNetwork.with_operator(GNS).build(SMALL | options, figures)
     if awake:
-        torch.nn.init.normal_(model.network.decoder[-1].weight, std=0.1)
-        torch.nn.init.normal_(model.network.decoder[-1].bias, std=0.1)
+        last_layer = model.network.decoder[-1]
+        torch.nn.init.normal_(last_layer.weight, std=0.1)
+        torch.nn.init.normal_(last_layer.bias, std=0.1)
     return model
 
 
@@ -411,9 +441,11 @@ def oracle(truth: torch.Tensor, target: str, **options: object) -> Any:
     standardised; six are given.
     """
     velocity = truth.diff(dim=1)
-    exact = {"velocity": velocity[:, 5:], "acceleration": velocity.diff(dim=1)[:, 4:]}[
-        target
-    ]
+    acceleration = velocity.diff(dim=1)
+    if target == "velocity":
+        exact = velocity[:, 5:]
+    else:
+        exact = acceleration[:, 4:]
 
     class Oracle(GraphNetwork):
         operator = GNS
@@ -425,11 +457,17 @@ def oracle(truth: torch.Tensor, target: str, **options: object) -> Any:
         ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
             scale = getattr(self, target)
             self.frame += 1
-            return scale(exact[:, self.frame - 1].float()).to(state.position.dtype), {}
+            of_next_frame = exact[:, self.frame - 1].float()
+            output = scale(of_next_frame)
+            return output.to(state.position.dtype), {}
 
-    means = {"velocity_mean": (1e-3, -2e-3), "acceleration_mean": (1e-5, 2e-5)}
+    means = {
+        "velocity_mean": (1e-3, -2e-3),
+        "acceleration_mean": (1e-5, 2e-5),
+    }
     shifted = info(statistics=dict(info().statistics) | means)
-    return Oracle.build(SMALL | {"target": target} | options, shifted)
+    all_options = SMALL | {"target": target} | options
+    return Oracle.build(all_options, shifted)
 
 
 class Graph(NamedTuple):
@@ -446,10 +484,14 @@ def graph(nodes: int, edges: int, *, node: int, edge: int, seed: int = 0) -> Gra
     """
     source = torch.Generator().manual_seed(seed)
     linked = nodes - 1
-    pairs = torch.cartesian_prod(torch.arange(linked), torch.arange(linked))
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    chosen = pairs[torch.randperm(len(pairs), generator=source)[:edges]].t()
-    by_receiver = torch.argsort(chosen[1] * nodes + chosen[0])
+    numbers = torch.arange(linked)
+    pairs = torch.cartesian_prod(numbers, numbers)
+    is_loop = pairs[:, 0] == pairs[:, 1]
+    pairs = pairs[~is_loop]
+    order = torch.randperm(len(pairs), generator=source)
+    chosen = pairs[order[:edges]].t()
+    sender, receiver = chosen
+    by_receiver = torch.argsort(receiver * nodes + sender)
     return Graph(
         torch.randn(nodes, node, generator=source),
         chosen[:, by_receiver],

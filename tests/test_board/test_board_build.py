@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import netCDF4
 import numpy as np
@@ -71,12 +72,14 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
 @pytest.fixture(scope="module")
 def card(bench: BoardBench) -> ScoreCard:
     """The score card of ``noisy``, scored apart from the board."""
-    return bench.data.card(bench.predict(noisy, "again"))
+    predictions = bench.predict(noisy, "again")
+    return bench.data.card(predictions)
 
 
 def row_of(board: Board, method: str) -> BoardRow:
     """Return a row of the only tab."""
-    return next(row for row in board.tabs[0].rows if row.id == method)
+    rows = {row.id: row for row in board.tabs[0].rows}
+    return rows[method]
 
 
 def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
@@ -131,12 +134,14 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
         a = first[name].values
         b = second[name].values
         value = row.values[name]
+        seeds = np.stack([a, b])
         mean = (a + b) / 2.0
         deviation = abs(a.mean() - b.mean()) / math.sqrt(2.0)
         assert value.per_scenario == pytest.approx(mean)
         assert value.mean == pytest.approx(mean.mean())
         assert value.std == pytest.approx(deviation)
-        assert (value.low, value.high) == bootstrap_interval(np.stack([a, b]))
+        interval = [value.low, value.high]
+        assert_array_equal(interval, bootstrap_interval(seeds))
     ranking = "vorticity_nrmse"
     means = (first[ranking].mean, second[ranking].mean)
     assert row.seed_means == pytest.approx(means)
@@ -144,11 +149,11 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
 
 def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
     """The entry is named: a package that describes its split is missing."""
+    nothing_known = Registry({}, {})
     with pytest.raises(DataError) as caught:
-        collect(bench.folder, registry=Registry({}, {}))
-    assert caught.value.where in {
-        str(path) for path in (bench.folder / "submissions").rglob("*.yaml")
-    }
+        collect(bench.folder, registry=nothing_known)
+    entries = (bench.folder / "submissions").rglob("*.yaml")
+    assert Path(caught.value.where or "") in entries
 
 
 def test_few_scenarios_decide_nothing(board: Board) -> None:
@@ -156,8 +161,10 @@ def test_few_scenarios_decide_nothing(board: Board) -> None:
     (tab,) = board.tabs
     assert not tab.decided
     ranked = [row for row in tab.rows if row.rank is not None]
-    assert {row.id for row in ranked} == {"damped", "noisy", "flipping"}
-    assert [row.rank for row in ranked] == [1, 2, 3]
+    names = {row.id for row in ranked}
+    assert names == {"damped", "noisy", "flipping"}
+    ranks = [row.rank for row in ranked]
+    assert ranks == [1, 2, 3]
     for row in ranked:
         assert math.isnan(row.p)
         assert not row.tied
@@ -165,35 +172,47 @@ def test_few_scenarios_decide_nothing(board: Board) -> None:
     assert means == sorted(means)
 
 
+def withdraw(entry: dict[str, Any]) -> None:
+    """Withdraw an entry."""
+    entry["status"] = "withdrawn"
+    entry["reason"] = "leaked"
+
+
+def supersede(entry: dict[str, Any]) -> None:
+    """Let an entry name its successor."""
+    entry["status"] = "superseded"
+    entry["superseded_by"] = "flipping"
+
+
+def outdate(entry: dict[str, Any]) -> None:
+    """Give an entry the hash of another data set."""
+    entry["dataset"]["sha256"] = "0" * 64
+
+
 def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> None:
     """They stay on the board, below, and say why; scores of another task are left
     out.
     """
-    own.edit("noisy", lambda held: held.update(status="withdrawn", reason="leaked"))
-    own.edit(
-        "damped",
-        lambda held: held.update(status="superseded", superseded_by="flipping"),
-    )
-    own.edit("flipping", lambda held: held["dataset"].update(sha256="0" * 64))
-    rows = {
-        row.id: row for row in collect(own.folder, registry=own.registry).tabs[0].rows
-    }
-    assert all(row.rank is None for row in rows.values())
-    assert not any(row.active for row in rows.values())
-    assert rows["noisy"].entry.reason == "leaked"
-    assert not rows["flipping"].current
+    own.edit("noisy", withdraw)
+    own.edit("damped", supersede)
+    own.edit("flipping", outdate)
+    board = collect(own.folder, registry=own.registry)
+    for row in board.tabs[0].rows:
+        assert row.rank is None
+        assert not row.active
+    assert row_of(board, "noisy").entry.reason == "leaked"
+    assert not row_of(board, "flipping").current
 
 
 def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
     """Maps of truth and prediction share one packing: the tab's truth is the finest."""
-    names = ("flipping", "noisy")
-    coarse, fine = (
-        read_score_file(bench.folder / f"scores/cavity/tiny/{name}.nc")
-        for name in names
-    )
+    folder = bench.folder / "scores/cavity/tiny"
+    coarse = read_score_file(folder / "flipping.nc")
+    fine = read_score_file(folder / "noisy.nc")
     assert coarse.precision > 5.0 * fine.precision
-    truth = board.tabs[0].truth.vorticity
-    assert_allclose(truth, fine.preview.vorticity[0], atol=fine.precision)
+    true_vorticity = board.tabs[0].truth.vorticity
+    expected = fine.preview.vorticity[0]
+    assert_allclose(true_vorticity, expected, atol=fine.precision)
 
 
 def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
@@ -209,10 +228,12 @@ def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> No
     map_error = np.abs(row.pictures.vorticity - vorticity[1])
     assert np.nanmax(map_error) <= span / 65534
 
-    predicted = card.submission["energy_predicted"].per_frame
-    true = card.submission["energy_true"].per_frame
-    assert row.energy.mean == pytest.approx(predicted.mean(axis=0))
-    assert board.tabs[0].energy.mean == pytest.approx(true.mean(axis=0))
+    predicted_energy = card.submission["energy_predicted"].per_frame
+    expected = predicted_energy.mean(axis=0)
+    assert row.energy.mean == pytest.approx(expected)
+    true_energy = card.submission["energy_true"].per_frame
+    expected = true_energy.mean(axis=0)
+    assert board.tabs[0].energy.mean == pytest.approx(expected)
 
 
 def test_residual_histograms(card: ScoreCard) -> None:
@@ -221,26 +242,30 @@ def test_residual_histograms(card: ScoreCard) -> None:
     """
     truth, prediction = card.preview.vorticity.astype(float)
     histograms = residual_histograms(card.preview)
-    for histogram, difference in zip(histograms, prediction - truth, strict=True):
+    differences = prediction - truth
+    for histogram, difference in zip(histograms, differences, strict=True):
         residual = difference[~np.isnan(difference)]
         greatest = np.abs(residual).max()
         half_bin = greatest / (RESIDUAL_BINS - 1)
         end = greatest + half_bin
-        counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
+        ends = (-end, end)
+        counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=ends)
+        shares = counts / residual.size
         assert histogram.low == -greatest
         assert histogram.high == greatest
-        assert histogram.shares == pytest.approx(counts / residual.size)
+        assert histogram.shares == pytest.approx(shares)
 
 
 def made_up(per_frame: NDArray[np.float64]) -> Score:
     """Return a score of the ranking metric with given values, shape [scenario,
     frame].
     """
-    count, frames = per_frame.shape
+    count, frame_count = per_frame.shape
+    frames = range(10, 10 + frame_count)
     return Score(
         metric=METRICS["vorticity_rmse"],
         scenarios=tuple(range(count)),
-        frames=tuple(range(10, 10 + frames)),
+        frames=tuple(frames),
         per_frame=per_frame,
         values=np.zeros(count),
         undefined=(0,) * count,
@@ -260,18 +285,20 @@ def test_curves_keep_the_ends() -> None:
     assert curve.frames[-1] == 607
 
     chosen_steps = np.array(curve.frames) - 10.0
+    mean = 2.0 * chosen_steps
     assert curve.mean[0] == 0.0
+    assert curve.mean[1:] == pytest.approx(mean[1:])
     assert curve.low[1:] == pytest.approx(chosen_steps[1:])
     assert curve.high == pytest.approx(3.0 * chosen_steps)
-    assert curve.mean[1:] == pytest.approx(2.0 * chosen_steps[1:])
 
 
 def test_curves_of_sampled_metrics_are_lines() -> None:
     """A metric that is measured at every tenth frame has these frames, and no gaps
     between them.
     """
+    every_tenth = range(9, 298, 10)
     per_frame = np.full((2, 298), np.nan)
-    per_frame[:, 9::10] = np.arange(29.0)
+    per_frame[:, every_tenth] = np.arange(29.0)
     curve = make_curve(made_up(per_frame))
     assert curve.frames == tuple(range(19, 308, 10))
     assert list(curve.mean) == list(range(29))
@@ -281,29 +308,30 @@ def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """A scenario that one seed has no value for takes the other's; none stays
     undefined.
     """
-    paths = ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
-    held = [read_statistics(bench.folder / path) for path in paths]
-    found = combine([scores.tallies for scores in held])["vorticity_pearson"]
-    assert np.array_equal(
-        found.score.values, held[0].scores()["vorticity_pearson"].values
-    )
-    assert math.isnan(found.std)
+    name = "vorticity_pearson"
+    defined = read_statistics(bench.folder / "scores/cavity/tiny/noisy.nc")
+    undefined = read_statistics(bench.folder / "floors/cavity/tiny/persistence.nc")
+    combined = combine([defined.tallies, undefined.tallies])
+    expected = defined.scores()[name].values
+    assert_array_equal(combined[name].score.values, expected)
+    assert math.isnan(combined[name].std)
 
 
 def test_the_order_of_files_does_not_matter(bench: BoardBench, tmp_path: Path) -> None:
     """The same submissions, copied in another order and time, give the same bytes of
     the page.
     """
+    files = [path for path in bench.folder.rglob("*.*") if path.is_file()]
+    files.sort()
     pages = []
-    for reverse in (False, True):
-        target = tmp_path / str(reverse)
-        for path in sorted(
-            filter(Path.is_file, bench.folder.rglob("*.*")), reverse=reverse
-        ):
+    for ordered_files in (files, files[::-1]):
+        target = tmp_path / str(len(pages))
+        for path in ordered_files:
             copy = target / path.relative_to(bench.folder)
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
-        pages.append(build(target, registry=bench.registry).page.read_bytes())
+        result = build(target, registry=bench.registry)
+        pages.append(result.page.read_bytes())
     assert pages[0] == pages[1]
 
 
@@ -311,15 +339,18 @@ def test_less_is_formed_to_the_same_numbers(bench: BoardBench, board: Board) -> 
     """A board of some metrics without pictures has the ranks and values of the whole
     one.
     """
-    scope = Scope(metrics=("position_rmse",), intervals=(), has_pictures=False)
+    scope = Scope(
+        metrics=("position_rmse",),
+        intervals=(),
+        has_pictures=False,
+    )
     small = collect(bench.folder, registry=bench.registry, scope=scope)
     for row, whole in zip(small.tabs[0].rows, board.tabs[0].rows, strict=True):
         assert row.values.keys() == {"vorticity_nrmse", "position_rmse"}
-        ranking = row.values["vorticity_nrmse"]
-        assert ranking.mean == whole.values["vorticity_nrmse"].mean
-        assert row.losses.tolist() == whole.losses.tolist()
-        assert row.values["position_rmse"].mean == whole.values["position_rmse"].mean
+        for metric, value in row.values.items():
+            assert value.mean == whole.values[metric].mean
         assert math.isnan(row.values["position_rmse"].low)
+        assert row.losses.tolist() == whole.losses.tolist()
         assert row.pictures is None
         assert row.rank == whole.rank
 
@@ -328,20 +359,21 @@ def test_names_tell_variants() -> None:
     """A name that continues another one of the same authors with a comma or a word is
     that of a variant.
     """
-    names = (
+    gns = make_entry("GNS", 0, "cavity", "mini", None)
+    entries = []
+    for name in (
         "GNS",
         "GNS, wide",
         "GNS without noise",
         "GNS2",
         "GNS + MLP",
         "GNS, wide, 2",
-    )
-    entries = []
-    for name in names:
+    ):
         method = re.sub("[^a-z0-9]+", "-", name.lower())
-        entry = make_entry("GNS", 0, "cavity", "mini", None)
-        entries.append(entry.model_copy(update={"name": name, "method": method}))
-    stranger = entries[1].model_copy(update={"authors": ("Z.",), "method": "theirs"})
+        entry = gns.model_copy(update={"name": name, "method": method})
+        entries.append(entry)
+    of_others = {"authors": ("Z.",), "method": "theirs"}
+    stranger = entries[1].model_copy(update=of_others)
     variants = find_variants([*entries, stranger], entries)
     assert variants == {
         "gns-wide": "gns",
@@ -354,7 +386,8 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
     """Nothing is collected from a folder with a displaced entry, and no board from no
     folder.
     """
-    own.entry("noisy").rename(own.folder / PLACE / "other.yaml")
+    elsewhere = own.folder / PLACE / "other.yaml"
+    own.entry("noisy").rename(elsewhere)
     with pytest.raises(ChecksFailedError) as caught:
         collect(own.folder, registry=own.registry)
     assert caught.value.where == "submissions/cavity/tiny/other.yaml"
@@ -395,24 +428,30 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
         assert row[0] == "-"
         assert row[-1] == reference.kind
     damped = rows["damped"]
-    assert damped[0] == str(row_of(board, "damped").rank)
+    rank = row_of(board, "damped").rank
+    assert damped[0] == str(rank)
     assert damped[5] == "0.5"
     for row in table.rows:
-        assert max(map(len, row[-1].split("\n"))) <= 17
+        lines = row[-1].split("\n")
+        assert max(map(len, lines)) <= 17
     (wide,) = tables(board, wide=True)
-    spread = {row[1]: row for row in wide.rows}["damped"]
-    assert " ± " in spread[3]
+    wide_rows = {row[1]: row for row in wide.rows}
+    score = wide_rows["damped"][3]
+    assert " ± " in score
 
 
 def test_json_has_the_numbers_of_the_board(board: Board) -> None:
     """Digits are those of scores.json."""
     (plain,) = to_plain(board)["tabs"]
     rows = {row["id"]: row for row in plain["rows"]}
-    mean = row_of(board, "damped").values["position_rmse"].mean
-    assert rows["damped"]["metrics"]["position_rmse"]["mean"] == digits(mean)
-    assert rows["damped"]["cost"]["speed_up"] == 4.0
+    damped = rows["damped"]
+    value = row_of(board, "damped").values["position_rmse"]
+    metric = damped["metrics"]["position_rmse"]
+    assert metric["mean"] == digits(value.mean)
+    assert damped["cost"]["speed_up"] == 4.0
     names = sorted(reference.name for reference in board.tabs[0].references)
-    assert sorted(floor["id"] for floor in plain["floors"]) == names
+    floors = sorted(floor["id"] for floor in plain["floors"])
+    assert floors == names
 
 
 def test_unknown_names_are_refused(board: Board) -> None:
@@ -438,7 +477,8 @@ def test_boards_without_an_entry_are_named(
     assert empty.tabs == ()
     assert set(board.empty) <= set(empty.empty)
     assert choose_data_sets([], None, None) == ()
-    assert build(tmp_path, registry=bench.registry).rows == 0
+    result = build(tmp_path, registry=bench.registry)
+    assert result.rows == 0
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan])
@@ -464,16 +504,17 @@ def test_impossible_scores_name_their_file(own: BoardBench, value: float) -> Non
 
 def test_weights_that_fail_a_gate_are_marked(tmp_path: Path) -> None:
     """They are found by the hash of the weights; a broken list is named."""
-    weights = Weights(path="x", sha256="a" * 64)
+    sha256 = "a" * 64
+    weights = Weights(path="x", sha256=sha256)
     entry = make_entry("GNS", 1, "cavity", "mini", None)
     prediction = entry.predictions[0].model_copy(update={"weights": weights})
-    entry = entry.model_copy(update={"predictions": (prediction,)})
+    with_weights = entry.model_copy(update={"predictions": (prediction,)})
     path = tmp_path / "gates.json"
-    row = {"weights_sha256": "a" * 64, "failed": ["one_step"]}
+    row = {"weights_sha256": sha256, "failed": ["one_step"]}
     path.write_text(json.dumps({"weights": [row]}))
     failed = read_failed_gates(Folder(tmp_path))
-    assert gates_failed_by(entry, failed) == ("one_step",)
-    assert gates_failed_by(make_entry("GNS", 1, "cavity", "mini", None), failed) == ()
+    assert gates_failed_by(with_weights, failed) == ("one_step",)
+    assert gates_failed_by(entry, failed) == ()
     path.write_text("{}")
     with pytest.raises(UnreadableFileError):
         read_failed_gates(Folder(tmp_path))

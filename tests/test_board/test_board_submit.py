@@ -90,17 +90,22 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
         "solver_seconds_per_frame": 0.5,
     }
     assert entry.cost.model_dump() == cost
+    (prediction,) = entry.predictions
     with open_predictions(predictions) as opened:
-        assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
+        assert prediction.sha256 == opened.content_sha256()
         assert entry.dataset.sha256 == opened.header.dataset_sha256
-    assert entry.predictions[0].bytes == predictions.stat().st_size
+    assert prediction.bytes == predictions.stat().st_size
     assert entry.score.lagbench == __version__
-    (score_file,) = entry.score_paths
-    assert entry.score.files[0].sha256 == file_sha256(own.folder / score_file)
+    (score_path,) = entry.score_paths
+    score_hash = file_sha256(own.folder / score_path)
+    assert entry.score.files[0].sha256 == score_hash
     card = own.data.card(predictions)
-    assert result.mean == pytest.approx(card.submission[card.ranking].mean, rel=1e-8)
-    assert [path.name for path in result.files] == ["my-model.yaml", "my-model.nc"]
-    assert all(path.stat().st_size <= 1_000_000 for path in result.files)
+    mean = card.submission[card.ranking].mean
+    assert result.mean == pytest.approx(mean, rel=1e-8)
+    names = [path.name for path in result.files]
+    assert names == ["my-model.yaml", "my-model.nc"]
+    for path in result.files:
+        assert path.stat().st_size <= 1_000_000
     assert well(own)
     before = own.state()
     own.submit(predictions, replace=True, **said)
@@ -111,10 +116,11 @@ def test_replacing_leaves_no_score_file_over(own: BoardBench) -> None:
     """Two seeds that become one: the score files of both are gone, the new one is
     there.
     """
-    own.submit(own.predict(damped, "damped"), replace=True)
-    assert [
-        path.name for path in (own.folder / "scores/cavity/tiny").glob("damped*")
-    ] == ["damped.nc"]
+    predictions = own.predict(damped, "damped")
+    own.submit(predictions, replace=True)
+    scores = own.folder / "scores/cavity/tiny"
+    names = [path.name for path in scores.glob("damped*")]
+    assert names == ["damped.nc"]
 
 
 def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
@@ -125,8 +131,10 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
     inside.parent.mkdir()
     own.data.submit(inside, nearer, "inside")
     own.submit(inside)
-    assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
-    assert read_entry(own.entry("noisy")).predictions[0].path is None
+    (prediction,) = read_entry(own.entry("inside")).predictions
+    assert prediction.path == "predictions/mine.nc"
+    (prediction,) = read_entry(own.entry("noisy")).predictions
+    assert prediction.path is None
     assert well(own)
 
 
@@ -145,7 +153,10 @@ def test_a_name_that_no_entry_can_hold(own: BoardBench) -> None:
 
 def tree(folder: Path) -> set[str]:
     """Return everything under a folder, hidden files too."""
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    names = set()
+    for path in folder.rglob("*"):
+        names.add(path.relative_to(folder).as_posix())
+    return names
 
 
 def test_predictions_are_submitted_once(
@@ -160,38 +171,42 @@ def test_predictions_are_submitted_once(
     again = own.predict(nearer, "second")
     with pytest.raises(UsageError):
         own.submit(again)
+    one_seed = own.predict(still, "third", seed=0)
+    same_content = own.predict(still, "third", seed=1)
     with monkeypatch.context() as patch:
         patch.setattr(submitting, "score", pytest.fail)
         for files in (
             (first,),
-            tuple(own.predict(still, "third", seed=seed) for seed in (0, 1)),
+            (one_seed, same_content),
         ):
             with pytest.raises(UsageError):
                 own.submit(*files, method="other", name="Other")
     assert tree(own.folder) == before
-    assert own.submit(again, method="first", replace=True).method == "first"
+    result = own.submit(again, method="first", replace=True)
+    assert result.method == "first"
+
+
+TWO_ADDRESSES = ("https://a.org/1", "https://a.org/2")
+Keys = dict[str, Any]
 
 
 @pytest.mark.usefixtures("unscored")
 @pytest.mark.parametrize(
     "keys",
     [
-        *(
-            {"authors": ()},
-            {"command": ""},
-            {"method": "noisy"},
-            {"method": "persistence"},
-        ),
-        *({"name": "NO\u0406SY"}, {"name": "Persistence"}),
-        *(
-            {"urls": ("https://a.org/1", "https://a.org/2")},
-            {"date": datetime.date(2999, 1, 1)},
-        ),
+        {"authors": ()},
+        {"command": ""},
+        {"method": "noisy"},
+        {"method": "persistence"},
+        {"name": "NO\u0406SY"},
+        {"name": "Persistence"},
+        {"urls": TWO_ADDRESSES},
+        {"date": datetime.date(2999, 1, 1)},
         {"budget": {"track": "converged"}},
     ],
 )
 def test_refused_before_the_work(
-    keys: dict[str, Any], own: BoardBench, predictions: Path
+    keys: Keys, own: BoardBench, predictions: Path
 ) -> None:
     """What is missing, taken, of a day to come or nobody's to say, before anything is
     scored or written.
@@ -200,8 +215,11 @@ def test_refused_before_the_work(
     with pytest.raises(UsageError) as caught:
         own.submit(predictions, **keys)
     assert tree(own.folder) == before
-    where = {"date": "date", "budget": "budget.track"}
-    assert all(caught.value.where == where.get(key, caught.value.where) for key in keys)
+    (key,) = keys
+    if key == "date":
+        assert caught.value.where == "date"
+    if key == "budget":
+        assert caught.value.where == "budget.track"
 
 
 @pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
@@ -210,9 +228,11 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
     it is refused.
     """
     before = tree(own.folder)
+    predictions = own.predict(nearer, "odd", training=text)
     with pytest.raises(LagbenchError):
-        own.submit(own.predict(nearer, "odd", training=text))
-    assert {path for path in tree(own.folder) if "odd" in path} <= before
+        own.submit(predictions)
+    left = {path for path in tree(own.folder) if "odd" in path}
+    assert left <= before
 
 
 @pytest.mark.usefixtures("unscored")
@@ -226,14 +246,16 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
     ],
 )
 def test_a_cost_of_predictions_that_no_entry_can_hold(
-    own: BoardBench, key: str, labels: dict[str, Any]
+    own: BoardBench, key: str, labels: Keys
 ) -> None:
     """Valid predictions may tell a cost beyond what the board takes: the key is named
     before the work.
     """
-    path = own.predict(
-        nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels}
-    )
+    good_labels = {
+        "device": "a laptop",
+        "seconds_per_frame": 0.25,
+    }
+    path = own.predict(nearer, "odd", **(good_labels | labels))
     with pytest.raises(ChecksFailedError) as caught:
         own.submit(path)
     assert f"{key}: " in str(caught.value.got)
@@ -243,17 +265,26 @@ def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     """All that is wrong with an entry is in one error: whoever mends it all can
     submit.
     """
-    keys = {"name": "NO\u0406SY", "urls": ("https://a.org/1", "https://a.org/2")}
-    mended = {"name": "Fine", "urls": (), "method": "fine"}
+    wrong = {
+        "name": "NO\u0406SY",
+        "urls": TWO_ADDRESSES,
+    }
+    mended = {
+        "name": "Fine",
+        "urls": (),
+        "method": "fine",
+    }
     alone = []
-    for key, value in keys.items():
+    for key, value in wrong.items():
         with pytest.raises(UsageError) as caught:
-            own.submit(predictions, **{**mended, key: value})
+            own.submit(predictions, **(mended | {key: value}))
         alone.append(caught.value.what)
     with pytest.raises(UsageError) as together:
-        own.submit(predictions, **keys)
-    assert all(what in str(together.value) for what in alone)
-    assert own.submit(predictions, **mended).method == "fine"
+        own.submit(predictions, **wrong)
+    for what in alone:
+        assert what in str(together.value)
+    result = own.submit(predictions, **mended)
+    assert result.method == "fine"
 
 
 @pytest.mark.usefixtures("unscored")
@@ -264,18 +295,19 @@ def test_files_that_do_not_belong_together(own: BoardBench) -> None:
     plain = own.predict(still, "plain")
     other = own.predict(noisy, "other")
     same = own.predict(still, "same", seed=4)
-    two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
-    odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
-    small, large = (
-        own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1)
-    )
+    one = own.predict(still, "one", seed=0)
+    another = own.predict(noisy, "another", seed=1)
+    odd_path = own.folder.parent / "odd.nc"
+    odd = own.data.submit(odd_path, still, "My Model!")
+    small = own.predict(still, "sized", seed=0, parameters=9)
+    large = own.predict(still, "sized", seed=1, parameters=10)
     for files, keys in (
         ((), {}),
         ((small, large), {}),
         ((plain, other), {"method": "both"}),
         ((same, same), {}),
         ((odd,), {}),
-        (two, {"method": "both"}),
+        ((one, another), {"method": "both"}),
     ):
         with pytest.raises(UsageError):
             own.submit(*files, **keys)
@@ -319,9 +351,11 @@ def test_an_interruption_is_found(
         with pytest.raises(KeyboardInterrupt):
             own.submit(predictions)
     left = "scores/cavity/tiny/my-model.nc"
-    assert own.state() == before | {left: own.state()[left]}
+    state = own.state()
+    assert state == before | {left: state[left]}
     result = check_board(own.folder, registry=own.registry, isolated=False)
-    assert [finding.check for finding in result.findings] == ["stray"]
+    checks = [finding.check for finding in result.findings]
+    assert checks == ["stray"]
     own.submit(predictions)
     assert well(own)
 
@@ -353,10 +387,13 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
     (folder / first).unlink()
     (folder / max(before)).write_bytes(b"something else")
     result = own.submit(predictions)
-    assert set(result.files) >= {folder / first, folder / max(before)}
-    assert {path.name for path in folder.iterdir()} == set(before)
+    last = max(before)
+    assert set(result.files) >= {folder / first, folder / last}
+    names = {path.name for path in folder.iterdir()}
+    assert names == set(before)
     for path in folder.iterdir():
-        assert read_score_file(path).scores.identity["method"] == path.stem
+        score_file = read_score_file(path)
+        assert score_file.scores.identity["method"] == path.stem
     assert well(own)
 
 
@@ -366,21 +403,27 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
     """
 
     def leaving(truth: Any, n: int, h: int) -> Any:
-        guess = np.array(nearer(truth, n, h))
-        guess[1:, :3, 0] += np.linspace(0.0, 3.0, h - 1)[:, None]
-        return guess
+        prediction = np.array(nearer(truth, n, h))
+        way_out = np.linspace(0.0, 3.0, h - 1)
+        prediction[1:, :3, 0] += way_out[:, None]
+        return prediction
 
     own.submit(own.predict(leaving, "leaving"))
-    told = read_entry(own.entry("leaving")).score.files[0].warnings
-    (warning,) = (one for one in told if one.name == "in_domain")
+    entry = read_entry(own.entry("leaving"))
+    warnings = {warning.name: warning for warning in entry.score.files[0].warnings}
+    warning = warnings["in_domain"]
     task = own.data.size.task
     size = own.data.size
     outside = 0
-    room = size.bounds[0][1] + 1.0 / size.grid
-    for scenario in size.subsets["test"]:
-        guess = leaving(motion(size, scenario), task.input_frames, task.horizon)
-        outside += int((guess.astype(np.float32)[..., 0] > room).sum())
-    count = len(size.subsets["test"]) * task.horizon * size.particles
+    _, high = size.bounds[0]
+    room = high + 1.0 / size.grid
+    scenarios = size.subsets["test"]
+    for scenario in scenarios:
+        truth = motion(size, scenario)
+        prediction = leaving(truth, task.input_frames, task.horizon)
+        x = prediction.astype(np.float32)[..., 0]
+        outside += int((x > room).sum())
+    count = len(scenarios) * task.horizon * size.particles
     assert 0.0 < outside < count
     assert warning.share == pytest.approx(outside / count, rel=1e-3)
 
@@ -399,7 +442,8 @@ def test_no_board_is_begun_by_mistake(
     assert "--new-board" in str(caught.value.fix)
     assert not board.exists()
     where["new_board"] = True
-    assert submitting.submit([predictions], meta, **where).board == board
+    result = submitting.submit([predictions], meta, **where)
+    assert result.board == board
     shutil.rmtree(board)
     (board / ".git").mkdir(parents=True)
     for name in ("README.md", "index.html"):
@@ -414,26 +458,37 @@ def test_no_board_is_begun_by_mistake(
         "index.html",
     ]
     (board / "index.html").unlink()
-    assert submitting.submit([predictions], meta, **where).board == board
+    result = submitting.submit([predictions], meta, **where)
+    assert result.board == board
 
 
 def test_what_is_not_given(own: BoardBench) -> None:
     """The date is today's in UTC; seeds timed on different machines have no cost."""
-    first = own.predict(nearer, "mixed", seed=0, device="one", seconds_per_frame=0.25)
-    second = own.predict(still, "mixed", seed=1, device="two", seconds_per_frame=0.25)
+    first = own.predict(
+        nearer,
+        "mixed",
+        seed=0,
+        device="one",
+        seconds_per_frame=0.25,
+    )
+    second = own.predict(
+        still,
+        "mixed",
+        seed=1,
+        device="two",
+        seconds_per_frame=0.25,
+    )
     own.submit(first, second, date=None)
     entry = read_entry(own.entry("mixed"))
     assert entry.cost is None
-    assert abs(
-        entry.date - datetime.datetime.now(datetime.UTC).date()
-    ) <= datetime.timedelta(days=1)
+    today = datetime.datetime.now(datetime.UTC).date()
+    assert abs(entry.date - today) <= datetime.timedelta(days=1)
 
 
 def rounds(few: int, many: int) -> Any:
     """Return a number of rounds for every run, and one for slow ones."""
-    return pytest.mark.parametrize(
-        "count", [few, pytest.param(many, marks=pytest.mark.slow)]
-    )
+    slow = pytest.param(many, marks=pytest.mark.slow)
+    return pytest.mark.parametrize("count", [few, slow])
 
 
 FORK = multiprocessing.get_context("fork")
@@ -470,9 +525,12 @@ def test_two_that_add_a_seed_at_once_lose_none(own: BoardBench, count: int) -> N
         name = f"twice-{number}"
         paths = []
         for seed in range(3):
-            paths.append(own.predict(shifted(3 * number + seed), name, seed=seed))
-        own.submit(paths[0], method=name)
-        codes = finish([begin(own, path, name, add=True) for path in paths[1:]])
+            step = 3 * number + seed
+            paths.append(own.predict(shifted(step), name, seed=seed))
+        first, *others = paths
+        own.submit(first, method=name)
+        processes = [begin(own, path, name, add=True) for path in others]
+        codes = finish(processes)
         entry = read_entry(own.entry(name))
         assert set(codes) <= {0, REFUSED}
         assert len(entry.seeds) == 3 - codes.count(REFUSED)
@@ -486,9 +544,11 @@ def test_two_that_submit_one_name_at_once(own: BoardBench, count: int) -> None:
         name = f"race-{number}"
         paths = []
         for side in (0, 1):
-            path = own.predict(shifted(50 + 2 * number + side), f"{name}-{side}")
+            step = 50 + 2 * number + side
+            path = own.predict(shifted(step), f"{name}-{side}")
             paths.append(path)
-        codes = finish([begin(own, path, name, add=False) for path in paths])
+        processes = [begin(own, path, name, add=False) for path in paths]
+        codes = finish(processes)
         assert sorted(codes) == [0, REFUSED]
     assert well(own)
 
@@ -498,7 +558,8 @@ def shifted(step: int) -> Any:
 
     def predict(truth: Any, n: int, h: int) -> Any:
         frame = np.arange(1, h + 1)[:, None, None]
-        return truth[n : n + h] + 1e-6 * (step + 1) * frame
+        shift = 1e-6 * (step + 1) * frame
+        return truth[n : n + h] + shift
 
     return predict
 
@@ -539,7 +600,11 @@ def test_a_journal_of_strangers_leads_nowhere(
     staging.mkdir()
     (staging / "bait").write_text("bad")
     content = {
-        "moves": [["bait", "../victim.nc"], ["bait", "/etc/x"], ["bait", "index.html"]],
+        "moves": [
+            ["bait", "../victim.nc"],
+            ["bait", "/etc/x"],
+            ["bait", "index.html"],
+        ],
         "removed": ["../victim.nc", "scores/../../victim.nc"],
     }
     (staging / "journal.json").write_text(json.dumps(content))
@@ -557,7 +622,8 @@ def test_the_next_submission_mends_thirty_kills(
     rng = np.random.Generator(np.random.PCG64(30))
     for number in range(30):
         name = f"killed-{number}"
-        process = begin(own, own.predict(shifted(1000 + number), name), name, add=False)
+        predictions = own.predict(shifted(1000 + number), name)
+        process = begin(own, predictions, name, add=False)
         time.sleep(rng.uniform(0.05, 1.5))
         process.kill()
         process.join()
@@ -567,11 +633,13 @@ def test_the_next_submission_mends_thirty_kills(
 
 def test_a_board_may_be_the_root_of_a_repository(own: BoardBench) -> None:
     """What git keeps there is passed over; other strays are named."""
-    (own.folder / ".git" / "objects").mkdir(parents=True)
-    (own.folder / ".git" / "objects" / "x").write_text("x")
+    objects = own.folder / ".git" / "objects"
+    objects.mkdir(parents=True)
+    (objects / "x").write_text("x")
     (own.folder / ".gitignore").write_text("*.tmp")
     assert well(own)
     (own.folder / "stray.txt").write_text("x")
-    (finding,) = check_board(own.folder, registry=own.registry, isolated=False).findings
+    result = check_board(own.folder, registry=own.registry, isolated=False)
+    (finding,) = result.findings
     assert finding.check == "folder"
     assert "stray.txt" in finding.where

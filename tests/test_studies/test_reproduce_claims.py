@@ -42,8 +42,19 @@ from studies.thesis.tables import (
     rollout_table,
 )
 
-FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
-EQUAL = [0.5] * 8  # scores of a model in eight scenarios
+FIRST = Claim(
+    question="",
+    first="supergat",
+    rivals=thesis.OPERATORS[1:],
+)
+
+
+def equal(score: float, count: int = 8) -> list[float]:
+    """Return the scores of a model that is as good in each of eight scenarios."""
+    return [score] * count
+
+
+EQUAL = equal(0.5)
 
 
 def six(**better: list[float]) -> SplitResults:
@@ -52,9 +63,15 @@ def six(**better: list[float]) -> SplitResults:
     return made_up_results(values | better)
 
 
+def two_models(*, gns: list[float], gat: list[float]) -> SplitResults:
+    """Return the results of two models with these scores."""
+    return made_up_results({"gns": gns, "gat": gat})
+
+
 def compare_errors(results: SplitResults, first: str, second: str) -> ComparedModels:
     """Return the comparison of two models by the error of their positions."""
-    (row,) = compare_models(results, first, [second], ["position_rmse"])
+    metrics = ["position_rmse"]
+    (row,) = compare_models(results, first, [second], metrics)
     return row
 
 
@@ -62,12 +79,15 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes
     first.
     """
-    results = made_up_results({"gns": [0.1] * 8, "gat": [0.2] * 8})
+    results = two_models(gns=equal(0.1), gat=equal(0.2))
     row = compare_errors(results, "gns", "gat")
-    assert row.means == pytest.approx((0.1, 0.2))
+    first_mean, second_mean = row.means
+    assert first_mean == pytest.approx(0.1)
+    assert second_mean == pytest.approx(0.2)
     assert row.win_count == 8
     assert row.seed_counts == (1, 1)
-    assert row.p == row.test.p == 2 / 2**8
+    assert row.p == 2 / 2**8
+    assert row.test.p == row.p
     assert row.verdict is Verdict.BETTER
     turned = compare_errors(results, "gat", "gns")
     assert turned.verdict is Verdict.WORSE
@@ -77,7 +97,7 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
 
 def test_directions_come_from_the_metrics_table() -> None:
     """A higher correlation is better; the values of one frame may be compared."""
-    results = made_up_results({"gns": [0.9] * 8, "gat": EQUAL})
+    results = two_models(gns=equal(0.9), gat=EQUAL)
     metrics = ["vorticity_pearson"]
     (row,) = compare_models(results, "gns", ["gat"], metrics, frame=54)
     assert row.verdict is Verdict.BETTER
@@ -89,11 +109,11 @@ def test_an_undecided_comparison_claims_nothing() -> None:
     """Mixed signs leave a question open; fewer than six scenarios give no p-value at
     all.
     """
-    results = made_up_results({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8})
+    results = two_models(gns=[0.1, 0.3] * 4, gat=equal(0.2))
     mixed = compare_errors(results, "gns", "gat")
     assert mixed.verdict is Verdict.OPEN
 
-    results = made_up_results({"gns": [0.1] * 5, "gat": [0.9] * 5})
+    results = two_models(gns=equal(0.1, 5), gat=equal(0.9, 5))
     few = compare_errors(results, "gns", "gat")
     assert few.verdict is Verdict.FEW
     assert math.isnan(few.p)
@@ -103,24 +123,32 @@ def test_first_place_takes_all_rivals() -> None:
     """Better than all five after correction (5 x 2 / 2^8 < 5 %): yes; a tie or a loss:
     counted.
     """
-    rows = claim_rows(FIRST, six(supergat=[0.1] * 8))
-    assert {row.second for row in rows} == set(FIRST.rivals)
+    rows = claim_rows(FIRST, six(supergat=equal(0.1)))
+    rivals = {row.second for row in rows}
+    assert rivals == set(FIRST.rivals)
     for row in rows:
         assert row.p == 5 * 2 / 2**8
     assert answer(rows) == "yes"
 
-    tied = claim_rows(FIRST, six(supergat=[0.1] * 8, gns=[0.05, 0.16] * 4))
+    as_good_in_half = [0.05, 0.16] * 4
+    results = six(supergat=equal(0.1), gns=as_good_in_half)
+    tied = claim_rows(FIRST, results)
     open_rivals = [row.second for row in tied if row.verdict is Verdict.OPEN]
     assert open_rivals == ["gns"]
     assert answer(tied) not in ("yes", "no")
 
-    last = claim_rows(FIRST, six(supergat=[0.9] * 8))
+    last = claim_rows(FIRST, six(supergat=equal(0.9)))
     for row in last:
         assert row.verdict is Verdict.WORSE
 
 
 @pytest.mark.parametrize(
-    ("without", "expected"), [(0.9, "yes"), (0.1, "no"), (0.5, "open")]
+    ("without", "expected"),
+    [
+        (0.9, "yes"),
+        (0.1, "no"),
+        (0.5, "open"),
+    ],
 )
 def test_a_loss_is_judged_by_the_model_without_it(
     without: float, expected: str
@@ -129,8 +157,9 @@ def test_a_loss_is_judged_by_the_model_without_it(
     metric first.
     """
     ablation = "gns-novorticity"
-    (claim,) = [claim for claim in CLAIMS if claim.rivals == (ablation,)]
-    results = made_up_results({"gns": EQUAL, ablation: [without] * 8})
+    claims = {claim.rivals: claim for claim in CLAIMS}
+    claim = claims[(ablation,)]
+    results = made_up_results({"gns": EQUAL, ablation: equal(without)})
     rows = claim_rows(claim, results)
     assert answer(rows) == expected
     assert rows[0].metric == results.ranking
@@ -144,10 +173,12 @@ def test_a_loss_is_judged_by_the_model_without_it(
 def test_seeds_that_only_one_has_do_not_count() -> None:
     """Two models are compared over common seeds; where there are none, over all."""
     results = made_up_results({})
-    results.methods["gns"] = a_method("gns", EQUAL, [99.0] * 8)
-    results.methods["gat"] = a_method("gat", [0.9] * 8)
+    results.methods["gns"] = a_method("gns", EQUAL, equal(99.0))
+    results.methods["gat"] = a_method("gat", equal(0.9))
     row = compare_errors(results, "gns", "gat")
-    assert row.means == pytest.approx((0.5, 0.9))
+    first_mean, second_mean = row.means
+    assert first_mean == pytest.approx(0.5)
+    assert second_mean == pytest.approx(0.9)
 
     (only,) = results.methods["gat"].trainings
     other_seed = replace(only, seed=7)
@@ -160,18 +191,20 @@ def test_skill_is_measured_from_the_best_naive_baseline() -> None:
     """Skill is 1 - score / score of the naive baseline of least error."""
     results = made_up_results(
         {
-            "gns": [0.1] * 8,
-            "gat": [0.9] * 8,
-            "persistence": [0.5] * 8,
-            "constant-velocity": [2.0] * 8,
+            "gns": equal(0.1),
+            "gat": equal(0.9),
+            "persistence": equal(0.5),
+            "constant-velocity": equal(2.0),
         }
     )
     assert results.best_naive == "persistence"
     assert results.skill("gns") == pytest.approx(0.8)
     assert results.skill("gat") == pytest.approx(-0.8)
     assert results.skill("persistence") == 0.0
-    rows = claim_rows(Claim(question="", first=""), results)
-    assert {row.second: row.verdict for row in rows} == {
+    best_naive_first = Claim(question="", first="")
+    rows = claim_rows(best_naive_first, results)
+    verdicts = {row.second: row.verdict for row in rows}
+    assert verdicts == {
         "gns": Verdict.WORSE,
         "gat": Verdict.BETTER,
     }
@@ -181,8 +214,8 @@ def test_skill_is_measured_from_the_best_naive_baseline() -> None:
     leaders = {row[2] for row in ahead.rows}
     assert results.ranking in metrics
     assert leaders <= set(results.references)
-    equal = made_up_results({"gns": EQUAL, "constant-velocity": EQUAL})
-    assert leading_references([equal]).rows == ()
+    tied = made_up_results({"gns": EQUAL, "constant-velocity": EQUAL})
+    assert leading_references([tied]).rows == ()
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])
@@ -250,9 +283,8 @@ def test_printed_errors_agree_with_each_other() -> None:
         assert row["rmse"] == pytest.approx(root, rel=4e-3)
         assert row["mae"] < row["rmse"]
     swapped = thesis.TABLE_4_7
-    (right,) = (
-        row for row in thesis.TABLE_4_8["fluid"] if row.scenario == swapped.scenario
-    )
+    rows = {row.scenario: row for row in thesis.TABLE_4_8["fluid"]}
+    right = rows[swapped.scenario]
     for name in ("mlp", "lstm-mlp"):
         i = thesis.FRAME_MODELS.index(name)
         assert right.average[i] == swapped.end[i]
@@ -271,16 +303,24 @@ def test_scenes_stand_for_their_own_kind() -> None:
                 assert scenario is not None
                 assert scenario % scene_count == row.scenario % scene_count
     cavity = registry.size("cavity", "mini")
-    assert scenario_of(cavity, 0) == min(cavity.subsets["test"])
+    first_test_scenario = min(cavity.subsets["test"])
+    assert scenario_of(cavity, 0) == first_test_scenario
     assert scenario_of(cavity, 1000) is None
 
 
-@pytest.mark.parametrize(("spin", "strain"), [(0.3, 0.0), (-0.2, 0.5)])
+@pytest.mark.parametrize(
+    ("spin", "strain"),
+    [
+        (0.3, 0.0),
+        (-0.2, 0.5),
+    ],
+)
 def test_interpolation_finds_the_vorticity_of_a_linear_flow(
     spin: float, strain: float
 ) -> None:
     """U = (s x - w y, w x - s y) has vorticity 2 w everywhere inside the hull."""
-    position = np.random.default_rng(1).random((200, 2))
+    rng = np.random.default_rng(1)
+    position = rng.random((200, 2))
     x, y = position.T
     u = strain * x - spin * y
     v = spin * x - strain * y
@@ -311,7 +351,8 @@ def test_errors_of_interpolated_fields() -> None:
     assert twice["kl"] == pytest.approx(0.0, abs=1e-9)
     reversed_errors = cubic_errors(truth, -truth)
     assert reversed_errors["pearson"] == pytest.approx(-1.0)
-    errors_of_rest = cubic_errors(truth, np.zeros((2, 2)))
+    at_rest = np.zeros((2, 2))
+    errors_of_rest = cubic_errors(truth, at_rest)
     assert math.isnan(errors_of_rest["pearson"])
 
 
@@ -333,7 +374,8 @@ def test_smoothing_is_a_centred_mean() -> None:
     """Each value is the mean of as many before it as after, fewer at both ends; lines
     stay lines.
     """
-    values = np.random.default_rng(2).random(60)
+    rng = np.random.default_rng(2)
+    values = rng.random(60)
     means = []
     for i in range(60):
         reach = min(SMOOTHED // 2, i, 59 - i)
@@ -348,16 +390,19 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
     results = SplitResults(Sources(board=None), "fluid", "full")
     ids = tuple(sorted(results.size.subsets["test"]))
-    values = np.arange(len(ids), dtype=float)
-    none = np.empty((len(ids), 0))
-    missing = (0,) * len(ids)
+    count = len(ids)
+    values = np.arange(float(count))
+    no_frames = np.empty((count, 0))
+    undefined = (0,) * count
     scores = {}
     for name in ("mse_avg", "mse_end"):
-        scores[name] = Score(METRICS[name], ids, (), none, values, missing)
+        metric = METRICS[name]
+        scores[name] = Score(metric, ids, (), no_frames, values, undefined)
     seed = ScoredTraining(seed=0, scores=scores, record={}, path=Path())
     results.methods["mlp"] = Method(name="mlp", trainings=(seed,))
     table = rollout_table(results, thesis.TABLE_4_8["fluid"])
-    circle = dict(zip(table.columns, table.rows[1], strict=True))
+    row = table.rows[1]
+    circle = dict(zip(table.columns, row, strict=True))
     assert circle["thesis's id"] == "26"
     assert circle["our id"] == "38"
     assert circle["average, MLP"] == f"{ids.index(38)} / 2.127"
@@ -367,18 +412,21 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
 @pytest.mark.parametrize("split", ["curl-noise", "fluid"])
 def test_skill_is_that_of_the_shipped_naive_scores(split: str) -> None:
     """Worked from the shipped JSON file and the committed score files alone."""
-    content = json.loads((FOLDER / f"{split}-mini.json").read_text())
+    path = FOLDER / f"{split}-mini.json"
+    content = json.loads(path.read_text())
     board = Path(__file__).parents[2] / "leaderboard"
     results = SplitResults(Sources(board=board), split, "mini")
     assert results.models
     naive_means = []
-    for name in NAIVE.intersection(content["floors"]):
-        values = content["floors"][name]["values"][results.ranking]
+    floors = content["floors"]
+    for name in NAIVE.intersection(floors):
+        values = floors[name]["values"][results.ranking]
         naive_means.append(np.mean(values))
     for name, method in results.models.items():
         seed_means = []
         for training in method.trainings:
             scores = read_statistics(training.path).scores()
             seed_means.append(scores[results.ranking].mean)
-        expected = 1.0 - np.mean(seed_means) / min(naive_means)
+        mean = np.mean(seed_means)
+        expected = 1.0 - mean / min(naive_means)
         assert results.skill(name) == pytest.approx(expected, abs=1e-4)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tracemalloc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ from lagbench.errors import (
 from lagbench.submission import PredictionsWriter, open_predictions, template, write
 
 SHAPE = (HORIZON, PARTICLES, 2)
-RIGHT = {i: truth(i) for i in TESTS}
+RIGHT = {scenario: truth(scenario) for scenario in TESTS}
 
 
 bench = small
@@ -73,16 +73,22 @@ FINITE = st.floats(-(2.0**99), 2.0**99, width=32)
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
-    values=hnp.arrays(np.float32, (len(TESTS), *SHAPE), elements=FINITE, fill=FINITE)
+    values=hnp.arrays(
+        np.float32,
+        (len(TESTS), *SHAPE),
+        elements=FINITE,
+        fill=FINITE,
+    )
 )
 def test_what_is_written_is_read(bench: Bench, values: np.ndarray) -> None:
     """Every finite float32 comes back bit by bit, from an array and from a mapping."""
-    for form in (values, dict(zip(TESTS, values, strict=True))):
+    by_scenario = dict(zip(TESTS, values, strict=True))
+    for form in (values, by_scenario):
         path = write(bench.folder / "round.nc", form, **options(bench))
         with open_predictions(path) as predictions:
-            for row, scenario in enumerate(TESTS):
-                got = predictions.frames(scenario, GIVEN, HORIZON)
-                assert_array_equal(got.view("u4"), values[row].view("u4"))
+            for scenario, expected in by_scenario.items():
+                frames = predictions.frames(scenario, GIVEN, HORIZON)
+                assert_array_equal(frames.view("u4"), expected.view("u4"))
 
 
 def test_the_template_is_the_last_given_frame_repeated(
@@ -93,8 +99,16 @@ def test_the_template_is_the_last_given_frame_repeated(
     Without the test scenarios the message has the command that makes them, and nothing
     is written.
     """
-    made: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
-    result = template("cavity", "tiny", output=bench.folder / "t.nc", **made)
+    location: dict[str, Any] = {
+        "root": bench.root,
+        "registry": bench.registry,
+    }
+    result = template(
+        "cavity",
+        "tiny",
+        output=bench.folder / "t.nc",
+        **location,
+    )
     assert result.scenarios == TESTS
     assert result.frames == (GIVEN, FRAMES - 1)
     assert result.particles == PARTICLES
@@ -102,30 +116,33 @@ def test_the_template_is_the_last_given_frame_repeated(
     with open_predictions(result.path) as predictions:
         assert predictions.header.method == "persistence"
         for scenario in TESTS:
-            last = np.broadcast_to(
-                frames_of(scenario, FRAMES, PARTICLES)[GIVEN - 1], SHAPE
-            )
-            assert_array_equal(predictions.frames(scenario, GIVEN, HORIZON), last)
+            input_frames = frames_of(scenario, FRAMES, PARTICLES)
+            last_given = input_frames[GIVEN - 1]
+            expected = np.broadcast_to(last_given, SHAPE)
+            frames = predictions.frames(scenario, GIVEN, HORIZON)
+            assert_array_equal(frames, expected)
     with h5py.File(result.path) as file:
         assert file["position"].chunks == (1, 1, PARTICLES, 2)
-    again = template("cavity", "tiny", output=bench.folder / "twice.nc", **made)
+    again = template(
+        "cavity",
+        "tiny",
+        output=bench.folder / "twice.nc",
+        **location,
+    )
     assert again.path.read_bytes() == result.path.read_bytes()
+    output = tmp_path / "t.nc"
+    location["root"] = tmp_path
     with pytest.raises(DataError) as caught:
-        template(
-            "cavity",
-            "tiny",
-            output=tmp_path / "t.nc",
-            **{**made, "root": tmp_path},
-        )
+        template("cavity", "tiny", output=output, **location)
     assert caught.value.where.endswith("cavity/tiny/v2/test")
-    assert not (tmp_path / "t.nc").exists()
+    assert not output.exists()
 
 
 def test_without_a_recorded_hash_one_must_be_given(
     unmeasured: Registry, tmp_path: Path
 ) -> None:
     """A split that nobody measured has no hash; a given one is stored."""
-    zeros = np.full((2, 20, 324, 2), 0.5)
+    halves = np.full((2, 20, 324, 2), 0.5)
     more: dict[str, Any] = {
         "split": "cavity",
         "size": "tiny",
@@ -133,11 +150,11 @@ def test_without_a_recorded_hash_one_must_be_given(
         "registry": unmeasured,
     }
     with pytest.raises(DataError) as caught:
-        write(tmp_path / "p.nc", zeros, root=tmp_path, **more)
+        write(tmp_path / "p.nc", halves, root=tmp_path, **more)
     assert caught.value.where == "cavity tiny"
     path = write(
         tmp_path / "p.nc",
-        zeros,
+        halves,
         root=tmp_path,
         dataset_sha256="ab" * 32,
         **more,
@@ -146,64 +163,89 @@ def test_without_a_recorded_hash_one_must_be_given(
         assert predictions.header.dataset_sha256 == "ab" * 32
 
 
-def _nan(values: np.ndarray) -> np.ndarray:
+Values = Any
+Labels = dict[str, Any]
+
+
+def changed(change: Callable[[np.ndarray], object]) -> Values:
+    """Return the truth of all scenarios, changed."""
+    return {scenario: change(values) for scenario, values in RIGHT.items()}
+
+
+def with_first(values: object) -> Values:
+    """Return the truth of all scenarios but the first."""
+    return RIGHT | {3: values}
+
+
+def with_nan(values: np.ndarray) -> np.ndarray:
+    """Return positions of which one is not a number."""
     values = values.copy()
     values[2, 5, 1] = np.nan
     return values
 
 
-@pytest.mark.parametrize(
-    ("values", "labels", "place"),
-    [
-        ({3: truth(3), 4: truth(4)}, {}, "refused.nc"),
-        ({**RIGHT, 9: truth(3)}, {}, "scenario 9"),
-        ({i: truth(i)[:5] for i in TESTS}, {}, "position of scenario 3"),
-        ({i: truth(i).swapaxes(1, 2) for i in TESTS}, {}, "position of scenario 3"),
-        ({i: _nan(truth(i)) for i in TESTS}, {}, "frame 5, particle 5"),
-        ({i: truth(i).astype("f8") * 1e300 for i in TESTS}, {}, "frame 3"),
-        *((np.zeros(shape), {}, "positions") for shape in ((2, *SHAPE), SHAPE)),
-        ({}, {"sed": 3}, "'sed'"),
-        *(({}, {"seed": odd}, "'seed'") for odd in ("three", True, 2**70)),
-        ({}, {"parameters": -5}, "'parameters'"),
-        *(
-            ({}, {"seconds_per_frame": odd}, "'seconds_per_frame'")
-            for odd in (10**400, -1, float("inf"))
-        ),
-        *(({}, {"device": odd}, "'device'") for odd in ("\udcff", "a\0b")),
-        ({}, {"training": "x" * 70_000}, "'training'"),
-        *(
-            ({}, {"method": name}, "'method'")
-            for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)
-        ),
-        *(({}, {"dataset_sha256": odd}, "dataset_sha256") for odd in ("zz", "", 5)),
-        # no arrays of numbers: nothing is dropped in silence
-        (RIGHT | {3: np.ma.masked_less(truth(3), 0.5)}, {}, "position of scenario 3"),
-        *(
-            (RIGHT | {3: truth(3).astype(kind)}, {}, "position of scenario 3")
-            for kind in (complex, str)
-        ),
-        (RIGHT | {3: [truth(3)[0], truth(3)[0, :2]]}, {}, "position of scenario 3"),
-        (RIGHT | {3: torch.ones(SHAPE, requires_grad=True)}, {}, "of scenario 3"),
-        # rows instead of ids
-        (RIGHT, {"diverged_at": {0: 10}}, "diverged_at"),
-        (RIGHT, {"velocities": RIGHT | {0: RIGHT[3]}}, "velocities"),
-        # velocities of some scenarios only
-        (RIGHT, {"velocities": {3: RIGHT[3]}}, "scenario 4"),
-        # a mark before motion that goes on, beyond the horizon, or in the given frames
-        *(
-            (RIGHT, {"diverged_at": {4: mark}}, "diverged_at of scenario 4")
-            for mark in (7, 100_000, GIVEN - 1, -5)
-        ),
-    ],
-)
-def test_wrong_arrays_and_labels_are_refused_and_leave_no_file(
-    bench: Bench,
-    values: Any,
-    labels: dict[str, Any],
-    place: str,
-) -> None:
-    """Missing, unknown, misshapen, no numbers: the error says where, what was expected
-    and how to mend it; no file is left.
+FIRST = truth(3)
+MASKED = np.ma.masked_less(FIRST, 0.5)
+RAGGED = [FIRST[0], FIRST[0, :2]]
+
+WRONG_VALUES: list[tuple[Values, str]] = [
+    ({3: FIRST, 4: truth(4)}, "refused.nc"),
+    (RIGHT | {9: FIRST}, "scenario 9"),
+    (changed(lambda values: values[:5]), "position of scenario 3"),
+    (changed(lambda values: values.swapaxes(1, 2)), "position of scenario 3"),
+    (changed(with_nan), "frame 5, particle 5"),
+    (changed(lambda values: values.astype("f8") * 1e300), "frame 3"),
+    (np.zeros((2, *SHAPE)), "positions"),
+    (np.zeros(SHAPE), "positions"),
+    # no arrays of numbers: nothing is dropped in silence
+    (with_first(MASKED), "position of scenario 3"),
+    (with_first(FIRST.astype(complex)), "position of scenario 3"),
+    (with_first(FIRST.astype(str)), "position of scenario 3"),
+    (with_first(RAGGED), "position of scenario 3"),
+    (with_first(torch.ones(SHAPE, requires_grad=True)), "of scenario 3"),
+]
+
+WRONG_LABELS: list[tuple[Labels, str]] = [
+    ({"sed": 3}, "'sed'"),
+    ({"seed": "three"}, "'seed'"),
+    ({"seed": True}, "'seed'"),
+    ({"seed": 2**70}, "'seed'"),
+    ({"parameters": -5}, "'parameters'"),
+    ({"seconds_per_frame": 10**400}, "'seconds_per_frame'"),
+    ({"seconds_per_frame": -1}, "'seconds_per_frame'"),
+    ({"seconds_per_frame": float("inf")}, "'seconds_per_frame'"),
+    ({"device": "\udcff"}, "'device'"),
+    ({"device": "a\0b"}, "'device'"),
+    ({"training": "x" * 70_000}, "'training'"),
+    ({"method": ""}, "'method'"),
+    ({"method": " "}, "'method'"),
+    ({"method": "a\x07"}, "'method'"),
+    ({"method": "\udcff"}, "'method'"),
+    ({"method": "x" * 201}, "'method'"),
+    ({"method": None}, "'method'"),
+    ({"dataset_sha256": "zz"}, "dataset_sha256"),
+    ({"dataset_sha256": ""}, "dataset_sha256"),
+    ({"dataset_sha256": 5}, "dataset_sha256"),
+]
+
+WRONG_COMPANIONS: list[tuple[Labels, str]] = [
+    # rows instead of ids
+    ({"diverged_at": {0: 10}}, "diverged_at"),
+    ({"velocities": RIGHT | {0: RIGHT[3]}}, "velocities"),
+    # velocities of some scenarios only
+    ({"velocities": {3: RIGHT[3]}}, "scenario 4"),
+    # a mark before motion that goes on, beyond the horizon, or in the given frames
+    ({"diverged_at": {4: 7}}, "diverged_at of scenario 4"),
+    ({"diverged_at": {4: 100_000}}, "diverged_at of scenario 4"),
+    ({"diverged_at": {4: GIVEN - 1}}, "diverged_at of scenario 4"),
+    ({"diverged_at": {4: -5}}, "diverged_at of scenario 4"),
+]
+
+
+def assert_refused(bench: Bench, place: str, values: Values, **labels: Any) -> None:
+    """Assert that an error says where, what was expected and how to mend it.
+
+    No file is left.
     """
     before = sorted(bench.folder.iterdir())
     with pytest.raises(UsageError) as caught:
@@ -214,17 +256,38 @@ def test_wrong_arrays_and_labels_are_refused_and_leave_no_file(
     assert sorted(bench.folder.iterdir()) == before
 
 
+@pytest.mark.parametrize(("values", "place"), WRONG_VALUES)
+def test_wrong_arrays_are_refused(bench: Bench, values: Values, place: str) -> None:
+    """Missing, unknown, misshapen, no numbers."""
+    assert_refused(bench, place, values)
+
+
+@pytest.mark.parametrize(("labels", "place"), WRONG_LABELS)
+def test_wrong_labels_are_refused(bench: Bench, labels: Labels, place: str) -> None:
+    """They are refused before values are looked at, here none."""
+    assert_refused(bench, place, {}, **labels)
+
+
+@pytest.mark.parametrize(("companions", "place"), WRONG_COMPANIONS)
+def test_marks_and_velocities_that_do_not_fit_are_refused(
+    bench: Bench, companions: Labels, place: str
+) -> None:
+    """Beside right positions."""
+    assert_refused(bench, place, RIGHT, **companions)
+
+
 def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     """Velocities are not read by the scorer but are there for others; diverged_at comes
     back by id.
     """
     values = RIGHT | {5: frozen(truth(5), 7)}
-    more = options(
-        bench, velocities={i: -v for i, v in values.items()}, diverged_at={5: 7}
-    )
+    velocities = {scenario: -positions for scenario, positions in values.items()}
+    more = options(bench, velocities=velocities, diverged_at={5: 7})
     path = write(bench.folder / "v.nc", values, **more)
     with h5py.File(path) as file:
-        assert_array_equal(file["velocity"][...], -file["position"][...])
+        velocity = file["velocity"][...]
+        position = file["position"][...]
+    assert_array_equal(velocity, -position)
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
@@ -245,7 +308,8 @@ def test_a_full_disk_is_said(
     """Wherever the disk fills up, that is said and nothing is left, whatever the values
     lack.
     """
-    values = RIGHT if whole else {TESTS[0]: RIGHT[TESTS[0]]}
+    first = TESTS[0]
+    values = RIGHT if whole else {first: RIGHT[first]}
     with largest_file(size), pytest.raises(WorkFailedError) as caught:
         write(tmp_path / "p.nc", values, **options(bench))
     assert "--output" in str(caught.value.fix)
@@ -281,7 +345,7 @@ def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
     path = bench.folder / "again.nc"
     writer = PredictionsWriter(path, **options(bench))
     with pytest.raises(UsageError):
-        writer.add(TESTS[0], truth(TESTS[0]))
+        writer.add(3, truth(3))
 
     def attempt(scenarios: Sequence[int], then: object = None) -> None:
         with writer:
@@ -311,14 +375,21 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
     No such scenario, before the first, beyond the last, fewer than none: that is told.
     """
     with open_predictions(bench.valid) as predictions:
-        got = predictions.frames(4, 5, 3)
+        three_frames = predictions.frames(4, 5, 3)
         header = predictions.header
-        for place in ((9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)):
+        for place in (
+            (9, 3, 1),
+            (3, 2, 1),
+            (3, 3, 9),
+            (3, 11, 1),
+            (3, 3, -1),
+        ):
             with pytest.raises(UsageError) as caught:
                 predictions.frames(*place)
             assert caught.value.where.endswith("valid.nc")
-    assert got.dtype == np.float32
-    assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
+    assert three_frames.dtype == np.float32
+    from_frame_5 = truth(4)[5 - GIVEN :]
+    assert_array_equal(three_frames, from_frame_5[:3])
     assert header.split == "cavity"
     assert header.size == "tiny"
     assert header.method == "truth"
@@ -333,28 +404,36 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
 def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:
     """A reordered file is valid, reads the same and has the same content hash."""
     path = rows(bench, "reordered", [5, 3, 4], ALL, [2, 0, 1])
-    assert bench.validate(path).passed == bench.validate(bench.valid).passed
+    passed = bench.validate(path).passed
+    assert passed == bench.validate(bench.valid).passed
     with open_predictions(path) as shuffled, open_predictions(bench.valid) as plain:
         assert shuffled.header.scenarios == (5, 3, 4)
         for scenario in TESTS:
-            assert_array_equal(
-                *(f.frames(scenario, GIVEN, HORIZON) for f in (shuffled, plain))
-            )
+            frames = shuffled.frames(scenario, GIVEN, HORIZON)
+            expected = plain.frames(scenario, GIVEN, HORIZON)
+            assert_array_equal(frames, expected)
         assert shuffled.content_sha256() == plain.content_sha256()
 
 
+ONE_FRAME = (1, 1, PARTICLES, 2)
 PACKINGS: dict[str, dict[str, Any]] = {
     "contiguous": {},
     "big_endian": {"dtype": ">f4"},
-    "one_chunk": {"chunks": (3, 8, PARTICLES, 2), "compression": 9},
+    "one_chunk": {
+        "chunks": (3, 8, PARTICLES, 2),
+        "compression": 9,
+    },
     "chunks_over_scenarios": {
         "chunks": (2, 3, 7, 1),
         "compression": 1,
         "shuffle": True,
     },
-    "checksummed": {"chunks": (1, 1, PARTICLES, 2), "fletcher32": True},
+    "checksummed": {
+        "chunks": ONE_FRAME,
+        "fletcher32": True,
+    },
     "unlimited": {
-        "chunks": (1, 1, PARTICLES, 2),
+        "chunks": ONE_FRAME,
         "maxshape": (None, None, PARTICLES, 2),
     },
 }
@@ -374,9 +453,9 @@ def test_packing_does_not_matter(bench: Bench, name: str) -> None:
         file.attrs["lagbench_format"] = np.int64(1)
     assert not bench.validate(path).findings
     with open_predictions(path) as packed, open_predictions(bench.valid) as plain:
-        got = packed.frames(3, GIVEN, HORIZON)
-        assert got.dtype.isnative
-        assert_array_equal(got, truth(3))
+        frames = packed.frames(3, GIVEN, HORIZON)
+        assert frames.dtype.isnative
+        assert_array_equal(frames, truth(3))
         assert packed.content_sha256() == plain.content_sha256()
 
 
@@ -393,70 +472,73 @@ def test_files_of_xarray_and_links_to_files_are_read(bench: Bench) -> None:
 def test_the_content_hash_is_that_of_the_document(bench: Bench) -> None:
     """Computed by hashlib and json alone, as docs/predictions.md says."""
 
-    def spelt(value: object) -> bytes:
-        return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+    def canonical_json(value: object) -> bytes:
+        text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+        return text.encode()
 
-    values = np.stack([truth(i) for i in TESTS]).astype("<f4")
+    values = np.stack(list(RIGHT.values())).astype("<f4")
     header = {
         "dims": list(DIMS),
         "dtype": "float32",
         "name": "position",
+        "shape": list(values.shape),
     }
-    variable = hashlib.sha256(
-        spelt({**header, "shape": list(values.shape)}) + b"\n" + values.tobytes()
-    )
+    variable = canonical_json(header) + b"\n" + values.tobytes()
+    variable_sha256 = hashlib.sha256(variable).hexdigest()
     with open_predictions(bench.valid) as predictions:
-        got = predictions.content_sha256()
-        head = predictions.header
-    whole = {
-        "dataset_sha256": head.dataset_sha256,
+        actual = predictions.content_sha256()
+        dataset_sha256 = predictions.header.dataset_sha256
+    identity = {
+        "dataset_sha256": dataset_sha256,
         "dataset_version": "2.2.0",
         "method": "truth",
-    }
-    whole |= {
         "split": "cavity",
         "size": "tiny",
         "scenarios": list(TESTS),
         "frames": ALL,
+        "variables": {"position": variable_sha256},
     }
-    whole |= {"variables": {"position": variable.hexdigest()}}
-    assert got == hashlib.sha256(spelt(whole)).hexdigest()
+    whole = canonical_json(identity)
+    assert actual == hashlib.sha256(whole).hexdigest()
 
 
 def test_blocks_cover_a_scenario_in_order_and_in_bounded_memory(tmp_path: Path) -> None:
     """A scenario of 96 MB in pieces of 1 MiB, read in less than 20 MB."""
     path = tmp_path / "large.nc"
-    frames = 120
-    particles = 100_000
+    frame_count = 120
+    particle_count = 100_000
+    frame_numbers = np.arange(frame_count, dtype="f4")
     values = np.broadcast_to(
-        np.arange(frames, dtype="f4")[:, None, None], (1, frames, particles, 2)
+        frame_numbers[:, None, None],
+        (1, frame_count, particle_count, 2),
     )
-    named = {
+    attributes = {
         "lagbench_format": 1,
         "split": "a",
         "size": "b",
         "method": "c",
-    }
-    attributes = {
-        **named,
         "dataset_version": "1.0.0",
         "dataset_sha256": "d",
     }
-    coordinates = {"scenario": [1], "frame": np.arange(2, 2 + frames)}
-    whole = xr.Dataset({"position": (DIMS, values)}, coordinates, attributes)
-    whole.to_netcdf(path, encoding={"position": {"chunksizes": (1, 1, particles, 2)}})
+    coordinates = {
+        "scenario": [1],
+        "frame": np.arange(2, 2 + frame_count),
+    }
+    data = xr.Dataset({"position": (DIMS, values)}, coordinates, attributes)
+    chunks = (1, 1, particle_count, 2)
+    data.to_netcdf(path, encoding={"position": {"chunksizes": chunks}})
     tracemalloc.start()
-    seen: list[int] = []
+    frames_read = 0
     with open_predictions(path) as predictions:
         for first, block in predictions.blocks(1):
-            assert (
-                block[:, 0, 0] == np.arange(len(seen), len(seen) + len(block))
-            ).all()
-            assert first == 2 + len(seen)
-            seen += [first] * len(block)
-    peak = tracemalloc.get_traced_memory()[1]
+            block_end = frames_read + len(block)
+            expected = frame_numbers[frames_read:block_end]
+            assert_array_equal(block[:, 0, 0], expected)
+            assert first == 2 + frames_read
+            frames_read = block_end
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(seen) == frames
+    assert frames_read == frame_count
     assert peak < 20e6
 
 
@@ -471,10 +553,10 @@ LAYOUTS = (
 @pytest.mark.parametrize("name", ["fifo", "truncated_half", "netcdf3", *LAYOUTS])
 def test_opening_what_is_unreadable_raises(bench: Bench, name: str) -> None:
     """Exit code 3; of another layout exit code 1, naming the check."""
-    kind, words = (
-        (ChecksFailedError, FAULTS[name].check)
-        if name in LAYOUTS
-        else (UnreadableFileError, None)
-    )
+    kind: type[Exception] = UnreadableFileError
+    words = None
+    if name in LAYOUTS:
+        kind = ChecksFailedError
+        words = FAULTS[name].check
     with pytest.raises(kind, match=words):
         open_predictions(FAULTS[name].make(bench))
