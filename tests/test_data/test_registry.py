@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from lagbench.data import registry
 from lagbench.data.box import Box
 from lagbench.data.limits import NEEDED, SUBSETS, Limit
-from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.generators.batch import draw_initial_state
@@ -53,33 +53,46 @@ def test_full_sizes_are_those_of_the_documentation(
     frame_count = 0
     scenario_counts = []
     for name in ("train", "valid", "test"):
-        ids = full.subsets[name]
-        scenario_counts.append(len(ids))
-        frame_count += sum(full.frame_count(scenario) for scenario in ids)
-    numbers = (full.particles, full.grid, full.substeps_per_frame, frame_count)
-    assert (*numbers, *scenario_counts) == expected
+        scenarios = full.subsets[name]
+        scenario_counts.append(len(scenarios))
+        frame_count += sum(map(full.frame_count, scenarios))
+    numbers = (
+        full.particles,
+        full.grid,
+        full.substeps_per_frame,
+        frame_count,
+        *scenario_counts,
+    )
+    assert numbers == expected
     assert full.frame_interval == pytest.approx(interval, rel=1e-15)
-    assert full.dt == pytest.approx(interval / full.substeps_per_frame, rel=1e-15)
+    substep = interval / full.substeps_per_frame
+    assert full.dt == pytest.approx(substep, rel=1e-15)
+
+
+def run_of_ids(first: int, last: int) -> tuple[int, ...]:
+    """Return consecutive ids of scenarios."""
+    return tuple(range(first, last + 1))
 
 
 def test_subsets_are_runs_of_ids() -> None:
     """The subset extra and the long scenarios of fluid are the documented ones."""
     registry = load()
     fluid = registry.size("fluid", "full")
-    assert fluid.subsets["test"] == tuple(range(36, 52))
-    assert fluid.subsets["valid"] == tuple(range(28, 36))
+    assert fluid.subsets["test"] == run_of_ids(36, 51)
+    assert fluid.subsets["valid"] == run_of_ids(28, 35)
     assert fluid.frame_count(0) == 600
     assert fluid.frame_count(26) == 600
 
     multimaterial = registry.size("multimaterial", "full")
     extra = multimaterial.subsets["extra"]
-    assert extra == tuple(range(72, 87))
-    assert {multimaterial.frame_count(scenario) for scenario in extra} == {1200}
+    assert extra == run_of_ids(72, 86)
+    frame_counts = {multimaterial.frame_count(scenario) for scenario in extra}
+    assert frame_counts == {1200}
 
     cavity = registry.size("cavity", "full")
-    assert cavity.subsets["test"] == tuple(range(56, 76))
+    assert cavity.subsets["test"] == run_of_ids(56, 75)
     noise = registry.size("curl-noise", "full")
-    assert noise.subsets["test"] == tuple(range(56, 72))
+    assert noise.subsets["test"] == run_of_ids(56, 71)
 
 
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
@@ -91,20 +104,27 @@ def test_every_size_is_consistent(split: str, size: str) -> None:
     entry = load().size(split, size)
     task = entry.task
     last = task.input_frames + task.horizon - 1
-    assert all(entry.frame_count(i) > last for i in entry.subsets["test"])
-    assert all(task.input_frames <= frame <= last for frame in task.frames_of_interest)
-    assert all(0.0 < low < high < 1.0 for low, high in entry.bounds)
-    assert all(
-        low + high == pytest.approx(1.0, abs=1e-12) for low, high in entry.bounds
-    )
+    for scenario in entry.subsets["test"]:
+        assert entry.frame_count(scenario) > last
+    for frame in task.frames_of_interest:
+        assert task.input_frames <= frame <= last
+    for low, high in entry.bounds:
+        assert 0.0 < low < high < 1.0
+        assert low + high == pytest.approx(1.0, abs=1e-12)
     assert set(entry.subsets) <= set(SUBSETS)
-    assert entry.scenarios == tuple(
-        sorted({i for ids in entry.subsets.values() for i in ids})
-    )
-    assert all(
-        p.unit and p.description and p.value is not None
-        for p in entry.parameters.values()
-    )
+    all_scenarios = set().union(*entry.subsets.values())
+    assert entry.scenarios == tuple(sorted(all_scenarios))
+    for parameter in entry.parameters.values():
+        assert parameter.unit
+        assert parameter.description
+        assert parameter.value is not None
+
+
+def particles_per_cell(size: Size) -> float:
+    """Return how many particles a cell between the walls has."""
+    low, high = size.bounds[0]
+    cells = (high - low) * size.grid
+    return size.particles / cells**2
 
 
 @pytest.mark.parametrize("split", SPLITS)
@@ -112,23 +132,22 @@ def test_mini_and_tiny_are_small_relatives(split: str) -> None:
     """As many particles per cell, the same frame interval, substeps as cells; tiny for
     tests.
     """
-    full, mini, tiny = (load().size(split, size) for size in ("full", "mini", "tiny"))
-    inside = [
-        (size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)
-    ]
+    registry = load()
+    full = registry.size(split, "full")
+    mini = registry.size(split, "mini")
+    tiny = registry.size(split, "tiny")
     if split in ("cavity", "curl-noise"):
-        per_cell = [
-            size.particles / cells**2
-            for size, cells in zip((full, mini), inside, strict=True)
-        ]
-        assert per_cell[1] == pytest.approx(per_cell[0], rel=0.06)
+        expected = particles_per_cell(full)
+        assert particles_per_cell(mini) == pytest.approx(expected, rel=0.06)
     else:
         assert mini.particles == full.particles / 4
-    assert mini.frame_interval == tiny.frame_interval == full.frame_interval
-    assert mini.substeps_per_frame / mini.grid == full.substeps_per_frame / full.grid
+    assert mini.frame_interval == full.frame_interval
+    assert tiny.frame_interval == full.frame_interval
+    substeps_per_cell = full.substeps_per_frame / full.grid
+    assert mini.substeps_per_frame / mini.grid == substeps_per_cell
     assert 256 <= tiny.particles <= 640
     assert len(mini.subsets["train"]) == 24
-    assert mini.scenarios == tuple(range(len(mini.scenarios)))
+    assert mini.scenarios == run_of_ids(0, len(mini.scenarios) - 1)
 
 
 Change = Callable[[dict[str, Any]], object]
@@ -158,8 +177,9 @@ def within(*below: str, **values: object) -> Change:
         for key in below:
             entry = entry[key]
         entry.update(values)
-        for key in [key for key, value in values.items() if value is None]:
-            del entry[key]
+        for key, value in values.items():
+            if value is None:
+                del entry[key]
 
     return change
 
@@ -177,19 +197,23 @@ def test_unknown_names_offer_the_nearest() -> None:
     with pytest.raises(UsageError) as caught:
         load().size("fluid", "ful")
     assert caught.value.where == "--size"
+    fluid = load().size("fluid", "full")
     with pytest.raises(UsageError) as caught:
-        load().size("fluid", "full").value("liqid_modulus")
+        fluid.value("liqid_modulus")
     assert caught.value.where == "datasets.yaml, fluid full"
+    multimaterial = load().size("multimaterial", "full")
     with pytest.raises(UsageError) as caught:
-        load().size("multimaterial", "full").subset_of(95)
+        multimaterial.subset_of(95)
     assert caught.value.where == "multimaterial full"
 
 
 def test_a_box_has_walls_unless_axes_are_periodic(tmp_path: Path) -> None:
-    assert load().size("cavity", "full").box.walls == ("left", "right", "bottom", "top")
-    path = edited(tmp_path, cavity(periodic=["y"], bounds=[[0.1, 0.9], [0.0, 1.0]]))
+    walled = load().size("cavity", "full")
+    assert walled.box.walls == ("left", "right", "bottom", "top")
+    bounds = [[0.1, 0.9], [0.0, 1.0]]
+    path = edited(tmp_path, cavity(periodic=["y"], bounds=bounds))
     size = load(path).size("cavity", "full")
-    assert size.box == Box.from_bounds([(0.1, 0.9), (0.0, 1.0)], [False, True])
+    assert size.box == Box.from_bounds(bounds, [False, True])
     assert size.field_grid.box == size.box
 
 
@@ -204,10 +228,13 @@ def test_a_registry_of_ones_own(
     ours = set(load(default_path()).splits)
     path = edited(tmp_path, lambda splits: splits.pop("fluid"))
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
-    assert set(load().splits) == ours - {"fluid"}
+    without_fluid = load()
+    assert set(without_fluid.splits) == ours - {"fluid"}
     edited(tmp_path, lambda splits: splits.pop("cavity"))
-    assert set(load().splits) == ours - {"cavity"}
-    monkeypatch.setenv("LAGBENCH_REGISTRY", str(tmp_path / "none.yaml"))
+    without_cavity = load()
+    assert set(without_cavity.splits) == ours - {"cavity"}
+    none = tmp_path / "none.yaml"
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(none))
     with pytest.raises(UnreadableFileError) as caught:
         load()
     assert caught.value.where.endswith("none.yaml")
@@ -220,23 +247,33 @@ def renamed(split: str, old: str, new: str) -> Change:
 
     def change(splits: dict[str, Any]) -> None:
         entry = splits[split]
-        for mapping in (
-            entry["parameters"],
-            *(s["parameters"] for s in entry["sizes"].values()),
-        ):
+        mappings = [entry["parameters"]]
+        for size in entry["sizes"].values():
+            mappings.append(size["parameters"])
+        for mapping in mappings:
             if old in mapping:
                 mapping[new] = mapping.pop(old)
 
     return change
 
 
-def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> None:
+Parts = tuple[str, ...]
+
+
+def refused(path: Path, parts: Parts, call: Callable[[], object]) -> None:
     """Assert that a call names file and parts, exit code 3."""
     with pytest.raises(UnreadableFileError) as caught:
         call()
     text = str(caught.value)
     assert caught.value.exit_code == 3
-    assert all(part in text for part in (str(path), *parts)), text
+    for part in (str(path), *parts):
+        assert part in text
+
+
+def lead_out(splits: dict[str, Any]) -> None:
+    """Name a size like a folder above."""
+    sizes = splits["cavity"]["sizes"]
+    sizes["../x"] = sizes.pop("tiny")
 
 
 @pytest.mark.parametrize(
@@ -255,12 +292,7 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
         (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
         (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),
         (within("cavity", version="1.0"), ("cavity.version", "match pattern")),
-        (
-            lambda splits: splits["cavity"]["sizes"].update(
-                {"../x": dict(splits["cavity"]["sizes"].pop("tiny"))}
-            ),
-            ("cavity.sizes", "../x", "match pattern"),
-        ),
+        (lead_out, ("cavity.sizes", "../x", "match pattern")),
         (
             tiny(substeps_per_frame="many"),
             ("tiny.parameters.substeps_per_frame", ">= 1", "'many'"),
@@ -313,7 +345,7 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
     ],
 )
 def test_mistakes_are_named_on_load(
-    change: Change, parts: tuple[str, ...], tmp_path: Path
+    change: Change, parts: Parts, tmp_path: Path
 ) -> None:
     """An unknown key or a value that cannot be: file, key, what is expected, what was
     got.
@@ -345,29 +377,26 @@ def test_mistakes_are_named_on_load(
     ],
 )
 def test_a_solver_that_cannot_be_fed_is_refused_before_work(
-    change: Change, parts: tuple[str, ...], tmp_path: Path
+    change: Change, parts: Parts, tmp_path: Path
 ) -> None:
     """By ``generate``, dry or not, and by ``verify --regenerate``; nothing is
     written.
     """
     path = edited(tmp_path, change)
     root = tmp_path / "data"
-    options = {"root": root, "registry": load(path), "workers": 1}
-    for dry_run in (True, False):
-        refused(
-            path,
-            parts,
-            lambda dry_run=dry_run: generate(
-                "fluid",
-                "tiny",
-                dry_run=dry_run,
-                **options,
-            ),
-        )
-    assert [
-        p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")
-    ] == []
-    refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
+    options: dict[str, Any] = {
+        "root": root,
+        "registry": load(path),
+        "workers": 1,
+    }
+    plan = partial(generate, "fluid", "tiny", dry_run=True, **options)
+    refused(path, parts, plan)
+    simulate = partial(generate, "fluid", "tiny", **options)
+    refused(path, parts, simulate)
+    for file in root.rglob("*"):
+        assert file.is_dir() or file.name.startswith(".lock")
+    regenerate = partial(verify, "fluid", "tiny", regenerate=1, **options)
+    refused(path, parts, regenerate)
 
 
 UNUSABLE = always("area_min", value="big")
@@ -385,20 +414,26 @@ UNUSABLE_PARTS = ("size tiny", "generators.fluid can use", "area_min = 'big'")
     ],
 )
 def test_a_scenario_that_cannot_be_drawn_is_refused(
-    change: Change, parts: tuple[str, ...], tmp_path: Path
+    change: Change, parts: Parts, tmp_path: Path
 ) -> None:
     path = edited(tmp_path, change)
     size = load(path).size("fluid", "tiny")
-    refused(path, parts, lambda: draw_initial_state(size, 0))
+    draw = partial(draw_initial_state, size, 0)
+    refused(path, parts, draw)
 
 
 def test_a_worker_refuses_a_scenario_that_cannot_be_drawn(tmp_path: Path) -> None:
     """Planning draws nothing, so a dry run passes; no file is left."""
     path = edited(tmp_path, UNUSABLE)
     root = tmp_path / "data"
-    options = {"root": root, "registry": load(path), "workers": 1}
+    options: dict[str, Any] = {
+        "root": root,
+        "registry": load(path),
+        "workers": 1,
+    }
     generate("fluid", "tiny", dry_run=True, **options)
-    refused(path, UNUSABLE_PARTS, lambda: generate("fluid", "tiny", **options))
+    simulate = partial(generate, "fluid", "tiny", **options)
+    refused(path, UNUSABLE_PARTS, simulate)
     assert not list(root.rglob("*.nc"))
     assert not list(root.rglob("manifest.json"))
 
@@ -407,23 +442,28 @@ def test_our_own_values_hold_with_room() -> None:
     """Every number of ours lies within its limit, at every size, or the limits are
     wrong.
     """
-    for split, entry in load().splits.items():
+    registry = load()
+    all_limits = {**LIMITS, **NEEDED}
+    for split, entry in registry.splits.items():
         for name in entry.sizes:
-            size = load().size(split, name)
-            for parameter, limit in {**LIMITS, **NEEDED}.items():
+            size = registry.size(split, name)
+            for parameter, limit in all_limits.items():
                 if parameter in size.parameters:
-                    assert limit.holds(size.value(parameter)), (split, name, parameter)
+                    value = size.value(parameter)
+                    assert limit.holds(value), (split, name, parameter)
 
 
 @given(st.one_of(st.integers(), st.floats(), st.booleans(), st.text()))
-def test_limits_agree_with_their_words(value: object) -> None:
+def test_limits_agree_with_their_words(value: Any) -> None:
     """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the
     type.
     """
+    is_integer = type(value) is int
+    is_number = type(value) in (int, float)
     whole = Limit(low=-2, high=5, whole=True, open_high=True)
-    assert whole.holds(value) == (type(value) is int and value in range(-2, 5))
+    assert whole.holds(value) == (is_integer and -2 <= value < 5)
     real = Limit(low=0.0, open_low=True)
-    assert real.holds(value) == (type(value) in (int, float) and 0 < value < math.inf)  # type: ignore[operator]
+    assert real.holds(value) == (is_number and 0 < value < math.inf)
     assert str(whole) == "an integer, >= -2 and < 5"
     assert str(real) == "a finite number, > 0"
 
@@ -440,12 +480,13 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
     monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
 
     def plug(**sources: str) -> Registry:
-        points = [EntryPoint("cavity", "lagbench.generators.cavity", registry.GROUP)]
+        own = EntryPoint("cavity", "lagbench.generators.cavity", registry.GROUP)
+        points = [own]
         for name, source in sources.items():
-            (tmp_path / f"{name}_split.py").write_text(source)
-            points += 2 * [
-                EntryPoint(name, f"{name}_split", registry.GROUP)
-            ]  # found on two paths
+            module = f"{name}_split"
+            (tmp_path / f"{module}.py").write_text(source)
+            point = EntryPoint(name, module, registry.GROUP)
+            points += [point, point]  # found on two paths
         monkeypatch.setattr(registry, "list_entry_points", lambda group: points)
         registry._load.cache_clear()
         return load()
@@ -459,20 +500,26 @@ def theirs(tmp_path: Path) -> str:
     """A datasets.yaml of a split of one's own that also rewrites the cavity and its
     hash.
     """
-    data = copy.deepcopy(our_registry())
-    splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
+    ours = copy.deepcopy(our_registry())["splits"]
+    splits = {
+        "sloshing": ours["fluid"],
+        "cavity": ours["cavity"],
+    }
     splits["cavity"]["title"] = "Hijacked"
-    nothing = {
+    measured = {
+        "dataset_sha256": "0" * 64,
         "subset_sha256": {},
         "scenario_sha256": {},
         "statistics": {},
         "twin_floor": [],
     }
-    measured = {"cavity": {"tiny": {"dataset_sha256": "0" * 64, **nothing}}}
+    content = {
+        "format": 1,
+        "splits": splits,
+        "measured": {"cavity": {"tiny": measured}},
+    }
     path = tmp_path / "theirs.yaml"
-    path.write_text(
-        yaml.safe_dump({"format": 1, "splits": splits, "measured": measured})
-    )
+    path.write_text(yaml.safe_dump(content))
     return str(path)
 
 
@@ -481,11 +528,11 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     ours.
     """
     before = load(default_path())
-    found = plugged(sloshing=f"REGISTRY = {theirs!r}")
-    assert set(found.splits) == {*before.splits, "sloshing"}
-    assert found.size("sloshing", "tiny").particles == 256
-    assert found.size("cavity", "tiny") == before.size("cavity", "tiny")
-    assert found.split("cavity") == before.split("cavity")
+    after = plugged(sloshing=f"REGISTRY = {theirs!r}")
+    assert set(after.splits) == {*before.splits, "sloshing"}
+    assert after.size("sloshing", "tiny").particles == 256
+    assert after.size("cavity", "tiny") == before.size("cavity", "tiny")
+    assert after.split("cavity") == before.split("cavity")
 
 
 @pytest.mark.parametrize(
@@ -512,12 +559,24 @@ def test_a_broken_package_is_left_out(
     """A package that cannot be imported or read costs one warning that names it, and
     none of our splits.
     """
-    with pytest.warns(
-        registry.PluginWarning, match=f"(?s)package {name}_split .*{reason}"
-    ) as told:
-        found = plugged(**{name: source.format(theirs=theirs)})
-    assert len(told) == 1
+    words = f"(?s)package {name}_split .*{reason}"
+    sources = {name: source.format(theirs=theirs)}
+    with pytest.warns(registry.PluginWarning, match=words) as warnings:
+        found = plugged(**sources)
+    assert len(warnings) == 1
     assert found.splits == load(default_path()).splits
+
+
+METADATA = "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
+
+
+def install_waves(root: Path, entry_points: str) -> Path:
+    """Install a package and return the folder with its metadata."""
+    folder = root / "wave_splits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(METADATA)
+    (folder / "entry_points.txt").write_text(entry_points)
+    return folder
 
 
 def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -527,15 +586,9 @@ def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.syspath_prepend(tmp_path)
     os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
     assert registry.list_entry_points("some.group") == ()
-    folder = tmp_path / "wave_splits-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
-    )
-    (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
-    assert [point.name for point in registry.list_entry_points("some.group")] == [
-        "waves"
-    ]
+    folder = install_waves(tmp_path, "[some.group]\nwaves = wave_splits\n")
+    (point,) = registry.list_entry_points("some.group")
+    assert point.name == "waves"
     shutil.rmtree(folder)
     os.utime(tmp_path, (1, 1))
     assert registry.list_entry_points("some.group") == ()
@@ -545,14 +598,7 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
     """An installed package whose module is gone: the command works, one line on stderr
     names the package.
     """
-    folder = tmp_path / "wave_splits-1.0.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
-    )
-    (folder / "entry_points.txt").write_text(
-        f"[{registry.GROUP}]\nwaves = wave_splits.gone\n"
-    )
+    install_waves(tmp_path, f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
         "from lagbench.__main__ import app; app()"
@@ -573,7 +619,10 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("split", "expected"),
-    [("cavity", (0.002191, 0.002195)), ("curl-noise", (1.600e-03, 1.600e-03))],
+    [
+        ("cavity", (0.002191, 0.002195)),
+        ("curl-noise", (1.600e-03, 1.600e-03)),
+    ],
 )
 def test_statistics_of_train_are_those_of_the_thesis(
     split: str, expected: tuple[float, float]
@@ -585,11 +634,11 @@ def test_statistics_of_train_are_those_of_the_thesis(
     gives it within 2 %.
     """
     size = load().size(split, "full")
-    assert size.measured.statistics["velocity_std"] == pytest.approx(expected, rel=0.05)
+    statistics = size.measured.statistics
+    assert statistics["velocity_std"] == pytest.approx(expected, rel=0.05)
     if split == "curl-noise":
-        (low, high), _ = size.bounds
+        low, high = size.bounds[0]
         uniform = (high - low) / 12**0.5
-        assert size.measured.statistics["position_std"] == pytest.approx(
-            (uniform, uniform), rel=1e-3
-        )
+        spread = (uniform, uniform)
+        assert statistics["position_std"] == pytest.approx(spread, rel=1e-3)
         assert uniform == pytest.approx(0.272, rel=0.02)
