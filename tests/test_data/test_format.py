@@ -209,9 +209,7 @@ def test_parameters_survive_the_file(
 
 
 @pytest.mark.parametrize("name", sorted(TYPES))
-def test_every_variable_is_hashed_and_named(
-    written: Written, name: str
-) -> None:
+def test_every_variable_is_hashed_and_named(written: Written, name: str) -> None:
     """Changing one value of any variable is found, and the error names file and
     variable.
     """
