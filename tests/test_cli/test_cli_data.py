@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,15 @@ from lagbench.make.generate import GenerationResult
 from lagbench.references.shipped import shipped
 
 Run = Callable[..., Result]
+Copied = Callable[[], Path]
+
+
+def printed_data(run: Run, *words: object) -> dict[str, Any]:
+    """Return what a command prints as JSON."""
+    result = run(*words, "--json")
+    data: dict[str, Any] = json.loads(result.stdout)
+    return data
+
 
 CLONE = Path(lagbench.__file__).parents[1]
 
@@ -43,22 +53,28 @@ def files_below(folder: Path) -> set[str]:
 def test_list_shows_every_size(run: Run, generated: GenerationResult) -> None:
     """The table has a row for each size of each split of the registry."""
     text = run("list", "--root", generated.root).stdout
-    rows = [line for line in text.splitlines() if re.search(" (full|mini|tiny) ", line)]
-    assert len(rows) == sum(len(split.sizes) for split in load().splits.values())
+    rows = re.findall(" (full|mini|tiny) ", text)
+    size_count = sum(len(split.sizes) for split in load().splits.values())
+    assert len(rows) == size_count
 
 
 def test_list_has_counts_bytes_time_and_local_data_as_json(
     run: Run, generated: GenerationResult
 ) -> None:
-    data = json.loads(run("list", "--root", generated.root, "--json").stdout)
-    sizes = {(entry["split"], entry["size"]): entry for entry in data["sizes"]}
+    data = printed_data(run, "list", "--root", generated.root)
+    sizes = {}
+    for entry in data["sizes"]:
+        sizes[entry["split"], entry["size"]] = entry
     local = sizes[SPLIT, SIZE]
     assert local["present"] == {"train": 2, "valid": 1, "test": 2}
     assert local["picture"].endswith("scenarios.png")
     full = sizes["cavity", "full"]
-    assert full["frames"] == 50_400
+    frame_count = 50_400
+    assert full["frames"] == frame_count
     assert set(full["present"].values()) == {0}
-    assert full["bytes"] == 50_400 * 8192 * 16 + 84 * 65536
+    frame_bytes = 8192 * 16
+    header_bytes = 65536
+    assert full["bytes"] == frame_count * frame_bytes + 84 * header_bytes
     assert full["seconds"] > 60.0
 
 
@@ -67,8 +83,10 @@ def test_list_shows_one_split_with_its_references(
 ) -> None:
     """It has the sizes, the version and the measured scores of the references."""
     monkeypatch.delenv("LAGBENCH_REGISTRY")
-    text = run("list", "cavity", "--root", tmp_path).stdout
-    assert text == run("list", "--split", "cavity", "--root", tmp_path).stdout
+    by_argument = run("list", "cavity", "--root", tmp_path)
+    by_option = run("list", "--split", "cavity", "--root", tmp_path)
+    text = by_argument.stdout
+    assert text == by_option.stdout
     entry = load().split("cavity")
     assert f"cavity {entry.version}" in text
     for size in entry.sizes:
@@ -76,19 +94,22 @@ def test_list_shows_one_split_with_its_references(
     assert "curl-noise" not in text
     assert "vorticity_nrmse" in text
 
-    command = ("list", "cavity", "--root", tmp_path, "--json")
-    data = json.loads(run(*command).stdout)
-    assert [overview["size"] for overview in data["sizes"]] == list(entry.sizes)
+    data = printed_data(run, "list", "cavity", "--root", tmp_path)
+    sizes = [overview["size"] for overview in data["sizes"]]
+    assert sizes == list(entry.sizes)
     measured = shipped(load().size("cavity", "mini"))
     assert measured is not None
-    for name, value in data["references"]["mini"].items():
-        assert value == pytest.approx(measured[name].scores["vorticity_nrmse"].mean)
-    assert "persistence" in data["references"]["mini"]
+    references = data["references"]["mini"]
+    for name, value in references.items():
+        score = measured[name].scores["vorticity_nrmse"]
+        assert value == pytest.approx(score.mean)
+    assert "persistence" in references
 
 
 def test_list_shows_a_local_split_by_its_folder(run: Run, tmp_path: Path) -> None:
     """The references of such a split are measured with each score."""
-    np.save(tmp_path / "runs.npy", np.stack(straight_runs(3)))
+    runs = np.stack(straight_runs(3))
+    np.save(tmp_path / "runs.npy", runs)
     own = lagbench.adopt(
         tmp_path / "runs.npy",
         output=tmp_path / "own",
@@ -116,7 +137,7 @@ def test_info_shows_parameters_with_units_and_the_local_data(
     assert str(generated.folder) in text
     assert "pictures/scenarios.png" in text
 
-    data = json.loads(run("info", SPLIT, "--size", SIZE, "--json").stdout)
+    data = printed_data(run, "info", SPLIT, "--size", SIZE)
     size = data["sizes"][SIZE]
     assert size["parameters"]["modulus"]["unit"] == "mass/s^2"
     assert size["subsets"]["test"] == [3, 4]
@@ -127,16 +148,16 @@ def test_generate_and_verify_one_scenario(run: Run, tmp_path: Path) -> None:
     data_set = [SPLIT, "--size", SIZE, "--root", tmp_path]
     options = [*data_set, "--scenarios", "2"]
     plan = run("generate", *options, "--dry-run").stdout
-    assert re.search(
-        r"(?s)1 scenario to simulate.*disk .*bytes.*free.*time +about \d+ s", plan
-    )
+    pattern = r"(?s)1 scenario to simulate.*disk .*bytes.*free.*time +about \d+ s"
+    assert re.search(pattern, plan)
     first = run("generate", *options)
     assert first.exit_code == 0, first.output
     assert "missing 0-1,3-4" in first.stdout
     # progress, on a slow machine
-    assert all("scenarios" in line for line in first.stderr.splitlines())
+    for line in first.stderr.splitlines():
+        assert "scenarios" in line
 
-    second = json.loads(run("generate", *options, "--json").stdout)
+    second = printed_data(run, "generate", *options)
     assert second["simulated"] == []
     assert second["kept"] == [2]
     assert second["complete"] is False
@@ -145,22 +166,25 @@ def test_generate_and_verify_one_scenario(run: Run, tmp_path: Path) -> None:
     verified = run("verify", *data_set)
     assert verified.exit_code == 0
     assert "train lacks 0-1" in verified.stderr
-    assert run("verify", *data_set, "--complete").exit_code == 4
+    complete = run("verify", *data_set, "--complete")
+    assert complete.exit_code == 4
 
 
-def test_damage_of_a_data_set_exits_4(run: Run, copied: Callable[[], Path]) -> None:
+def test_damage_of_a_data_set_exits_4(run: Run, copied: Copied) -> None:
     """It is described on stdout and named on stderr."""
     root = copied()
     path = root / SPLIT / SIZE / "v2" / "valid" / "0002.nc"
-    path.write_bytes(path.read_bytes()[:-500])
+    content = path.read_bytes()
+    path.write_bytes(content[:-500])
     result = run("verify", SPLIT, "--size", SIZE, "--root", root, "--json")
     assert result.exit_code == 4
-    assert json.loads(result.stdout)["subsets"][1]["wrong"] == [2]
+    _, valid, _ = json.loads(result.stdout)["subsets"]
+    assert valid["wrong"] == [2]
     assert "0002.nc" in result.stderr
 
 
 def test_a_picture_of_a_damaged_scenario_names_the_remedy(
-    run: Run, copied: Callable[[], Path], tmp_path: Path
+    run: Run, copied: Copied, tmp_path: Path
 ) -> None:
     root = copied()
     path = root / SPLIT / SIZE / "v2" / "test" / "0003.nc"
@@ -171,16 +195,23 @@ def test_a_picture_of_a_damaged_scenario_names_the_remedy(
     assert "lagbench generate" in result.stderr
 
 
+def citation_file() -> dict[str, Any]:
+    """Return the content of CITATION.cff."""
+    text = (CLONE / "CITATION.cff").read_text()
+    content: dict[str, Any] = yaml.safe_load(text)
+    return content
+
+
 def test_citation_readme_and_changelog_have_the_version() -> None:
     version = project_version()
-    citation = yaml.safe_load((CLONE / "CITATION.cff").read_text())
-    assert citation["version"] == version
-    assert f"version = {{{version}}}" in (CLONE / "README.md").read_text()
+    assert citation_file()["version"] == version
+    readme = (CLONE / "README.md").read_text()
+    assert f"version = {{{version}}}" in readme
 
 
 def project_version() -> str:
-    project = tomllib.loads((CLONE / "pyproject.toml").read_text())["project"]
-    version: str = project["version"]
+    text = (CLONE / "pyproject.toml").read_text()
+    version: str = tomllib.loads(text)["project"]["version"]
     return version
 
 
@@ -188,7 +219,8 @@ def test_a_tag_names_the_version() -> None:
     """The tag of a release is v and the version, which heads the changelog too."""
     # Outside of git, and in an archive that was unpacked in another repository, there
     # are no tags of ours.
-    if not (CLONE / ".git").exists() or shutil.which("git") is None:
+    is_clone = (CLONE / ".git").exists()
+    if not is_clone or shutil.which("git") is None:
         pytest.skip("no clone")
     command = ["git", "-C", str(CLONE), "tag", "--points-at", "HEAD"]
     command += ["--list", "v[0-9]*"]
@@ -206,13 +238,16 @@ def test_a_tag_names_the_version() -> None:
 def bibtex_fields(text: str) -> dict[str, str]:
     """Return the fields of a BibTeX entry."""
     assert text.count("{") == text.count("}")
-    assert text.strip().partition("{")[0] in {"@software", "@misc"}
-    return dict(re.findall(r"^  (\w+) = \{(.*)\},$", text, re.MULTILINE))
+    kind, _, _ = text.strip().partition("{")
+    assert kind in {"@software", "@misc"}
+    field = r"^  (\w+) = \{(.*)\},$"
+    return dict(re.findall(field, text, re.MULTILINE))
 
 
 def test_bibtex_of_lagbench_is_that_of_citation_cff(run: Run) -> None:
-    citation = yaml.safe_load((CLONE / "CITATION.cff").read_text())
-    assert bibtex_fields(run("cite", "--bibtex").stdout) == {
+    citation = citation_file()
+    bibtex = run("cite", "--bibtex").stdout
+    assert bibtex_fields(bibtex) == {
         "author": "{The lagbench authors}",
         "title": citation["title"],
         "version": citation["version"],
@@ -225,7 +260,8 @@ def test_bibtex_of_a_split_has_its_version_and_every_hash(
 ) -> None:
     monkeypatch.delenv("LAGBENCH_REGISTRY")
     registry = load()
-    fields = bibtex_fields(run("cite", "cavity", "--bibtex").stdout)
+    bibtex = run("cite", "cavity", "--bibtex").stdout
+    fields = bibtex_fields(bibtex)
     assert fields["version"] == registry.split("cavity").version
     measured = registry.measured["cavity"]
     assert len(measured) == 3
@@ -237,27 +273,42 @@ def test_without_a_split_lagbench_itself_is_cited(run: Run) -> None:
     result = run("cite")
     assert result.exit_code == 0
     assert lagbench.__version__ in result.stdout
-    assert json.loads(run("cite", "--json").stdout)["version"] == lagbench.__version__
+    data = printed_data(run, "cite")
+    assert data["version"] == lagbench.__version__
 
 
 def test_a_citation_names_the_work_behind_the_split(run: Run) -> None:
     assert "Ghia" in run("cite", "cavity").stdout
-    assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"
+    data = printed_data(run, "cite", "cavity")
+    assert data["licence"] == "CC-BY-4.0"
 
 
-@pytest.mark.parametrize("words", [("--bibtex",), ("cavity", "--bibtex")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--bibtex",),
+        ("cavity", "--bibtex"),
+    ],
+)
 def test_bibtex_as_json_is_the_same_text(words: tuple[str, ...], run: Run) -> None:
     text = run("cite", *words).stdout
-    data = json.loads(run("cite", *words, "--json").stdout)
+    data = printed_data(run, "cite", *words)
     assert data == {"bibtex": text.removesuffix("\n")}
+
+
+def library_name(requirement: str) -> str:
+    """Return the name of a library that the package requires."""
+    name, *_ = re.split(r"[^\w.-]", requirement)
+    return name.lower()
 
 
 def test_doctor_checks_every_library_that_the_package_declares() -> None:
     declared = set()
     for requirement in requires("lagbench") or []:
         if "extra ==" not in requirement:
-            declared.add(re.split(r"[^\w.-]", requirement)[0].lower())
-    assert {name.lower() for name in REQUIRED_LIBRARIES} == declared
+            declared.add(library_name(requirement))
+    required = {name.lower() for name in REQUIRED_LIBRARIES}
+    assert required == declared
 
 
 def test_doctor_names_one_command_for_all_that_is_missing(
@@ -284,17 +335,18 @@ def test_doctor_names_one_command_for_all_that_is_missing(
 def test_doctor_knows_the_libraries_of_every_extra() -> None:
     declared = {}
     for requirement in requires("lagbench") or []:
-        name, _, extra = requirement.partition("extra ==")
-        library = re.split(r"[^\w.-]", name)[0].lower()
-        if extra.strip(" \"'") in doctor.PURPOSES:
-            declared[library] = extra.strip(" \"'")
+        _, _, condition = requirement.partition("extra ==")
+        extra = condition.strip(" \"'")
+        if extra in doctor.PURPOSES:
+            declared[library_name(requirement)] = extra
     assert declared == doctor.OPTIONAL_LIBRARIES
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
-    data = json.loads(run("doctor", "--root", tmp_path, "--json").stdout)
+    data = printed_data(run, "doctor", "--root", tmp_path)
     states = {check["name"]: check["state"] for check in data["checks"]}
-    assert states["numpy"] == states["registry"] == states["data folder"] == "ok"
+    for name in ("numpy", "registry", "data folder"):
+        assert states[name] == "ok"
 
 
 def test_doctor_finds_a_root_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
@@ -315,9 +367,7 @@ def add_strange_files(root: Path) -> set[str]:
     return names
 
 
-def test_clean_removes_a_data_set_but_no_other_file(
-    run: Run, copied: Callable[[], Path]
-) -> None:
+def test_clean_removes_a_data_set_but_no_other_file(run: Run, copied: Copied) -> None:
     root = copied()
     strange_files = add_strange_files(root)
     words = ["clean", SPLIT, "--size", SIZE, "--root", root]
@@ -331,19 +381,18 @@ def test_clean_removes_a_data_set_but_no_other_file(
     assert run(*words).exit_code == 0
 
 
-def test_clean_may_remove_leftovers_only(run: Run, copied: Callable[[], Path]) -> None:
+def test_clean_may_remove_leftovers_only(run: Run, copied: Copied) -> None:
     root = copied()
     leftover = root / SPLIT / SIZE / "v2" / "test" / ".0003.nc.1.partial"
     leftover.write_text("")
-    result = run(
-        "clean", SPLIT, "--size", SIZE, "--root", root, "--leftovers", "--json"
-    )
-    assert json.loads(result.stdout)["removed"] == [str(leftover)]
+    tiny = [SPLIT, "--size", SIZE, "--root", root]
+    data = printed_data(run, "clean", *tiny, "--leftovers")
+    assert data["removed"] == [str(leftover)]
 
 
 def test_a_dry_run_of_clean_removes_nothing_and_takes_no_lock(
     run: Run,
-    copied: Callable[[], Path],
+    copied: Copied,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     root = copied()
@@ -356,18 +405,18 @@ def test_a_dry_run_of_clean_removes_nothing_and_takes_no_lock(
     assert files_below(root) == names
 
 
-def test_clean_leaves_links(
-    run: Run, copied: Callable[[], Path], tmp_path: Path
-) -> None:
+def test_clean_leaves_links(run: Run, copied: Copied, tmp_path: Path) -> None:
     """A subset that lies on another disk loses its files, not its folder."""
     root = copied()
     folder = root / SPLIT / SIZE / "v2"
     elsewhere = tmp_path / "elsewhere"
     (folder / "train").rename(elsewhere)
     (folder / "train").symlink_to(elsewhere)
-    assert run("clean", SPLIT, "--size", SIZE, "--root", root).exit_code == 0
+    result = run("clean", SPLIT, "--size", SIZE, "--root", root)
+    assert result.exit_code == 0
     assert list(elsewhere.iterdir()) == []
-    assert [path.name for path in folder.iterdir()] == ["train"]
+    names = [path.name for path in folder.iterdir()]
+    assert names == ["train"]
 
 
 def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import io
 import math
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -149,21 +149,38 @@ def score_methods(
     cards = []
     paths = []
     for number, (name, method) in enumerate(methods):
-        path = bench.submit(folder / f"{number}.nc", method, name, **labels)
+        file = folder / f"{number}.nc"
+        path = bench.submit(file, method, name, **labels)
         paths.append(path)
         cards.append(bench.card(path))
     return ScoredFiles(bench, cards, paths)
 
 
+Page = Callable[[str], str]
+
+
 @pytest.fixture(scope="module")
-def page(home: Path) -> Callable[[str], str]:
+def page(home: Path) -> Page:
     """A function that returns the page of two methods on a split."""
     return lambda split: page_of(home, split).read_text("utf-8")
 
 
+def reported(bench: ReportBench, folder: Path, methods: Mapping[str, Method]) -> str:
+    """Return the page of a report on some methods."""
+    path = bench.report(folder, methods)
+    return path.read_text("utf-8")
+
+
+def title_of(reading: Reading) -> str:
+    """Return the first heading of a page."""
+    first, *_ = reading.named("h1")
+    return first.text
+
+
 def assert_harmless(reading: Reading) -> None:
     """Nothing runs, and nothing is fetched from outside the page."""
-    assert not {e.name for e in reading.elements} & ACTIVE_ELEMENTS
+    names = {element.name for element in reading.elements}
+    assert not names & ACTIVE_ELEMENTS
     for element in reading.elements:
         for name, value in element.attributes.items():
             assert not name.startswith("on"), (element.name, name)
@@ -176,45 +193,55 @@ def assert_harmless(reading: Reading) -> None:
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_page_is_whole_and_harmless(page: Callable[[str], str], split: str) -> None:
+def test_page_is_whole_and_harmless(page: Page, split: str) -> None:
     """Elements close in order, links lead somewhere, nothing runs; 3 MB hold it."""
     html = page(split)
     reading = read_html(html)
     assert not reading.faults
     assert html.startswith("<!DOCTYPE html>")
     assert len(html.encode()) < 3_000_000
-    targets = {a.attributes["href"].removeprefix("#") for a in reading.named("a")}
+    targets = set()
+    for link in reading.named("a"):
+        targets.add(link.attributes["href"].removeprefix("#"))
     assert targets
     assert targets <= set(reading.ids)
     assert_harmless(reading)
-    metas = [meta.attributes for meta in reading.named("meta")]
-    (policy,) = [meta["content"] for meta in metas if "http-equiv" in meta]
+    policies = []
+    for meta in reading.named("meta"):
+        if "http-equiv" in meta.attributes:
+            policies.append(meta.attributes["content"])
+    (policy,) = policies
     assert policy.startswith("default-src 'none'")
     assert "script-src" not in policy
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_every_figure_of_the_thesis_has_its_counterpart(
-    page: Callable[[str], str], split: str
-) -> None:
+def test_every_figure_of_the_thesis_has_its_counterpart(page: Page, split: str) -> None:
     """Captions name the figure of the thesis, and figures are numbered in order."""
     reading = read_html(page(split))
-    figures = {e.attributes["id"]: e for e in reading.named("figure")}
+    figures = {}
+    for figure in reading.named("figure"):
+        figures[figure.attributes["id"]] = figure
     for name, thesis in expected_figures(split).items():
         assert name in figures, name
         assert f"thesis {thesis}" in figures[name].text, name
     numbers = [element.text for element in reading.of_class("number")]
-    assert numbers == [f"Figure {k}" for k in range(1, len(figures) + 1)]
-    assert len(reading.named("figcaption")) == len(figures)
+    count = len(figures)
+    expected = [f"Figure {number}" for number in range(1, count + 1)]
+    assert numbers == expected
+    assert len(reading.named("figcaption")) == count
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_every_figure_can_be_read_aloud(page: Callable[[str], str], split: str) -> None:
+def test_every_figure_can_be_read_aloud(page: Page, split: str) -> None:
     """Pictures have a text, drawings a title, charts a description too."""
     html = page(split)
     reading = read_html(html)
-    assert all(image.attributes.get("alt") for image in reading.named("img"))
-    assert html.count("<desc>") == len(reading.of_class("chart")) > 0
+    for image in reading.named("img"):
+        assert image.attributes.get("alt")
+    chart_count = len(reading.of_class("chart"))
+    assert chart_count > 0
+    assert html.count("<desc>") == chart_count
     for drawing in reading.named("svg"):
         is_hidden = drawing.attributes.get("aria-hidden") == "true"
         assert is_hidden or drawing.text or "role" not in drawing.attributes
@@ -233,13 +260,16 @@ def test_text_of_strangers_is_shown_not_run(home: Path, tmp_path: Path) -> None:
         path = bench.submit(file, noisy, name, **labels)
         paths.append(path)
         cards.append(bench.card(path))
-    page = ScoredFiles(bench, cards, paths).report(tmp_path / "out")
+    scored = ScoredFiles(bench, cards, paths)
+    page = scored.report(tmp_path / "out")
     reading = read_html(page.read_text("utf-8"))
     assert not reading.faults
     assert_harmless(reading)
-    heading = reading.named("h1")[0].text
-    assert all(card.header.method in heading for card in cards)
-    assert "0 '" in reading.named("pre")[0].text
+    title = title_of(reading)
+    for card in cards:
+        assert card.header.method in title
+    command, *_ = reading.named("pre")
+    assert "0 '" in command.text
 
 
 PLAIN = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
@@ -250,7 +280,8 @@ PLAIN = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
 @example(PLAIN)
 def test_any_text_survives_escaping(words: str) -> None:
     """Text in an element and in an attribute stays, but for what cannot be shown."""
-    reading = read_html(tag("p", words, title=words))
+    html = tag("p", words, title=words)
+    reading = read_html(html)
     assert not reading.faults
     (element,) = reading.elements
     assert element.attributes["title"] == element.text
@@ -266,12 +297,12 @@ def test_markup_is_not_escaped_again() -> None:
 
 def test_same_bytes_every_time(
     home: Path,
-    page: Callable[[str], str],
+    page: Page,
     tmp_path: Path,
 ) -> None:
     """The same predictions give the same page; no folder stands in it."""
     bench = make_report_bench(home, "multimaterial")
-    first = bench.report(tmp_path / "there", METHODS).read_text("utf-8")
+    first = reported(bench, tmp_path / "there", METHODS)
     assert first == page("multimaterial")
     assert "the bands are" in first
     assert str(tmp_path) not in first
@@ -284,48 +315,53 @@ def test_undefined_and_huge_numbers_are_drawn_around(
 ) -> None:
     """A prediction at rest has no correlation, a runaway leaves every axis."""
     bench = make_report_bench(home, split)
-    page = bench.report(tmp_path, {"rest": still, "odd": runaway})
-    reading = read_html(page.read_text("utf-8"))
+    methods = {"rest": still, "odd": runaway}
+    reading = read_html(reported(bench, tmp_path, methods))
     assert not reading.faults
     for element in reading.elements:
         for name in NUMERIC_ATTRIBUTES:
             value = element.attributes.get(name, "")
             place = (element.name, name, value[:80])
             assert not re.search(r"nan|inf|e\+?\d", value), place
-            assert all(len(number) < 8 for number in re.findall(r"\d+", value)), place
+            for number in re.findall(r"\d+", value):
+                assert len(number) < 8, place
     assert set(expected_figures(split)) <= set(reading.ids)
 
 
+Reported = tuple[ScoreCard, Path]
+
+
 @pytest.fixture(scope="module")
-def damped_cavity(
-    home: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[ScoreCard, Path]:
+def damped_cavity(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Reported:
     """One method on cavity with its report."""
     bench = make_report_bench(home, "cavity")
     folder = tmp_path_factory.mktemp("damped")
-    labels = {"parameters": 1_600_000, "seconds_per_frame": 0.25}
+    labels = {
+        "parameters": 1_600_000,
+        "seconds_per_frame": 0.25,
+    }
     scored = score_methods(bench, folder, ("damped", damped), **labels)
     return scored.cards[0], scored.report(folder)
 
 
-def test_scores_on_the_page_are_those_of_the_scorer(
-    damped_cavity: tuple[ScoreCard, Path],
-) -> None:
+def test_scores_on_the_page_are_those_of_the_scorer(damped_cavity: Reported) -> None:
     """The ranking metric opens the table; there is no interval of two scenarios."""
     card, path = damped_cavity
     html = path.read_text("utf-8")
     reading = read_html(html)
-    scores = [scores[card.ranking] for scores in card.scores.values()]
     means = [element.text for element in reading.of_class("n")]
-    assert means[: len(scores)] == [text(score.mean) for score in scores]
-    assert np.isnan([score.interval for score in scores]).all()
-    assert not any("…" in element.text for element in reading.of_class("ci"))
+    expected = []
+    for scores in card.scores.values():
+        score = scores[card.ranking]
+        expected.append(text(score.mean))
+        assert np.isnan(score.interval).all()
+    assert means[: len(expected)] == expected
+    for element in reading.of_class("ci"):
+        assert "…" not in element.text
     assert "the bands are" not in html
 
 
-def test_the_page_identifies_what_was_scored(
-    damped_cavity: tuple[ScoreCard, Path],
-) -> None:
+def test_the_page_identifies_what_was_scored(damped_cavity: Reported) -> None:
     """Hashes, the number of parameters, flags and the command stand on it."""
     card, path = damped_cavity
     reading = read_html(path.read_text("utf-8"))
@@ -343,10 +379,11 @@ def test_the_page_identifies_what_was_scored(
 def test_reference_predictors_have_no_rank(home: Path, tmp_path: Path) -> None:
     """Two submissions, both worse than persistence, are ranked 1 and 2."""
     bench = make_report_bench(home, "curl-noise")
-    page = bench.report(tmp_path, {"m0": noisy, "m1": noisy}).read_text("utf-8")
-    (part,) = re.findall(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
+    page = reported(bench, tmp_path, {"m0": noisy, "m1": noisy})
+    (table,) = re.findall(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
+    _, *rows = re.findall(r"<tr>(.*?)</tr>", table)
     ranks = []
-    for row in re.findall(r"<tr>(.*?)</tr>", part)[1:]:
+    for row in rows:
         cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)
         ranks.append(cells[1])
     assert ranks[:2] == ["1", "2"]
@@ -357,10 +394,15 @@ def test_reference_predictors_have_no_rank(home: Path, tmp_path: Path) -> None:
 def test_methods_of_one_name_are_told_apart(home: Path, tmp_path: Path) -> None:
     """Two files of one method get numbers, and so does a reference predictor's name."""
     bench = make_report_bench(home, "curl-noise")
-    methods = (("gns", damped), ("gns", noisy), ("persistence", still))
-    page = score_methods(bench, tmp_path, *methods).report(tmp_path)
-    heading = read_html(page.read_text("utf-8")).named("h1")[0].text
-    assert heading == "gns (1) · gns (2) · persistence (1)"
+    methods = (
+        ("gns", damped),
+        ("gns", noisy),
+        ("persistence", still),
+    )
+    scored = score_methods(bench, tmp_path, *methods)
+    page = scored.report(tmp_path)
+    reading = read_html(page.read_text("utf-8"))
+    assert title_of(reading) == "gns (1) · gns (2) · persistence (1)"
 
 
 def test_score_reports_must_belong_together(home: Path, tmp_path: Path) -> None:
@@ -369,12 +411,12 @@ def test_score_reports_must_belong_together(home: Path, tmp_path: Path) -> None:
     cavity_bench = make_report_bench(home, "cavity")
     noise = score_methods(noise_bench, tmp_path / "noise", ("a", still))
     cavity = score_methods(cavity_bench, tmp_path / "cavity", ("a", still))
+    both_cards = noise.cards + cavity.cards
+    both_paths = noise.paths + cavity.paths
     mixtures = [
         ScoredFiles(cavity_bench, [], []),
         ScoredFiles(noise_bench, noise.cards, []),
-        ScoredFiles(
-            cavity_bench, noise.cards + cavity.cards, noise.paths + cavity.paths
-        ),
+        ScoredFiles(cavity_bench, both_cards, both_paths),
     ]
     for scored in mixtures:
         with pytest.raises(UsageError):
@@ -407,14 +449,20 @@ def subject_on(split: str, size_name: str) -> Subject:
         frames_of_interest=size.task.frames_of_interest,
         radius=size.task.radius,
     )
-    task = ScoredTask(truth=Truth(size, Path()), config=config, density=1.0)
+    truth = Truth(size, Path())
+    task = ScoredTask(truth=truth, config=config, density=1.0)
     return Subject(task=task, title=split, entries=())
 
 
 @pytest.mark.parametrize("size", ["full", "mini"])
 @pytest.mark.parametrize(
     ("split", "frame"),
-    [("cavity", 54), ("curl-noise", 40), ("fluid", 60), ("multimaterial", 60)],
+    [
+        ("cavity", 54),
+        ("curl-noise", 40),
+        ("fluid", 60),
+        ("multimaterial", 60),
+    ],
 )
 def test_models_are_compared_at_the_frame_of_the_thesis(
     split: str, frame: int, size: str
@@ -456,23 +504,27 @@ def read_values(address: str) -> NDArray[np.float64]:
 def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
     """Each panel of true vorticity holds the field of x(f) - x(f-1) at its frame f."""
     bench = make_report_bench(home, "curl-noise")
-    page = bench.report(tmp_path, {"damped": damped}).read_text("utf-8")
-    first_scenario = bench.size.subsets["test"][0]
-    truth = motion(bench.size, first_scenario).astype(np.float32).astype(np.float64)
-    grid = Grid(bench.size.task.score_grid.cells)
-    (low, high), _ = bench.size.bounds
-    full = grid.full_weight(bench.size.particles, (high - low) ** 2)
+    page = reported(bench, tmp_path, {"damped": damped})
+    size = bench.size
+    first_scenario = size.subsets["test"][0]
+    stored_truth = motion(size, first_scenario).astype(np.float32)
+    truth = stored_truth.astype(np.float64)
+    grid = Grid(size.task.score_grid.cells)
+    (low, high), _ = size.bounds
+    full = grid.full_weight(size.particles, (high - low) ** 2)
 
     shown = {}
     expected = {}
     for image in read_html(page).named("img"):
-        match = re.fullmatch(r"true vorticity, frame (\d+)", image.attributes["alt"])
+        description = image.attributes["alt"]
+        match = re.fullmatch(r"true vorticity, frame (\d+)", description)
         if match is None:
             continue
         frame = int(match[1])
         shown[frame] = read_values(image.attributes["src"])
-        displacement = truth[frame] - truth[frame - 1]
-        flow = fields(truth[frame], displacement, grid, full=full)
+        position = truth[frame]
+        displacement = position - truth[frame - 1]
+        flow = fields(position, displacement, grid, full=full)
         expected[frame] = flow.vorticity
     assert len(shown) == 6
 
@@ -485,8 +537,9 @@ def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
 
 def test_style_sheet_is_packaged() -> None:
     """Files in the folder that are no modules are named in pyproject.toml."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    patterns = project["tool"]["setuptools"]["package-data"]["lagbench.figures"]
+    project_text = (ROOT / "pyproject.toml").read_text()
+    setuptools = tomllib.loads(project_text)["tool"]["setuptools"]
+    patterns = setuptools["package-data"]["lagbench.figures"]
     folder = Path(str(lagbench.figures.__file__)).parent
     names = []
     for path in folder.iterdir():
@@ -494,16 +547,22 @@ def test_style_sheet_is_packaged() -> None:
             names.append(path.name)
     assert "style.css" in names
     for name in names:
-        assert any(fnmatch(name, pattern) for pattern in patterns), name
+        is_packaged = [fnmatch(name, pattern) for pattern in patterns]
+        assert any(is_packaged), name
 
 
 def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
     """Two scenarios of 3 frames have 2 frames without a correlation."""
     name = "vorticity_pearson"
-    correlations = [(0.96, math.nan, math.nan), (0.96, 0.96, 0.9)]
+    correlations = [
+        (0.96, math.nan, math.nan),
+        (0.96, 0.96, 0.9),
+    ]
     tallies = {}
     for scenario, values in enumerate(correlations):
-        by_frame = {frame: {name: value} for frame, value in enumerate(values, start=2)}
+        by_frame = {}
+        for frame, value in enumerate(values, start=2):
+            by_frame[frame] = {name: value}
         tallies[scenario] = Tally.of([name], range(2, 5), by_frame)
     metric = METRICS["stable_frames"]
     stable = aggregate([metric], tallies)["stable_frames"]

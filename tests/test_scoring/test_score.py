@@ -31,7 +31,8 @@ def persistence_card(
 ) -> ScoreCard:
     """The score card of persistence, written."""
     folder = tmp_path_factory.mktemp("persistence")
-    return bench.score(bench.submit(folder / "predictions.nc", still))
+    path = bench.submit(folder / "predictions.nc", still)
+    return bench.score(path)
 
 
 @pytest.fixture
@@ -42,13 +43,21 @@ def predictions(persistence_card: ScoreCard) -> Path:
 
 def load_json(card: ScoreCard) -> dict[str, Any]:
     """Return the content of scores.json."""
-    return dict(json.loads(card.files[0].read_bytes()))
+    content: dict[str, Any] = json.loads(card.files[0].read_bytes())
+    return content
+
+
+def row_of_submission(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the row of the submission in scores.json."""
+    row: dict[str, Any] = content["rows"][SUBMISSION]
+    return row
 
 
 @pytest.mark.usefixtures("as_shipped")
 def test_the_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
     """It gets the perfect value of every metric that has one, and is suspect."""
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", right))
+    path = bench.submit(tmp_path / "predictions.nc", right)
+    card = bench.evaluate(path)
     for name, score in card.submission.items():
         perfect = score.metric.perfect
         if perfect is not None:
@@ -72,7 +81,8 @@ def test_references_are_what_a_user_would_submit(
     predict: Any,
 ) -> None:
     """A reference written as a predictions.nc scores exactly like the scorer's row."""
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", predict))
+    path = bench.submit(tmp_path / "predictions.nc", predict)
+    card = bench.evaluate(path)
     for name, score in card.submission.items():
         expected = card.scores[row][name]
         assert_array_equal(score.per_frame, expected.per_frame, err_msg=name)
@@ -83,9 +93,10 @@ def test_position_rmse_is_that_of_xarray(
     bench: ScoreBench, persistence_card: ScoreCard
 ) -> None:
     """From the arrays of the public loader: the root of the mean over frames."""
-    first = bench.size.task.input_frames
-    predicted_frames = slice(first, first + bench.size.task.horizon)
-    with open_split(bench.size.split, size=bench.size.name, root=bench.root) as data:
+    size = bench.size
+    first = size.task.input_frames
+    predicted_frames = slice(first, first + size.task.horizon)
+    with open_split(size.split, size=size.name, root=bench.root) as data:
         position = data["position"].astype("float64").compute()
     last_input = position.isel(frame=first - 1).drop_vars("frame")
     error = last_input - position.isel(frame=predicted_frames)
@@ -112,7 +123,7 @@ def test_json_has_the_scores_of_the_card(persistence_card: ScoreCard) -> None:
     for row, scores in persistence_card.scores.items():
         for name, score in scores.items():
             entry = rows[row][name]
-            values = [digits(value) for value in score.values.tolist()]
+            values = [digits(value) for value in score.values]
             assert entry["mean"] == digits(score.mean)
             assert entry["values"] == values
             assert entry["undefined"] == list(score.undefined)
@@ -124,11 +135,12 @@ def test_json_has_the_frames_of_interest_and_the_last(
 ) -> None:
     content = load_json(persistence_card)
     config = persistence_card.config
-    expected = {*config.frames_of_interest, config.predicted_frames[-1]}
+    last = config.predicted_frames[-1]
+    expected = {*config.frames_of_interest, last}
     frames = content["task"]["frames"]
     assert frames == sorted(expected)
-    at_frames = content["rows"][SUBMISSION]["position_mse"]["at"]
-    assert list(at_frames) == [str(frame) for frame in frames]
+    mse = row_of_submission(content)["position_mse"]
+    assert list(mse["at"]) == [str(frame) for frame in frames]
 
 
 def test_json_describes_the_metrics(persistence_card: ScoreCard) -> None:
@@ -141,10 +153,12 @@ def test_json_describes_the_metrics(persistence_card: ScoreCard) -> None:
 
 def test_undefined_values_are_null_in_json(persistence_card: ScoreCard) -> None:
     """At rest there is no correlation in any frame of both scenarios."""
-    entry = load_json(persistence_card)["rows"][SUBMISSION]["vorticity_pearson"]
-    assert entry["mean"] is None
-    assert entry["values"] == [None, None]
-    assert entry["undefined"] == [persistence_card.config.horizon] * 2
+    content = load_json(persistence_card)
+    pearson = row_of_submission(content)["vorticity_pearson"]
+    horizon = persistence_card.config.horizon
+    assert pearson["mean"] is None
+    assert pearson["values"] == [None, None]
+    assert pearson["undefined"] == [horizon, horizon]
 
 
 def test_freezing_midway_leaves_frames_out(bench: ScoreBench, tmp_path: Path) -> None:
@@ -247,9 +261,10 @@ def test_a_wild_prediction_gets_finite_scores(
         positions[h // 2 :] += 9.0
         return positions
 
-    card = bench.score(bench.submit(tmp_path / "predictions.nc", wild))
+    path = bench.submit(tmp_path / "predictions.nc", wild)
+    card = bench.score(path)
     content = load_json(card)
-    mean = content["rows"][SUBMISSION]["position_mse"]["mean"]
+    mean = row_of_submission(content)["position_mse"]["mean"]
     assert math.isfinite(mean)
     assert mean > 40.0  # half of the frames are off by 9 along both axes
     checks = {warning["check"] for warning in content["warnings"]}
@@ -274,9 +289,11 @@ def test_a_validated_file_is_not_validated_again(
     card = bench.evaluate(predictions, validated=validated)
     assert card.predictions_sha256 == validated.sha256
     assert card.predictions_sha256 == persistence_card.predictions_sha256
-    assert card.as_json()["rows"] == persistence_card.as_json()["rows"]
+    rows = card.as_json()["rows"]
+    assert rows == persistence_card.as_json()["rows"]
+    other = predictions.with_name("other.nc")
     with pytest.raises(UsageError):
-        bench.evaluate(predictions.with_name("other.nc"), validated=validated)
+        bench.evaluate(other, validated=validated)
 
 
 def test_progress_reaches_its_total(bench: ScoreBench, predictions: Path) -> None:
@@ -297,7 +314,9 @@ def test_invalid_predictions_are_refused(
     with pytest.raises(ChecksFailedError) as caught:
         bench.score(broken, examined=results.append)
     assert caught.value.where == "first in scenario 3, frame 9, particle 5, y"
-    assert [finding.check for finding in results[0].errors] == ["finite"]
+    (result,) = results
+    checks = [finding.check for finding in result.errors]
+    assert checks == ["finite"]
     assert list(tmp_path.iterdir()) == [broken]
 
 
@@ -345,11 +364,15 @@ def test_optional_metrics_need_their_extra(
 
 def test_a_card_becomes_a_table_of_values(bench: ScoreBench, tmp_path: Path) -> None:
     """Each value of a row, a metric and a scenario has a line."""
-    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
+    path = bench.submit(tmp_path / "predictions.nc", half_right)
+    card = bench.evaluate(path)
     table = card.to_dataframe()
-    lines = table[(table.row == "submission") & (table.metric == card.ranking)]
+    is_submission = table.row == "submission"
+    is_ranking = table.metric == card.ranking
+    lines = table[is_submission & is_ranking]
     assert lines.scenario.tolist() == list(card.scenarios)
-    assert lines.value.mean() == pytest.approx(card.submission[card.ranking].mean)
+    expected = card.submission[card.ranking].mean
+    assert lines.value.mean() == pytest.approx(expected)
     assert set(table.row) == set(card.scores)
 
 
@@ -357,10 +380,11 @@ def test_a_card_in_a_notebook_is_escaped(bench: ScoreBench, tmp_path: Path) -> N
     """The name of the method comes from strangers."""
     method = "<img src=x>"
     path = bench.submit(tmp_path / "predictions.nc", half_right, method=method)
-    page = bench.evaluate(path)._repr_html_()
+    card = bench.evaluate(path)
+    page = card._repr_html_()
     assert "&lt;img src=x&gt;" in page
     assert "<img" not in page
-    assert bench.evaluate(path).ranking in page
+    assert card.ranking in page
 
 
 def test_predictions_for_another_split_are_refused(
@@ -370,4 +394,5 @@ def test_predictions_for_another_split_are_refused(
     with pytest.raises(UsageError) as caught:
         bench.evaluate(path, split="fluid")
     assert caught.value.expected == "fluid"
-    assert bench.evaluate(path, split=bench.size.split).skill is not None
+    card = bench.evaluate(path, split=bench.size.split)
+    assert card.skill is not None
