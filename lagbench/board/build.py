@@ -26,7 +26,7 @@ from lagbench.errors import (
     UsageError,
 )
 from lagbench.figures.solid import View
-from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.aggregate import Score, interval_in_range
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
     FEWEST_SCENARIOS,
@@ -638,7 +638,7 @@ def _on_shift(seeds: Sequence[Score], references: Mapping[str, Score]) -> OnShif
     if len(means) > 1:
         std = float(np.std(means, ddof=1))
     values = np.stack([seed.values for seed in seeds])  # shape [seed, scenario]
-    low, high = bootstrap_interval(values)
+    low, high = interval_in_range(values, seeds[0].value_range)
     value = Value(
         mean=mean(means),
         std=std,

@@ -21,7 +21,7 @@ from lagbench.metrics.aggregate import (
     Score,
     Tally,
     aggregate,
-    bootstrap_interval,
+    interval_in_range,
     mean_over_seeds,
 )
 from lagbench.metrics.table import METRICS
@@ -58,7 +58,8 @@ class CombinedScore:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the mean, over scenarios and seeds together."""
-        return bootstrap_interval(np.stack([seed.values for seed in self.seeds]))
+        values = np.stack([seed.values for seed in self.seeds])
+        return interval_in_range(values, self.score.value_range)
 
 
 def combine(

@@ -385,6 +385,28 @@ def bootstrap_interval(
     return resampling.interval
 
 
+def interval_in_range(
+    values: ArrayLike, value_range: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the interval of a mean, cut off at the range of the values.
+
+    The bootstrap of few skewed values is stretched beyond it, where no mean can lie:
+    nothing that is cut off could have been the mean. Values that lie outside all the
+    same widen the range.
+
+    Args:
+        values: as :func:`bootstrap_interval` takes them.
+        value_range: least and greatest value that there can be.
+    """
+    low, high = bootstrap_interval(values)
+    if math.isnan(low):
+        return (low, high)
+    least, greatest = value_range
+    low = max(low, min(least, float(np.nanmin(values))))
+    high = min(high, max(greatest, float(np.nanmax(values))))
+    return (low, high)
+
+
 @dataclass(frozen=True, eq=False)
 class Score:
     """The values of a metric for one prediction."""
@@ -410,12 +432,28 @@ class Score:
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the mean of these weights, by bootstrap over scenarios."""
-        return bootstrap_interval(self.values)
+        """95 % interval of the mean of these weights, by bootstrap over scenarios.
+
+        It does not leave the range of the metric.
+        """
+        return interval_in_range(self.values, self.value_range)
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Least and greatest value over the horizon, infinite without end."""
+        least, greatest = self.metric.value_range
+        if self.metric.unit == "frame":
+            # no more frames can count than there are
+            greatest = min(greatest, float(len(self.frames)))
+        return least, greatest
 
     def at(self, frame: int) -> Floats:
         """Return the value at one absolute frame, shape [scenario]."""
         return self.per_frame[:, self.frames.index(frame)]
+
+    def interval_at(self, frame: int) -> tuple[float, float]:
+        """Return the 95 % interval of the mean at one absolute frame."""
+        return interval_in_range(self.at(frame), self.metric.value_range)
 
 
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:

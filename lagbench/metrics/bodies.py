@@ -137,6 +137,7 @@ def _body_metrics(
     unit: str,
     direction: Direction,
     perfect: float | None,
+    greatest: float | None = None,
 ) -> Iterator[Metric]:
     """Yield a metric over all elastic bodies, then one for each elastic material."""
     for material in (None, *ELASTIC):
@@ -156,6 +157,8 @@ def _body_metrics(
             unit=unit,
             direction=direction,
             perfect=perfect,
+            least=0.0,
+            greatest=greatest,
             source="section 4.8.2",
             summary=f"{summary}, {bodies}",
             statistic=over_bodies,
@@ -177,6 +180,7 @@ METRICS = (
         unit="1",
         direction=Direction.HIGHER,
         perfect=1.0,
+        greatest=1.0,
     ),
     *_body_metrics(
         connectivity_true,
@@ -184,6 +188,7 @@ METRICS = (
         unit="1",
         direction=Direction.NONE,
         perfect=None,
+        greatest=1.0,
     ),
 )
 """Metrics of this family."""

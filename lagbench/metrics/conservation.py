@@ -41,13 +41,13 @@ def kinetic_energy(snapshot: Snapshot, particle_mass: float) -> float:
     return 0.5 * particle_mass * snapshot.speed_square
 
 
-@metric(unit="mass length^2/frame^2", source="Eq. 5.11")
+@metric(unit="mass length^2/frame^2", source="Eq. 5.11", least=0.0)
 def energy_true(pair: FramePair) -> float:
     """Kinetic energy of the truth."""
     return kinetic_energy(pair.truth, pair.scenario.particle_mass)
 
 
-@metric(unit="mass length^2/frame^2", source="Eq. 5.11, Fig. 5.28")
+@metric(unit="mass length^2/frame^2", source="Eq. 5.11, Fig. 5.28", least=0.0)
 def energy_predicted(pair: FramePair) -> float:
     """Kinetic energy of the prediction."""
     return kinetic_energy(pair.prediction, pair.scenario.particle_mass)
@@ -57,6 +57,7 @@ def energy_predicted(pair: FramePair) -> float:
     unit="1",
     direction=Direction.TARGET,
     perfect=1.0,
+    least=0.0,
     source="Eq. 5.11",
     of=ENERGIES,
 )
@@ -72,13 +73,13 @@ def energy_ratio(predicted: Floats, true: Floats) -> Floats:
     return quotient(predicted, moving)
 
 
-@metric(unit="1", source="Fig. 5.19")
+@metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention(pair: FramePair) -> float:
     """Kinetic energy of the prediction over that of the last given frame."""
     return _retained_share(pair.prediction)
 
 
-@metric(unit="1", source="Fig. 5.19")
+@metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention_true(pair: FramePair) -> float:
     """Kinetic energy of the truth over that of the last given frame."""
     return _retained_share(pair.truth)
@@ -102,7 +103,7 @@ def energy_error(predicted: Floats, true: Floats) -> Floats:
     return scaled_error(np.abs(predicted - true), true)
 
 
-@metric(unit="frame", source="Eq. 5.11", over_frames=total, per_frame=False)
+@metric(unit="frame", source="Eq. 5.11", least=0.0, over_frames=total, per_frame=False)
 def active_frames(pair: FramePair) -> float:
     """Predicted frames until the truth's kinetic energy stays below 1 % of its peak."""
     return float(pair.frame in pair.scenario.moving_frames)
@@ -130,14 +131,14 @@ def angular_momentum(snapshot: Snapshot) -> Floats:
     return np.array([component(1, 2), component(2, 0), component(0, 1)])
 
 
-@metric(unit="length/frame", source="section 5.2")
+@metric(unit="length/frame", source="section 5.2", least=0.0)
 def momentum_gap(pair: FramePair) -> float:
     """Error of total momentum, unscaled."""
     difference = momentum(pair.prediction) - momentum(pair.truth)
     return math.hypot(*difference)
 
 
-@metric(unit="length/frame", source="section 5.2")
+@metric(unit="length/frame", source="section 5.2", least=0.0)
 def momentum_scale(pair: FramePair) -> float:
     """The truth's sum of speeds that scales momentum_error."""
     return float(pair.truth.speeds.sum())
@@ -149,14 +150,14 @@ def momentum_error(gap: Floats, scale: Floats) -> Floats:
     return scaled_error(gap, scale)
 
 
-@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
+@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_gap(pair: FramePair) -> float:
     """Error of angular momentum about the box centre, unscaled."""
     difference = angular_momentum(pair.prediction) - angular_momentum(pair.truth)
     return math.hypot(*np.atleast_1d(difference))
 
 
-@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
+@metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_scale(pair: FramePair) -> float:
     """The truth's sum of arm times speed that scales angular_momentum_error."""
     return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)
@@ -183,13 +184,13 @@ def density_rmse(pair: FramePair) -> float:
     return math.sqrt(mean_squared_error(error))
 
 
-@metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
+@metric(unit="1/frame", source="section 5.9.1", least=0.0, defined=enough_nodes)
 def divergence_rms(pair: FramePair) -> float:
     """Root mean squared divergence of the prediction."""
     return _divergence_rms(pair, pair.prediction)
 
 
-@metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
+@metric(unit="1/frame", source="section 5.9.1", least=0.0, defined=enough_nodes)
 def divergence_rms_true(pair: FramePair) -> float:
     """Root mean squared divergence of the truth."""
     return _divergence_rms(pair, pair.truth)
@@ -201,7 +202,7 @@ def _divergence_rms(pair: FramePair, snapshot: Snapshot) -> float:
     return math.sqrt(mean_squared_error(rate[pair.nodes]))  # [1/frame]
 
 
-@_error(unit="%", source="docs/scoring.md")
+@_error(unit="%", source="docs/scoring.md", greatest=100.0)
 def outside_share(pair: FramePair) -> float:
     """Share of predicted particles that are past a wall."""
     return 100.0 * pair.outside_share

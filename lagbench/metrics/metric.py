@@ -151,6 +151,10 @@ class Metric:
     summary: str  # its meaning, one line
     # value of a perfect prediction; None where it depends on truth or task
     perfect: float | None = None
+    # ends of the values that it can have, at which intervals are cut off; None: without
+    # end, or the perfect value where less, or more, is better
+    least: float | None = None
+    greatest: float | None = None
     # of one frame pair; None if it follows from others
     statistic: Callable[[FramePair], float] | None = None
     # whether the statistic is measured for a frame pair
@@ -282,6 +286,20 @@ class Metric:
         )
         error.metric_name = self.name  # type: ignore[attr-defined]
         return error
+
+    @property
+    def value_range(self) -> tuple[float, float]:
+        """Least and greatest value that the metric can have, infinite without end."""
+        least = self.least
+        greatest = self.greatest
+        if least is None and self.direction is Direction.LOWER:
+            least = self.perfect
+        if greatest is None and self.direction is Direction.HIGHER:
+            greatest = self.perfect
+        return (
+            -math.inf if least is None else least,
+            math.inf if greatest is None else greatest,
+        )
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.

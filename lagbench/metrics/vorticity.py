@@ -121,7 +121,7 @@ def vorticity_rmse(mse: Floats) -> Floats:
     return np.sqrt(mse)
 
 
-@metric(unit="1/frame^2", source="Eq. 5.19", defined=enough_nodes)
+@metric(unit="1/frame^2", source="Eq. 5.19", least=0.0, defined=enough_nodes)
 def vorticity_square_true(pair: FramePair) -> float:
     """Mean squared vorticity of the truth over the counted nodes."""
     return mean_squared_error(pair.true_vorticity)
@@ -149,6 +149,7 @@ def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
     unit="1",
     direction=Direction.HIGHER,
     perfect=1.0,
+    least=-1.0,
     source="Eq. 5.21",
     defined=has_rotation,
 )
@@ -164,6 +165,7 @@ stable_frames = Metric(
     family="vorticity",
     unit="frame",
     direction=Direction.HIGHER,
+    least=0.0,
     source="Kochkov et al. 2021, PNAS 118(21)",
     summary=f"Defined frames before vorticity_pearson first falls below "
     f"{STABLE_PEARSON:g}",

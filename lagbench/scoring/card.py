@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lagbench.data.checksums import round_digits
 from lagbench.figures.html import tag
-from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
+from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
@@ -260,10 +260,9 @@ def _score_as_json(score: Score) -> dict[str, Any]:
 
 
 def _frame_as_json(score: Score, frame: int, row: str) -> dict[str, Any]:
-    values = score.at(frame)
-    content: dict[str, Any] = {"mean": digits(mean(values))}
+    content: dict[str, Any] = {"mean": digits(mean(score.at(frame)))}
     if row == SUBMISSION:
-        content["interval"] = _interval_as_json(bootstrap_interval(values))
+        content["interval"] = _interval_as_json(score.interval_at(frame))
     return content
 
 

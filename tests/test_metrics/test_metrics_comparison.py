@@ -6,6 +6,7 @@ import itertools
 import math
 import operator
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -430,6 +431,45 @@ def test_seeds_of_a_method_are_compared_together() -> None:
     assert found.difference == pytest.approx(-9.5)
     assert found.p == differ(values, other.values)
     assert found.interval == bootstrap_interval(values, minus=other.values)
+
+
+SKEWED = (0.0, 0.0, 0.0, 0.0, 0.0, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("metric", "values", "ends"),
+    [
+        ("vorticity_mse", SKEWED, (0.0, None)),
+        ("energy_ratio", SKEWED, (0.0, None)),
+        ("stable_frames", SKEWED, (0.0, None)),
+        ("stable_frames", [8.0 - value for value in SKEWED], (None, 8.0)),
+        ("vorticity_pearson", [1.0 - value / 4 for value in SKEWED], (None, 1.0)),
+        ("vorticity_pearson", [value / 4 - 1.0 for value in SKEWED], (-1.0, None)),
+        ("outside_share", [100.0 - value for value in SKEWED], (None, 100.0)),
+        ("vorticity_residual_p50", SKEWED, (None, None)),
+    ],
+)
+def test_an_interval_ends_where_the_metric_ends(
+    metric: str, values: Sequence[float], ends: tuple[float | None, float | None]
+) -> None:
+    """The stretched bootstrap of few skewed values reaches beyond; it is cut off."""
+    score = replace(score_of(*values, metric=metric), frames=tuple(range(8)))
+    low, high = bootstrap_interval(values)
+    least, greatest = ends
+    if least is not None:
+        assert low < least
+        low = least
+    if greatest is not None:
+        assert high > greatest
+        high = greatest
+    assert score.interval == (low, high)
+
+
+def test_an_interval_holds_its_values_whatever_the_range_is() -> None:
+    """A metric of another package may be below what it calls perfect."""
+    values = [-4.0, -3.0, -3.5, -2.5, -3.0]
+    low, high = bootstrap_interval(values)
+    assert score_of(*values).interval == (max(low, -4.0), high)
 
 
 def test_ranges_of_ranks_are_those_of_all_draws() -> None:

@@ -24,7 +24,6 @@ from lagbench.figures.html import (
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
     Score,
-    bootstrap_interval,
     mean_over_seeds,
 )
 from lagbench.metrics.metric import Metric
@@ -219,7 +218,7 @@ def _error_axis(name: str, series: Sequence[Series]) -> AxisScale:
 
 def _frame_intervals(score: Score) -> tuple[Floats, Floats]:
     """Return low and high end of the interval of each frame, shape [frame] each."""
-    bounds = [bootstrap_interval(values) for values in score.per_frame.T]
+    bounds = [score.interval_at(frame) for frame in score.frames]
     low, high = np.array(bounds).T
     return low, high
 

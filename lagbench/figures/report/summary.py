@@ -14,7 +14,7 @@ from lagbench.figures.html import (
     text,
     words,
 )
-from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
@@ -94,10 +94,10 @@ def _draw_tiles(subject: Subject) -> list[Markup]:
         if name == "stable_frames":
             tiles.append(_draw_score_tile("stable", score, describe_stability(score)))
         elif name == "vorticity_pearson":
-            values = score.at(subject.key_frame)
-            bounds = bootstrap_interval(values)
-            note = f"at frame {subject.key_frame}"
-            tiles.append(_draw_tile(words(name), mean(values), bounds, note))
+            frame = subject.key_frame
+            bounds = score.interval_at(frame)
+            note = f"at frame {frame}"
+            tiles.append(_draw_tile(words(name), mean(score.at(frame)), bounds, note))
         else:
             note = TILE_NOTES.get(name, "mean over the horizon")
             tiles.append(_draw_score_tile(words(name), score, note))
