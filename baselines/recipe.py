@@ -329,6 +329,8 @@ def recipe_for(
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
     if part is None:
         if file.recipes or variant:
+            if path == entry.recipes and not _has_recipes_of(split, file):
+                raise _no_recipe_of_split(entry, f"{split}/{size}", file)
             raise _missing_recipe(entry, name, variant, file)
         part = _SharedRecipe()
     _check_baselines(part, where=f"{path}, {name}, baselines")
@@ -355,6 +357,28 @@ def recipe_for(
         name=name,
         model=model.model_dump(mode="json"),
         training=training,
+    )
+
+
+def _has_recipes_of(split: str, file: _RecipeFile) -> bool:
+    """Return whether a file has any recipe of a split, or of any split."""
+    splits = {recipe.partition("/")[0] for recipe in file.recipes}
+    return not splits.isdisjoint((split, ANY))
+
+
+def _no_recipe_of_split(
+    entry: CatalogueEntry, name: str, file: _RecipeFile
+) -> UsageError:
+    """Return the error of a split that a baseline knows nothing of, as a user's own."""
+    splits = {recipe.partition("/")[0] for recipe in file.recipes}
+    example = f"{{format: 1, recipes: {{{name}: {{training: {{steps: 2000}}}}}}}}"
+    return UsageError(
+        f"{entry.name} has no recipe {name!r}",
+        where="--recipe",
+        expected=f"a YAML file with a recipe of {name}",
+        got=f"recipes of {', '.join(sorted(splits)) or 'no split'}",
+        fix=f"write a file, as in {example}, and add --recipe FILE.yaml; "
+        f"docs/exchange.md says more",
     )
 
 

@@ -6,6 +6,7 @@ import inspect
 import itertools
 import json
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -383,6 +384,18 @@ def test_no_such_recipe(entry: CatalogueEntry) -> None:
     ):
         with pytest.raises(UsageError, match=words):
             recipe_for(asked, split, size, variant=variant)
+
+
+def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
+    """No recipe of another split is suggested; the example is one that works."""
+    with pytest.raises(UsageError) as caught:
+        recipe_for(find("gns"), "own", "full", variant="short")
+    fix = str(caught.value.fix)
+    assert "did you mean" not in fix
+    path = tmp_path / "recipe.yaml"
+    path.write_text(re.search(r"\{.*\}", fix)[0])  # type: ignore[index]
+    recipe = recipe_for(find("gns"), "own", "full", variant=str(path))
+    assert recipe.name == "own/full"
 
 
 @pytest.mark.parametrize(
