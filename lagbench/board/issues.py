@@ -44,7 +44,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "docs/submitting.md describes the keys",
     ),
     "split": BoardCheck(
-        "an entry for a split or size that datasets.yaml does not have",
+        "an entry for a split or size that neither lagbench nor an installed package "
+        "has",
         "no such split and size",
         "a split and size that `lagbench list` shows",
         "name another",

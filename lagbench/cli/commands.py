@@ -32,7 +32,7 @@ COMMANDS = (
     CommandEntry(
         name="verify",
         target="verify:verify_command",
-        summary="Hash the files of a split and compare the hashes with datasets.yaml.",
+        summary="Hash the files of a split and compare them with the recorded hashes.",
         example="verify --split cavity --size tiny --regenerate 2",
     ),
     CommandEntry(

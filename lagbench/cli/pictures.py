@@ -50,7 +50,12 @@ def plot_command(
         int, option("--frame", "Frame number; -1 is the last frame.")
     ] = -1,
     kind: Annotated[
-        str, option("--kind", "all, speed, material, vorticity or streamlines.")
+        str,
+        option(
+            "--kind NAME",
+            "all, speed, material, vorticity, streamlines; of boxes of three "
+            "dimensions also front or above.",
+        ),
     ] = "all",
     sheet: Annotated[
         bool, option("--sheet", "Draw many scenarios of the split on one page instead.")
@@ -75,7 +80,7 @@ def plot_command(
         tier = locate(split_name, size, root=root).size
         page = output or Path(f"{tier.split}-{tier.name}-sheet.png")
         require_folder_of(page)
-        path = contact_sheet(split_name, tier.name, page, root=root, dpi=dpi)
+        path = contact_sheet(split_name, tier.name, page, root=root, kind=kind, dpi=dpi)
     else:
         path = plot(
             _choose_source(source, split),

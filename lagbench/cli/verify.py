@@ -43,7 +43,7 @@ def verify_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Hash the files of a split and compare the hashes with datasets.yaml."""
+    """Hash the files of a split and compare them with the recorded hashes."""
     with progress_bar(quiet=quiet) as progress:
         result = verify(
             split,

@@ -210,7 +210,14 @@ class Fields:
         """
         if self.grid.dimension == 2:
             return self
-        layer = self.grid.middle_layer
+        return self.slice_across_z(self.grid.middle_layer)
+
+    def slice_across_z(self, layer: int) -> Fields:
+        """Return the fields in one plane across z, in three dimensions.
+
+        Args:
+            layer: number of its nodes along z.
+        """
         return Fields(
             self.grid.section,
             self.weight[..., layer],

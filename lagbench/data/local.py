@@ -156,7 +156,7 @@ class RootedRegistry(Registry):
     """
 
     def __init__(self, base: Registry, root: Path) -> None:
-        super().__init__(base.splits, base.measured, base.files)
+        super().__init__(base.splits, base.measured, base.files, base.package_splits)
         self.base = base
         self.root = root
 

@@ -14,7 +14,7 @@ import functools
 import os
 import sys
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -211,6 +211,7 @@ class Size(BaseModel):
     task: Task
     measured: Measured | None = None
     file: Path = Path("datasets.yaml")  # the file that describes it
+    package_file: bool = False  # whether that file belongs to another package
     scored_subset: str = "test"  # subset that is predicted and scored
     # seed of all draws of a season [64 hex digits]; without it they follow from the
     # names of split, size, version and scenario
@@ -254,6 +255,19 @@ class Size(BaseModel):
         return Box.from_bounds(self.bounds, periodic)
 
     @property
+    def record_name(self) -> str:
+        """Name of the file that describes the size and records its hashes.
+
+        It is datasets.yaml of lagbench, a file in the folder of another package, or the
+        description of a local split.
+        """
+        if self.draw_seed is not None:
+            return "the scores of the season"
+        if self.package_file:
+            return f"{self.file.parent.name}/{self.file.name}"
+        return self.file.name
+
+    @property
     def field_grid(self) -> Grid:
         """Grid of the scorer's fields."""
         score_grid = self.task.score_grid
@@ -264,7 +278,7 @@ class Size(BaseModel):
         if name not in self.parameters:
             raise UsageError(
                 f"no parameter {name!r}",
-                where=f"datasets.yaml, {self.split} {self.name}",
+                where=f"{self.record_name}, {self.split} {self.name}",
                 fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
@@ -448,10 +462,12 @@ class Registry:
         splits: Mapping[str, Split],
         measured: Mapping[str, Mapping[str, Measured]],
         files: Mapping[str, Path] | None = None,
+        package_splits: Collection[str] = (),
     ) -> None:
         self.splits = dict(splits)
         self.measured = measured
         self.files = dict(files or {})
+        self.package_splits = frozenset(package_splits)
 
     def split(self, name: str) -> Split:
         """Return a split by name."""
@@ -490,6 +506,7 @@ class Registry:
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),
             file=self.files.get(split, Path("datasets.yaml")),
+            package_file=split in self.package_splits,
             draw_seed=entry.draw_seed,
         )
 
@@ -569,6 +586,7 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
         {**registry.splits, name: split},
         {**registry.measured, name: measured},
         {**registry.files, name: path},
+        {*registry.package_splits, name},
     )
 
 

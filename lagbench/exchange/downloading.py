@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lagbench.addresses import ARCHIVES, describe
 from lagbench.data.layout import MANIFEST_NAME, scenario_path
-from lagbench.data.local import locate_new
+from lagbench.data.local import locate_new, suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     MANIFEST_LIMIT,
@@ -245,8 +245,11 @@ class DownloadJob:
                 unknown.append(scenario)
         if unknown:
             return DataError(
-                "datasets.yaml has no hash to check downloads against",
+                "no hash is recorded to check downloads against",
                 where=f"{place}, scenarios {format_ids(unknown)}",
+                expected=f"their hashes in {self.size.record_name}",
+                got="none",
+                fix=suggest_repair(self.size),
             )
         archives = None
         if self.size.simulated:

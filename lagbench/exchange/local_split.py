@@ -47,6 +47,7 @@ from .trajectory import (
     Bounds,
     Description,
     Trajectory,
+    bounds_example,
     check_name,
     estimate_spacing,
 )
@@ -446,7 +447,8 @@ class SplitBuilder:
                 where=f"{where}, along {name}",
                 expected="steps much shorter than the box, as of most particles",
                 got=f"{crossing_count} of {len(step)} particles jump",
-                fix=f"if the box is periodic: --periodic {axes} with --bounds",
+                fix=f"if the box is periodic: --periodic {axes} with the ends of "
+                f"the box, as in {bounds_example(step.shape[1])}",
             )
 
     def _transform_velocities(

@@ -222,6 +222,15 @@ def check_name(name: str) -> None:
     )
 
 
+def bounds_example(dimension: int) -> str:
+    """Return how the bounds of a box of side 1 are given on the command line.
+
+    >>> bounds_example(2)
+    '--bounds 0,1,0,1'
+    """
+    return f"--bounds {','.join(['0,1'] * dimension)}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Description:
     """What is known of data from elsewhere; lengths are those of the source.
@@ -312,17 +321,24 @@ class Description:
         for low, high in self.bounds or ():
             if not -MOST <= low < high <= MOST:
                 raise UsageError(
-                    "bounds run from low to high", where="--bounds", got=self.bounds
+                    "bounds run from low to high",
+                    where="--bounds",
+                    expected=f"low < high along each axis, from {-MOST:g} to {MOST:g}",
+                    got=self.bounds,
+                    fix=f"give them as in {bounds_example(len(self.bounds))}",
                 )
 
     def _check_periodic(self) -> None:
         if not self.periodic:
             return
         if self.bounds is None:
+            dimension = 3 if "z" in self.periodic else 2
             raise UsageError(
                 "a periodic axis needs bounds: they are its period",
                 where="--periodic",
-                fix="add --bounds",
+                expected="X0,X1,Y0,Y1 of the box, in three dimensions also Z0,Z1",
+                got="nothing",
+                fix=f"add them, as in {bounds_example(dimension)} for a box of side 1",
             )
         try:
             parse_periodic(self.periodic, len(self.bounds))
@@ -332,6 +348,7 @@ class Description:
                 where="--periodic",
                 expected=error.expected,
                 got=error.got,
+                fix="separate them by commas, as in --periodic x,y",
             ) from None
 
     @cached_property

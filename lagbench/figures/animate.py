@@ -21,12 +21,12 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, suggest_name
 from lagbench.work.progress import watched
 
-from .canvas import DPI, figure, pixels_of
+from .canvas import DPI, figure, pixels_of, shrink
 from .colours import INK, MUTED
 from .encoders import encode_gif, encode_mp4
 from .painter import Painter, unpack
-from .panels import Panel, colour_bar, limit_of, material_key
-from .plot import describe
+from .panels import Panel, colour_bar, limit_of, material_key, name_slice
+from .plot import SEPARATOR, describe
 from .recording import Recording, open_recording
 
 if TYPE_CHECKING:
@@ -178,6 +178,11 @@ class Film:
         """Draw all that does not move."""
         self._recordings = recordings
         self._panel = panel
+        if panel is Panel.VORTICITY:
+            for recording in recordings:
+                frames = _sample_frames(recording)
+                recording.fix_layer(frames)
+                _check_vorticity(recording, frames)
         self._limit = _common_limit(recordings, panel)
         self._painters = []
         self._lefts = []  # left side of each panel [pixel]
@@ -231,7 +236,7 @@ class Film:
         width, height = self.size
         with figure(width / DPI, height / DPI) as drawn:
             titles = dict.fromkeys(recording.title for recording in self._recordings)
-            drawn.text(
+            title = drawn.text(
                 MARGIN / width,
                 1 - 14 / height,
                 " | ".join(titles),
@@ -239,10 +244,16 @@ class Film:
                 fontweight="bold",
                 va="top",
             )
+            shrink(title, (width - 2 * MARGIN) / DPI)
             name_height = 1 - (TOP - 12) / height
             for recording, left in zip(self._recordings, self._lefts, strict=True):
                 name = describe(recording)
-                drawn.text(left / width, name_height, name, fontsize=9, color=MUTED)
+                if self._panel is Panel.VORTICITY and recording.is_solid:
+                    name = f"{name}{SEPARATOR}{name_slice(recording.scene(0))}"
+                text = drawn.text(
+                    left / width, name_height, name, fontsize=9, color=MUTED
+                )
+                shrink(text, SIDE / DPI)
 
             bar_bottom = (BOTTOM - 24) / height
             place = (MARGIN / width, bar_bottom, BAR / width, 10 / height)
@@ -262,9 +273,8 @@ def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
         return 1.0
     tops = []
     for recording in recordings:
-        numbers = np.linspace(0, recording.frames - 1, SAMPLES).astype(int)
         limits = []
-        for number in np.unique(numbers).tolist():
+        for number in _sample_frames(recording):
             limits.append(limit_of(panel, recording.scene(number)))
         if panel is Panel.VORTICITY:
             # No vorticity is white: on the scale of the strongest frame most of a film
@@ -273,6 +283,27 @@ def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
         else:
             tops.append(max(limits))
     return max(tops)
+
+
+def _check_vorticity(recording: Recording, frames: Sequence[int]) -> None:
+    """Refuse a film of a vorticity that no frame has."""
+    for frame in frames:
+        if np.isfinite(recording.scene(frame).vorticity).any():
+            return
+    raise UsageError(
+        "there is no vorticity to show: material is too thin for the grid",
+        where="--kind",
+        expected="speed or material",
+        got=str(Panel.VORTICITY),
+        fix="leave --kind out",
+    )
+
+
+def _sample_frames(recording: Recording) -> list[int]:
+    """Return some frames, spread over a recording."""
+    numbers = np.linspace(0, recording.frames - 1, SAMPLES).astype(int)
+    frames: list[int] = np.unique(numbers).tolist()
+    return frames
 
 
 def _draw_letter(letter: str) -> NDArray[np.uint8]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
     from PIL.Image import Image
 
 ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
@@ -211,9 +212,20 @@ def draw_header(drawn: Figure, title: str, subtitle: str, *, left: float) -> Non
     width, height = drawn.get_size_inches()
     x = left / width
     y = 1 - 0.16 / height
-    drawn.text(x, y, title, fontsize=13, fontweight="bold", va="top")
+    first = drawn.text(x, y, title, fontsize=13, fontweight="bold", va="top")
     below = 1 - 0.43 / height
-    drawn.text(x, below, subtitle, fontsize=9.5, color=MUTED, va="top")
+    second = drawn.text(x, below, subtitle, fontsize=9.5, color=MUTED, va="top")
+    for text in (first, second):
+        shrink(text, width - 2 * left)
+
+
+def shrink(text: Text, width: float) -> None:
+    """Make the letters of a text smaller where it is wider than a width [inch]."""
+    drawn = text.get_figure()
+    assert drawn is not None  # the text stands in a figure
+    length = text.get_window_extent().width / drawn.dpi
+    if length > width:
+        text.set_fontsize(text.get_fontsize() * width / length)
 
 
 def pixels_of(drawn: Figure) -> NDArray[np.uint8]:

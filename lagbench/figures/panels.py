@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lagbench.data import MATERIALS
 
 from .canvas import build_speed_map, build_vorticity_map
-from .colours import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL
+from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL
 from .particles import DOT_DIAMETER
 from .recording import Recording, Scene
 from .solid import SLICE, View, shade
@@ -37,6 +37,8 @@ class Panel(enum.StrEnum):
     MATERIAL = "material"
     VORTICITY = "vorticity"
     STREAMLINES = "streamlines"
+    FRONT = "front"
+    ABOVE = "above"
 
 
 TITLES = {  # heading of each panel
@@ -44,22 +46,44 @@ TITLES = {  # heading of each panel
     Panel.MATERIAL: "Particles by material",
     Panel.VORTICITY: "Vorticity",
     Panel.STREAMLINES: "Streamlines",
+    Panel.FRONT: "From the front",
+    Panel.ABOVE: "From above",
 }
+VIEWS = (Panel.FRONT, Panel.ABOVE)
+"""Panels of boxes of three dimensions only: particles by speed, in true scale."""
+
+VIEW_FADE = 0.5
+"""Depth of the farthest particle of a view: it is less pale than in the cube."""
+
+OF_PARTICLES = (Panel.SPEED, Panel.MATERIAL, *VIEWS)
+"""Panels that show particles, not fields on the grid."""
+
 UNITS = {  # label of each colour bar; time is physical, as in velocities of the files
     Panel.SPEED: "speed  [length/s]",
     Panel.VORTICITY: "vorticity  [1/s]",
     Panel.STREAMLINES: "speed on the grid  [length/s]",
+    Panel.FRONT: "speed  [length/s]",
+    Panel.ABOVE: "speed  [length/s]",
 }
+TOO_THIN = "material is too thin here\nfor a field on the grid"
 
 
-def title_of(panel: Panel, recording: Recording) -> str:
+def title_of(panel: Panel, scene: Scene) -> str:
     """Return the heading of a panel; fields of three dimensions are slices."""
     title = TITLES[panel]
-    if not recording.is_solid or panel in (Panel.MATERIAL, Panel.SPEED):
+    if not scene.recording.is_solid or panel in OF_PARTICLES:
         return title
     if panel is Panel.VORTICITY:
         title = "Vorticity magnitude"
-    return f"{title}, {SLICE}"
+    return f"{title}, {name_slice(scene)}"
+
+
+def name_slice(scene: Scene) -> str:
+    """Return where the plane lies that is drawn of a box of three dimensions."""
+    if scene.recording.is_full_box:
+        return SLICE
+    place = scene.recording.size.field_grid.places(2)[scene.layer]
+    return f"across z at {place:.2f}"
 
 
 # particles drawn at the most; more would take memory and no eye would tell
@@ -75,10 +99,10 @@ _ARROWHEADS = (-0.4, -0.2, 0.0, 0.2, 0.4)
 
 def limit_of(panel: Panel, scene: Scene) -> float:
     """Return the top of the colour scale: the 99th percentile of what is shown."""
-    if panel is Panel.SPEED:
+    if panel is Panel.SPEED or panel in VIEWS:
         values = scene.speed
     elif panel is Panel.VORTICITY:
-        values = np.abs(scene.vorticity[scene.fields.differentiable])
+        values = np.abs(scene.vorticity[np.isfinite(scene.vorticity)])
     else:
         values = _grid_speed(scene)[scene.fields.counted]
     if values.size == 0:
@@ -99,18 +123,19 @@ def draw(
         detail: how dense and thick streamlines are, 0 to 1.
     """
     recording = scene.recording
-    shows_particles = panel in (Panel.MATERIAL, Panel.SPEED)
-    if recording.is_solid and shows_particles:
+    if panel is Panel.ABOVE:
+        draw_walls(axes, recording, scene.frame, plane=(0, 2))
+    elif recording.is_solid and panel in (Panel.MATERIAL, Panel.SPEED):
         draw_cube(axes, recording, scene.frame)
     else:
         draw_walls(axes, recording, scene.frame)
     scale = colour_scale(panel, limit, is_solid=recording.is_solid)
     if panel is Panel.MATERIAL:
         colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
-        _draw_dots(axes, scene, colours)
-    elif panel is Panel.SPEED:
+        _draw_dots(axes, scene, colours, panel)
+    elif panel in OF_PARTICLES:
         colours = scale.to_rgba(scene.speed)
-        _draw_dots(axes, scene, colours)
+        _draw_dots(axes, scene, colours, panel)
     elif panel is Panel.VORTICITY:
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
@@ -119,11 +144,16 @@ def draw(
         _draw_streamlines(axes, scene, detail=detail)
 
 
-def box_of(recording: Recording) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top wall of the box [length]."""
-    horizontal, vertical = recording.size.bounds[:2]
-    left, right = horizontal
-    bottom, top = vertical
+def box_of(
+    recording: Recording, plane: tuple[int, int] = (0, 1)
+) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top wall of the box [length].
+
+    The plane names the axes to the right and upwards.
+    """
+    horizontal, vertical = plane
+    left, right = recording.size.bounds[horizontal]
+    bottom, top = recording.size.bounds[vertical]
     return left, right, bottom, top
 
 
@@ -160,10 +190,17 @@ def _fill_rectangle(
     axes.add_patch(rectangle)
 
 
-def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
+def draw_walls(
+    axes: Axes,
+    recording: Recording,
+    frame: int,
+    *,
+    plane: tuple[int, int] = (0, 1),
+) -> None:
     """Draw the walls as bands around the box.
 
-    Arrowheads on a moving wall show which way it slides.
+    Arrowheads on a moving wall show which way it slides. The plane names the axes to
+    the right and upwards.
     """
     axes.set(
         xlim=(0, 1),
@@ -173,22 +210,23 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
         aspect="equal",
         frame_on=False,
     )
-    left, right, bottom, top = box_of(recording)
+    left, right, bottom, top = box_of(recording, plane)
     width = right - left
     height = top - bottom
     _fill_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
     _fill_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
 
-    # x, y, width and height of the walls left, right, bottom, top
-    bands = [
-        (0, bottom, left, height),
-        (right, bottom, 1 - right, height),
-        (left, 0, width, bottom),
-        (left, top, width, 1 - top),
-    ]
+    # x, y, width and height of the walls at both ends of both axes
+    horizontal, vertical = plane
+    bands = {
+        2 * horizontal: (0, bottom, left, height),
+        2 * horizontal + 1: (right, bottom, 1 - right, height),
+        2 * vertical: (left, 0, width, bottom),
+        2 * vertical + 1: (left, top, width, 1 - top),
+    }
     for wall, velocity in moving_walls(recording, frame):
-        along_plane = velocity[:2]
-        if wall < len(bands) and along_plane.any():
+        along_plane = velocity[list(plane)]
+        if wall in bands and along_plane.any():
             _draw_moving_wall(axes, bands[wall], along_plane)
 
 
@@ -235,7 +273,7 @@ def _draw_moving_wall(
         axes.fill(*np.transpose(corners), color=PAPER, lw=0, zorder=0.7)
 
 
-def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
+def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) -> None:
     """Draw a dot for every particle, or for every k-th of too many.
 
     Dots are cut off at the walls. In three dimensions farther ones are drawn first,
@@ -249,23 +287,44 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
     colours = colours[::step]
     scale = 1.0
     if recording.is_solid:
-        view = View(recording.size.box)
-        scale = view.scale
-        depth = view.depth(position)
+        place, depth, scale = _project(recording, position, panel)
         order = np.argsort(-depth, kind="stable")
         rgb = to_rgba_array(colours)[order, :3]
         colours = shade(rgb, depth[order], np.ones(3))
-        position = view.place(position[order])
+        position = place[order]
     x, y = position.T
-    drawn = axes.get_figure()
-    assert drawn is not None  # axes stand in a figure
-    side = axes.get_position().width * drawn.get_figwidth()  # type: ignore[union-attr]
     length = DOT_DIAMETER * recording.spacing * scale
-    diameter = length * POINTS_PER_INCH * side  # [point]
+    diameter = length * POINTS_PER_INCH * _side_of(axes)  # [point]
     area = step * float(diameter**2)  # [point^2]
     dots = axes.scatter(x, y, area, colours, linewidths=0, zorder=2)
     if not recording.is_solid:
         dots.set_clip_path(_box_patch(axes, recording))
+
+
+def _side_of(axes: Axes) -> float:
+    """Return the side of a panel [inch]."""
+    drawn = axes.get_figure()
+    assert drawn is not None  # axes stand in a figure
+    width: float = drawn.get_figwidth()  # type: ignore[union-attr]
+    return float(axes.get_position().width * width)
+
+
+def _project(
+    recording: Recording, position: Floats, panel: Panel
+) -> tuple[Floats, Floats, float]:
+    """Return where points stand in a panel, how deep they lie, and its scale.
+
+    Places have the shape [particle, 2], depths from 0 to 1 the shape [particle]. The
+    scale is in sides of the panel per length.
+    """
+    if panel not in VIEWS:
+        view = View(recording.size.box)
+        return view.place(position), view.depth(position), view.scale
+    low, high = np.transpose(recording.size.box.bounds)
+    share = np.clip((position - low) / (high - low), 0.0, 1.0)
+    if panel is Panel.FRONT:
+        return position[:, :2], VIEW_FADE * share[:, 2], 1.0
+    return position[:, [0, 2]], VIEW_FADE * (1.0 - share[:, 1]), 1.0
 
 
 def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
@@ -299,6 +358,9 @@ def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) 
     )
     image.set_clip_path(_box_patch(axes, scene.recording))
     axes.set(xlim=(0, 1), ylim=(0, 1))
+    if not np.isfinite(field).any():
+        size = POINTS_PER_INCH * _side_of(axes) / 24.0  # a line has about 24 letters
+        axes.text(0.5, 0.5, TOO_THIN, color=MUTED, fontsize=min(9.0, size), ha="center")
 
 
 def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:

@@ -44,7 +44,8 @@ def plot(
         size: name of the size; as :func:`lagbench.open_split` picks it when None.
         scenario: scenario id; the first one of test when None.
         frame: absolute frame number; negative ones count from the end.
-        kind: all (three panels), speed, material, vorticity or streamlines.
+        kind: all (three panels), speed, material, vorticity or streamlines; in three
+            dimensions also front or above, which all has of free surfaces.
         output: file to write, ending in .png, .pdf or .svg; named after the data in the
             working folder when None.
         dpi: pixels per inch.

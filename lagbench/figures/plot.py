@@ -22,9 +22,10 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, suggest_name
 from lagbench.store.copy import update_working_copy
 
-from .canvas import DPI, draw_header, figure, save
+from .canvas import DPI, draw_header, figure, save, shrink
 from .colours import MUTED
 from .panels import (
+    VIEWS,
     Panel,
     colour_bar,
     draw,
@@ -65,6 +66,7 @@ GAP = 0.25
 MARGIN = 0.25
 TOP = 0.96
 BAR = 0.66
+LINE = 0.17  # second line of the title of a single panel
 
 # lengths of a sheet [inch]
 CELL = 1.3
@@ -76,8 +78,11 @@ FOOT = 0.58
 NARROWEST = 5.0
 
 COLUMNS = 6  # of a table of scenarios at one frame
-# moments of a row over time, as shares of the last frame
+# moments of a row over time, as shares of the last frame; those of a long recording
+# are close where bodies fall and collide
 TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
+EVEN_TIMES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+FEWEST_BETWEEN = 5  # frames between two moments; where there are fewer they are even
 # moments of flows that walls drive, as shares of the last frame of interest
 MOMENTS = (1 / 9, 1 / 2, 1.0)
 # most scenarios on a sheet of flows that walls drive, and of flows that only decay
@@ -133,18 +138,21 @@ def plot_frame(
     panels = _choose_panels(kind, recording)
     width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
     height = TOP + SIDE + BAR
+    is_single = len(panels) == 1
+    if is_single:
+        height += LINE
     with figure(width, height, dpi=dpi) as drawn:
-        if len(panels) > 1:
-            subtitle = _describe_scene(scene)
-            moment = ""
-        else:
+        subtitle = _describe_scene(scene)
+        if is_single:
             subtitle = describe(recording)
-            moment = f" at frame {scene.frame}, t = {scene.time:.2f} s"
         draw_header(drawn, recording.title, subtitle, left=MARGIN)
         for column, panel in enumerate(panels):
             left = (MARGIN + column * (SIDE + GAP)) / width
             axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
-            axes.set_title(title_of(panel, recording) + moment)
+            title = title_of(panel, scene)
+            if is_single:
+                title = f"{title}\nframe {scene.frame}, t = {scene.time:.2f} s"
+            shrink(axes.set_title(title), SIDE)
             limit = limit_of(panel, scene)
             draw(axes, panel, scene, limit=limit)
 
@@ -160,10 +168,28 @@ def plot_frame(
 
 def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
     if kind != ALL:
+        _check_view(Panel(kind), recording.size)
         return [Panel(kind)]
+    if recording.is_solid and not recording.is_full_box:
+        # a slice of a splash is thin or empty
+        first = Panel.MATERIAL if recording.is_mixed else Panel.SPEED
+        return [first, Panel.FRONT, Panel.ABOVE]
     if recording.is_mixed:
         return [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
     return [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
+
+
+def _check_view(panel: Panel, size: Size) -> None:
+    """Refuse a view that a box of two dimensions does not have."""
+    if panel in VIEWS and size.dimension == 2:
+        raise UsageError(
+            f"there is no view {str(panel)!r} of two dimensions",
+            where="--kind",
+            expected="all, speed, material, vorticity or streamlines",
+            got=str(panel),
+            fix=f"leave --kind out, or name a split of three dimensions: "
+            f"{size.split} has two",
+        )
 
 
 def describe(recording: Recording) -> str:
@@ -252,7 +278,7 @@ def contact_sheet(
         size: name of the size.
         output: file to write, ending in .png, .pdf or .svg.
         root: folder that holds all data sets; see ``resolve_root``.
-        kind: what each panel shows; the default suits the split.
+        kind: what each panel shows; the default, as ``all``, suits the split.
         frame: frame to show where the sheet is a table of scenarios; when None, the
             first, the last frame of interest of what starts at rest, or three frames up
             to that of what is driven.
@@ -272,8 +298,10 @@ def contact_sheet(
             "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
         )
     panel = None
-    if kind is not None:
+    if kind is not None and kind != ALL:
+        check_kind(kind)
         panel = Panel(kind)
+        _check_view(panel, tier)
 
     kinds = _first_of_each_kind(files, splits)
     if kinds:
@@ -316,6 +344,15 @@ def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Pa
     return paths_by_name
 
 
+def choose_moments(frames: int) -> list[int]:
+    """Return the frames of a row over time, of a recording of so many frames."""
+    last = frames - 1
+    shares = TIMES
+    if TIMES[1] * last < FEWEST_BETWEEN:
+        shares = EVEN_TIMES
+    return [round(share * last) for share in shares]
+
+
 def _arrange_over_time(
     kinds: Mapping[str, Path], panel: Panel | None, splits: Registry
 ) -> ContactSheet:
@@ -326,9 +363,8 @@ def _arrange_over_time(
         row = []
         with open_recording(path, registry=splits) as recording:
             is_mixed = is_mixed or recording.is_mixed
-            last = recording.frames - 1
-            for share in TIMES:
-                row.append(recording.scene(round(share * last)))
+            for number in choose_moments(recording.frames):
+                row.append(recording.scene(number))
         rows.append(row)
     if panel is None and is_mixed:
         panel = Panel.MATERIAL
@@ -454,7 +490,8 @@ def _draw_sheet(
 
 
 def _draw_cell(axes: Axes, panel: Panel, cell: SheetCell) -> None:
-    axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
+    title = axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
+    shrink(title, CELL)
     draw(axes, panel, cell.scene, limit=cell.limit, detail=0.0)
 
 

@@ -7,7 +7,7 @@ A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
+from lagbench.data.grid import Placement
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
@@ -60,8 +61,40 @@ class Scene:
 
     @cached_property
     def fields(self) -> gridding.Fields:
-        """Fields on the size's score grid; vorticity and divergence in 1/frame."""
-        return self._whole_fields.section
+        """Fields on the size's score grid; vorticity and divergence in 1/frame.
+
+        In three dimensions they are those of the plane across z that is drawn.
+        """
+        if self._whole_fields.grid.dimension == 2:
+            return self._whole_fields
+        return self._whole_fields.slice_across_z(self.layer)
+
+    @cached_property
+    def layer(self) -> int:
+        """Number along z of the nodes of the plane that is drawn, in three dimensions.
+
+        It is the middle one of a full box. Else it is the one with the most nodes that
+        have a vorticity, or, where there are none, that count.
+        """
+        whole = self._whole_fields
+        middle = whole.grid.middle_layer
+        if self.recording.is_full_box:
+            return middle
+        if self.recording.layer is not None:
+            return self.recording.layer
+        differentiable, counted = self.nodes_of_layers
+        away = np.abs(np.arange(len(counted)) - middle)
+        order = np.lexsort((away, -counted, -differentiable))
+        return int(order[0])
+
+    @property
+    def nodes_of_layers(self) -> NDArray[np.intp]:
+        """Nodes with a vorticity, and those that count, shape [2, z node]."""
+        whole = self._whole_fields
+        counts = []
+        for is_node in (whole.differentiable, whole.counted):
+            counts.append(np.count_nonzero(is_node, axis=(0, 1)))
+        return np.array(counts)
 
     @cached_property
     def _whole_fields(self) -> gridding.Fields:
@@ -73,13 +106,13 @@ class Scene:
     def vorticity(self) -> NDArray[np.float64]:
         """Vorticity at the nodes of the score grid [1/s], shape [x node, y node].
 
-        In three dimensions it is the magnitude in the middle plane across z.
+        In three dimensions it is the magnitude in the plane that is drawn.
         """
         interval = self.recording.size.frame_interval
         whole = self._whole_fields
         if whole.grid.dimension == 2:
             return whole.vorticity / interval
-        across = whole.vorticity[:, :, whole.grid.middle_layer]
+        across = whole.vorticity[:, :, self.layer]
         magnitude: NDArray[np.float64] = np.sqrt((across**2).sum(axis=-1))
         return magnitude / interval
 
@@ -112,6 +145,8 @@ class Recording:
         self.scenario = int(identity["scenario"])
         self.parameters = parameters
         self.frames = frames
+        # plane across z that is drawn of every frame; None: the best one of each frame
+        self.layer: int | None = None
         self._read = read
         # rows of NaN fill up scenarios that have fewer particles than others
         self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
@@ -147,6 +182,21 @@ class Recording:
     def is_solid(self) -> bool:
         """Whether the box has three dimensions."""
         return self.size.dimension == 3
+
+    @property
+    def is_full_box(self) -> bool:
+        """Whether material fills the box; else it has a free surface."""
+        placement = Placement(self.size.task.score_grid.placement)
+        return placement is Placement.CELL_CENTRES
+
+    def fix_layer(self, frames: Iterable[int]) -> None:
+        """Draw one plane across z of all frames: the best one of these frames."""
+        if self.is_full_box or not self.is_solid:
+            return
+        counts = np.sum([self.scene(frame).nodes_of_layers for frame in frames], axis=0)
+        differentiable, counted = counts
+        order = np.lexsort((-counted, -differentiable))
+        self.layer = int(order[0])
 
     @property
     def reynolds(self) -> float | None:

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, to_plain
 from lagbench.data.layout import scenario_path, url_of
-from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
@@ -269,7 +268,7 @@ def _check_content(
     if manifest:
         claim = manifest.entry(scenario)
     expected = recorded_hash(size, scenario)
-    source = record_name(size)
+    source = size.record_name
     if expected is None and claim is not None:
         expected = claim.content_sha256
         source = "the manifest"
@@ -381,17 +380,8 @@ def _check_header(
         raise DataError(
             "a file was simulated with other parameters",
             where=f"{path}, attributes {', '.join(different)}",
-            expected="those of datasets.yaml",
+            expected=f"those of {size.record_name}",
         )
-
-
-def record_name(size: Size) -> str:
-    """Return the name of the file that records the hashes of a split."""
-    if size.draw_seed is not None:
-        return "the scores of the season"
-    if size.simulated:
-        return "datasets.yaml"
-    return DESCRIPTION
 
 
 def compare_hashes(
@@ -405,7 +395,7 @@ def compare_hashes(
     Raises:
         DataError: a hash is not the recorded one.
     """
-    record = record_name(size)
+    record = size.record_name
     measured = size.measured
     if measured is None:
         return f"{record} holds no hash of this size yet: nothing to compare with"
@@ -447,19 +437,19 @@ def _hash_error(size: Size, what: str, place: str) -> DataError:
     return DataError(
         what,
         where=f"{size.split} {size.name}, {place}",
-        expected=f"the hashes in {record_name(size)}",
+        expected=f"the hashes in {size.record_name}",
         fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
     )
 
 
 def unlike(size: Size) -> str:
     """Return the words for a hash that is not the recorded one."""
-    return f"NOT that of {record_name(size)}"
+    return f"NOT that of {size.record_name}"
 
 
 def other_bits(size: Size) -> str:
     """Return the words for bits that may be others."""
-    return f"other bits than {record_name(size)} (identity: tolerance)"
+    return f"other bits than {size.record_name} (identity: tolerance)"
 
 
 def hash_verdict(
@@ -470,11 +460,11 @@ def hash_verdict(
     """
     recorded = _recorded_digest(size, subset)
     if recorded is None:
-        return f"no hash in {record_name(size)} yet"
+        return f"no hash in {size.record_name} yet"
     if computed is None:
         return "incomplete"
     if computed == recorded:
-        return f"equal to {record_name(size)}"
+        return f"equal to {size.record_name}"
     if tolerated:
         return other_bits(size)
     return unlike(size)

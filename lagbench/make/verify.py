@@ -38,7 +38,6 @@ from .inventory import (
     hash_verdict,
     inspect_scenario,
     other_bits,
-    record_name,
     recorded_hash,
     unlike,
 )
@@ -461,7 +460,7 @@ def _manifest_differences(
     names = _different_statistics(size, manifest)
     if names:
         listing = ", ".join(names)
-        record = record_name(size)
+        record = size.record_name
         differences.append(f"the manifest has another {listing} than {record}")
     return differences
 

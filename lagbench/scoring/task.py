@@ -188,7 +188,7 @@ def _attribute_std(
     if len(position_std) != dimension or len(velocity_std) != dimension:
         raise DataError(
             "the statistics of train are not recorded",
-            where=f"datasets.yaml, and the manifest of {size.split} {size.name} "
+            where=f"{size.record_name}, and the manifest of {size.split} {size.name} "
             f"in {root}",
             expected=f"position_std and velocity_std, {dimension} numbers each",
             got=", ".join(statistics) or "nothing",

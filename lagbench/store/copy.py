@@ -115,7 +115,7 @@ def refuse_foreign_hashes(
         raise WrongContentError(
             "the store holds another data set",
             where=f"{where}, scenarios {format_ids(foreign_scenarios)}",
-            expected="the content hashes of datasets.yaml",
+            expected="the content hashes that are recorded",
             got=f"version {manifest.version}, data set hash {manifest.dataset_sha256}",
             fix=hint,
         )

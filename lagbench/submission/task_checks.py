@@ -87,7 +87,7 @@ def check_dataset(
             "the data set hash cannot be compared",
             where=where,
             expected=f"a recorded hash of {name}",
-            got="neither datasets.yaml nor a complete manifest has one",
+            got=f"neither {size.record_name} nor a complete manifest has one",
             fix=suggest_repair(size, root=root),
         )
     elif stored_hash != expected_hash:

@@ -428,7 +428,8 @@ def _recorded_hash(size: Size, root: Path) -> str:
         raise DataError(
             "the hash of the data set is not known",
             where=f"{size.split} {size.name}",
-            expected="a hash in datasets.yaml, or a complete data set here",
+            expected=f"a hash in {size.record_name}, or a complete data set here",
+            got="neither",
             fix=f"{suggest_repair(size, root=root)}, or give dataset_sha256",
         )
     return recorded

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from lagbench.data import registry
 from lagbench.data.box import Box
 from lagbench.data.limits import NEEDED, SUBSETS, Limit
+from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
@@ -533,6 +534,15 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     assert after.size("sloshing", "tiny").particles == 256
     assert after.size("cavity", "tiny") == before.size("cavity", "tiny")
     assert after.split("cavity") == before.split("cavity")
+
+    # messages name the file that describes a split
+    assert after.size("cavity", "tiny").record_name == "datasets.yaml"
+    place = Path(theirs)
+    their_size = load_rooted_registry(place.parent, after).size("sloshing", "tiny")
+    assert their_size.record_name == f"{place.parent.name}/theirs.yaml"
+    with pytest.raises(UsageError) as caught:
+        their_size.value("mass")
+    assert caught.value.where == f"{their_size.record_name}, sloshing tiny"
 
 
 @pytest.mark.parametrize(

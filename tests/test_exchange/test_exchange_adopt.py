@@ -5,6 +5,7 @@ error says why not.
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -940,6 +941,20 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
     at_rest = card.scores["persistence"]["position_rmse"].per_frame[0]  # [length]
     drift = 0.02 * np.arange(1, len(at_rest) + 1)
     assert_allclose(at_rest, drift / np.sqrt(2.0), rtol=0.01)
+
+
+@pytest.mark.parametrize(("axes", "ends"), [(["x"], 4), (["x", "z"], 6)])
+def test_a_periodic_axis_without_bounds_is_told_their_form(
+    tmp_path: Path, axes: list[str], ends: int
+) -> None:
+    """The fix is an option that can be typed."""
+    with pytest.raises(UsageError) as caught:
+        adopted(tmp_path, straight_runs(3), periodic=axes, bounds=None)
+    fix = str(caught.value.fix)
+    example = re.search(r"--bounds (\S+)", fix)
+    assert example is not None
+    assert len(example[1].split(",")) == ends
+    assert caught.value.where == "--periodic"
 
 
 def test_a_periodic_axis_needs_a_name_and_bounds(tmp_path: Path) -> None:

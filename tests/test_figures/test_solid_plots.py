@@ -1,0 +1,150 @@
+"""Pictures of free surfaces in three dimensions: views, slices, titles that fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from numpy.typing import NDArray
+from rotating_disc import write_swirl
+
+from lagbench.errors import UsageError
+from lagbench.figures.animate import Film
+from lagbench.figures.panels import Panel, limit_of
+from lagbench.figures.plot import KINDS, choose_moments, plot_frame
+from lagbench.figures.recording import open_recording
+
+FRAMES = 3
+BOTTOM = 0.125  # of the box of fluid-3d tiny
+
+
+def fill(low: tuple[float, ...], high: tuple[float, ...]) -> NDArray[np.float32]:
+    """Return particles that fill a block, four along a cell of the score grid."""
+    axes = []
+    for start, end in zip(low, high, strict=True):
+        axes.append(np.arange(start + 1 / 128, end, 1 / 64))
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def liquid(start: NDArray[np.floating]) -> xr.Dataset:
+    """Return a scenario of fluid-3d tiny whose particles rotate about the y axis."""
+    middle = start.mean(axis=0)
+    frames = []
+    for frame in range(FRAMES):
+        cosine, sine = np.cos(0.02 * frame), np.sin(0.02 * frame)
+        turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+        frames.append((start - middle) @ turn.T + middle)
+    return xr.Dataset(
+        {
+            "position": (
+                ("frame", "particle", "axis"),
+                np.stack(frames).astype(np.float32),
+            ),
+            "material": ("particle", np.zeros(len(start), np.int8)),
+            "particle_mass": ((), 1.0 / 64**3),
+        },
+        coords={"frame": np.arange(FRAMES)},
+        attrs={"split": "fluid-3d", "size": "tiny", "scenario": 3, "family": "made-up"},
+    )
+
+
+BLOCK = liquid(fill((0.2, 0.2, 0.6), (0.5, 0.5, 0.85)))  # behind the middle
+FILM = liquid(fill((0.2, BOTTOM, 0.2), (0.8, BOTTOM + 0.03, 0.8)))
+
+
+@pytest.fixture
+def texts(monkeypatch: pytest.MonkeyPatch) -> list[Text]:
+    """All texts of the figures that are drawn, beside their figures."""
+    collected: list[Text] = []
+
+    def collect(drawn: Figure, output: Path) -> Path:
+        drawn.draw_without_rendering()
+        collected.extend(drawn.findobj(Text))
+        return output
+
+    monkeypatch.setattr("lagbench.figures.plot.save", collect)
+    return collected
+
+
+def words_of(texts: list[Text]) -> list[str]:
+    return [text.get_text() for text in texts if text.get_text()]
+
+
+def test_a_liquid_is_shown_from_three_sides(texts: list[Text]) -> None:
+    """Vorticity and streamlines of a splash say little: they come on request."""
+    plot_frame(BLOCK, 2, "all.png")
+    titles = ("Particles by speed", "From the front", "From above")
+    for title in titles:
+        assert title in words_of(texts)
+
+
+@pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
+def test_a_slice_lies_where_the_liquid_is(texts: list[Text], kind: Panel) -> None:
+    """The slice has the most nodes with a vorticity; the title says where it lies."""
+    with open_recording(BLOCK) as recording:
+        scene = recording.scene(2)
+        place = scene.fields.grid.spacing * scene.layer
+        assert 0.6 < place < 0.85
+        assert np.isfinite(scene.vorticity).sum() > 3
+        assert np.isfinite(limit_of(kind, scene))
+    plot_frame(BLOCK, 2, "slice.png", kind=kind)
+    assert any(f"across z at {place:.2f}" in words for words in words_of(texts))
+
+
+def test_where_material_is_too_thin_the_panel_says_so(texts: list[Text]) -> None:
+    """A film of liquid on the floor has no vorticity on the grid."""
+    with open_recording(FILM) as recording:
+        assert limit_of(Panel.VORTICITY, recording.scene(2)) == 1.0
+    plot_frame(FILM, 2, "thin.png", kind=Panel.VORTICITY)
+    assert any("too thin" in words for words in words_of(texts))
+
+
+def test_a_film_without_any_vorticity_is_refused() -> None:
+    with open_recording(FILM) as recording, pytest.raises(UsageError) as caught:
+        Film([recording], Panel.VORTICITY)
+    assert caught.value.where == "--kind"
+
+
+def test_a_film_shows_one_slice() -> None:
+    """The slice of the best frame is that of all frames."""
+    with open_recording(BLOCK) as recording:
+        layers = {recording.scene(frame).layer for frame in range(FRAMES)}
+        recording.fix_layer(range(FRAMES))
+        assert recording.layer in layers
+        assert {recording.scene(frame).layer for frame in range(FRAMES)} == {
+            recording.layer
+        }
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_text_is_cut_off(texts: list[Text], kind: str) -> None:
+    plot_frame(BLOCK, 2, "any.png", kind=kind)
+    for text in texts:
+        is_tick = len(text.get_text()) <= 5  # a tick may lie beyond the bar, undrawn
+        if not is_tick:
+            drawn = text.get_figure()
+            assert drawn is not None
+            extent = text.get_window_extent()
+            assert extent.x0 >= 0.0, text
+            assert extent.x1 <= drawn.bbox.width, text
+            assert extent.y1 <= drawn.bbox.height, text
+
+
+@pytest.mark.parametrize("kind", [Panel.FRONT, Panel.ABOVE])
+def test_views_are_of_three_dimensions(tmp_path: Path, kind: Panel) -> None:
+    with pytest.raises(UsageError) as caught:
+        plot_frame(write_swirl(tmp_path), 1, tmp_path / "x.png", kind=kind)
+    assert caught.value.where == "--kind"
+
+
+@pytest.mark.parametrize(("frames", "steps"), [(32, 6), (150, 7), (800, 40)])
+def test_moments_of_a_row_lie_apart(frames: int, steps: int) -> None:
+    """Neighbours of a short recording are a sixth of it apart, not a frame or two."""
+    moments = choose_moments(frames)
+    assert len(moments) == 6
+    assert (moments[0], moments[-1]) == (0, frames - 1)
+    assert min(np.diff(moments)) == steps
