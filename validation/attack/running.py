@@ -47,15 +47,23 @@ class Outcome:
     errors: str
 
 
-def run_command(arguments: Sequence[str], folder: Path, logs: Path) -> Outcome:
+def run_command(
+    arguments: Sequence[str],
+    folder: Path,
+    logs: Path,
+    *,
+    model_seconds: float = 0.0,
+) -> Outcome:
     """Run ``lagbench ARGUMENTS`` in a folder, in a fork of this process.
 
     Args:
         arguments: words after the program's name.
         folder: working folder of the command.
         logs: folder for what the command prints.
+        model_seconds: processor time that the command grants a model, beyond
+            :data:`MOST_SECONDS` [s].
     """
-    most_seconds = MOST_SECONDS * _waiting_processes()
+    most_seconds = (MOST_SECONDS + model_seconds) * _waiting_processes()
     started = time.monotonic()
     process = os.fork()
     if process == 0:

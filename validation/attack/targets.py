@@ -27,6 +27,7 @@ from lagbench.board.folder import (
     WEIGHTS,
 )
 from lagbench.data.registry import load
+from lagbench.models.onnx_model import LOAD_SECONDS, SECONDS_PER_FRAME
 
 from .arrays import ARRAYS, write_gns, write_trajectories
 from .models import ONNX, write_straight_on
@@ -75,6 +76,7 @@ class Target:
     mutations: Sequence[Mutation]
     commands: Sequence[Sequence[str]]  # words after lagbench, run in the copy
     weight: int = 1  # cases of this target in a round
+    model_seconds: float = 0.0  # processor time that a model may take [s]
     # whether a file of other bytes must be refused
     is_hashed: bool = False
     check: Check | None = None  # what a success must fulfil
@@ -283,6 +285,7 @@ def list_targets(folder: Path) -> list[Target]:
                 (*predict_model, "--size", "tiny", "-o", "p.nc", "--no-bench", "-q")
             ],
             weight=12,
+            model_seconds=_seconds_of_rollout(),
         ),
         Target(
             name="hybrid-projection: weights",
@@ -323,6 +326,12 @@ def list_targets(folder: Path) -> list[Target]:
         )
         targets.append(target)
     return [*targets, *_board_targets(folder), *_array_targets()]
+
+
+def _seconds_of_rollout() -> float:
+    """Return the processor time that an ONNX model is granted for one rollout [s]."""
+    horizon = load().size("decaying-vortices", "tiny").task.horizon
+    return LOAD_SECONDS + SECONDS_PER_FRAME * (horizon + 1)
 
 
 def _board_targets(folder: Path) -> list[Target]:
