@@ -209,12 +209,13 @@ def _interruption_message(command: str | None) -> str:
 
 
 def _unexpected_error_message(error: Exception) -> str:
+    """Return the message of an error that is no LagbenchError, with what to do."""
     debug_command = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
     place = find_place_in_extension(error)
     if place is None:
         advice = "this is a fault of lagbench; please report it with the output of"
-        place = f"the repository's address is {describe(REPOSITORY)}"
-        fix = f"{advice}\n       {debug_command}\n       ({place})"
+        address = f"the repository's address is {describe(REPOSITORY)}"
+        fix = f"{advice}\n       {debug_command}\n       ({address})"
     else:
         advice = f"mend or uninstall the package of {place};"
         fix = f"{advice}\n       {debug_command} has the whole trace"

@@ -74,10 +74,13 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     pays = []
     open_sets = []
     does_not_pay = []
+    unmatched = []
     for results in all_results:
         model = results.best(Kind.LEARNED, Kind.HYBRID)
         against = None if model is None else results.against_classical(model)
         if against is None:
+            if model is not None and results.seconds_per_frame(model) is not None:
+                unmatched.append(results.where)
             continue
         low, high = against.interval
         if high < 1.0:
@@ -100,6 +103,10 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         sentences.append(
             f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"
             " costs no more is more accurate than the best learned or hybrid model."
+        )
+    if unmatched:
+        sentences.append(
+            f"On {_join(unmatched)} no classical solver is as cheap as the best model."
         )
     return " ".join(sentences)
 

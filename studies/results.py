@@ -65,7 +65,7 @@ chapter per data set with all models beside the numbers of the thesis (D. Dharma
 thesis, University of Leeds, 2025)."""
 
 SUMMARY_NOTE = """\
-Scores: less is better. The brackets hold the processor time of a frame on
+Scores: less is better. The brackets after a score hold the processor time of a frame on
 one core. Learned models were timed on another machine: their times are multiplied by
 the ratio of our solver's times on the two machines.
 `skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
@@ -76,13 +76,13 @@ HOW_TO_READ = """\
 ## How to read this page
 
 - **Reference predictors** are not trained. A naive baseline neither learns nor
-  integrates the equations; a classical solver integrates them on a coarser grid
-  ([references](references.md)).
+  integrates the equations; a classical solver integrates them
+  ([references](references.md) says on which grid).
 - **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
   as that baseline, and below 0 is worse.
 - **Cells** are means over test scenarios with 95 % bootstrap intervals over scenarios.
-  After ± stands the deviation over seeds, where there are several. The board resamples
-  seeds too, so its intervals are wider where there are few seeds.
+  After ± stands the standard deviation over seeds, where there are several. The
+  leaderboard resamples seeds too, so its intervals are wider where there are few seeds.
 - **Tests** are two-sided. Where both models have one seed, the test is the exact
   sign-flip test over scenarios. Else it is the two-way bootstrap over scenarios and
   seeds. If the two models are one training used in two ways (such as with and without
@@ -90,9 +90,14 @@ HOW_TO_READ = """\
   for the number of rivals (Holm). With fewer than six scenarios nothing is claimed.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
   GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
-  orientation. At size `mini` (a quarter of the particles, half the grid) compare only
-  the orders of the models.
-- **Metrics** are defined in [scoring](scoring.md).
+  orientation. At size `mini` (about a quarter of the particles, about half the grid)
+  compare only in which order the models come.
+- **Metrics** are defined in [scoring](scoring.md). In the heads ↓ means that less is
+  better, ↑ that more is better, and ◎ that the value behind it is best.
+- **Comparisons** have two models. `means` and `seeds` give both, the first one first.
+  `lead` is how much better the first mean is, in the units of the metric; a negative
+  lead means that the second is better. `won` counts the scenarios where the first one is
+  better.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
@@ -107,16 +112,17 @@ and curl-noise mini fail a [gate](baselines.md#gates): answers about them speak 
 under-trained weights, not of the methods."""
 
 TRAINING_NOTE = """\
-The validation columns have the least validation error up to a quarter, half and all of
-the steps, of the first seed. The last column is the gain of the last doubling of the
-steps. A model that gained more than 2 % has not converged. Hours are without
-validations, as in the entries; the first trainings of NeuralMPM did not time their
-validations apart."""
+The three validation columns have the least validation error up to a quarter, half and
+all of the steps, of the first seed; `validated` names its metric. The last column says
+by how much the second half of the steps lowered that error. A model that gained more
+than 2 % has not converged. Hours are without validations, as in the entries; the first
+trainings of NeuralMPM did not time their validations apart."""
 
 COST_NOTE = """\
-Cost. The columns have the recipe, and the options that the training or the prediction
-changed (`none`: no option). Where the seeds differ, their values stand in the order of
-the seeds. Without a record of the training, the words of the entry are used. The
+Cost. `changed` lists the options of the training or of the prediction that differ from
+the recipe (`none`: no option). Where the seeds differ, the different values stand with
+a slash between them, each once, in the order of the seeds. Without a record of the
+training, both columns have what the entry says. The
 speed-up is our solver's time for a frame, on one core, over that of the model on the
 same machine. Hours are without validations."""
 
@@ -136,10 +142,11 @@ and figures of a size. It can be interrupted and repeated. `lagbench submit` mak
 entries of its runs.
 
 Results without an entry are read from `docs/studies/<split>/<size>/`. There,
-`mlp_studies.json` is a copy of that in the folder of runs, and `var_protocol.json` is
-the output of `python -m studies.thesis.var_protocol --size mini --json`.
+`mlp_studies.json` is a copy of the file of that name in the folder of runs (`--runs`),
+and `var_protocol.json` is the output of
+`python -m studies.thesis.var_protocol --size mini --json`.
 
-Variants change an option or two:"""
+Variants change an option or two, take another recipe, or predict in another way:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -206,8 +213,8 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
             yield table_markdown(comparison_table(all_rows))
         else:
             yield (
-                f"There is nothing to compare yet: a split needs entries of "
-                f"{label(claim.first)} and of a rival."
+                f"There is nothing to compare yet: no split has entries of both "
+                f"{label(claim.first)} and {' or '.join(map(label, claim.rivals))}."
             )
 
     leading = leading_references(learned)
@@ -263,7 +270,7 @@ def _vorticity_note(results: SplitResults) -> str:
         "first test scenario (T0) in brackets"
     )
     if results.size.split == "cavity":
-        return f"{note}. The thesis has T0."
+        return f"{note}. The thesis prints T0 only: compare it with the brackets."
     return f"{note}."
 
 
@@ -326,7 +333,7 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
     if missing:
         names = ", ".join(missing)
         if len(missing) == len(expected):
-            names = "all models"
+            names = "all models of the thesis, and NeuralMPM trained at this size"
         command = f"python -m studies.thesis --size {results.size.name} --split {split}"
         yield f"- {results.where}: {names}: `{command}`, then `lagbench submit`."
     if results.stale:

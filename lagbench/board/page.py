@@ -240,7 +240,7 @@ def draw_intro(board: Board) -> Markup:
     return escaped(
         "Which neural surrogate predicts how fluids and soft bodies move, and is it "
         f"better than a classical solver of the same cost? {entries} on {data_sets} "
-        "that anyone regenerates bit for bit. Every number follows from committed "
+        "that anyone regenerates bit for bit. Every score follows from committed "
         f"score files. {_describe_levels(rows)} {_describe_costs(rows)}"
     )
 

@@ -33,7 +33,9 @@ REMARK_WIDTH = 16  # the whole table fits a terminal of 80 characters
 def choose_data_sets(
     known: Collection[tuple[str, str]], split: str | None, size: str | None
 ) -> tuple[tuple[str, str], ...]:
-    """Return the (split, size) with entries that are of a split, of a size, or all.
+    """Return the data sets with entries; only those of a split or size, if given.
+
+    A data set is a pair (split, size).
 
     Raises:
         UsageError: a split or size is given that has no entries.

@@ -51,7 +51,10 @@ def require_libraries(names: tuple[str, ...]) -> None:
 
 
 def root_option(split: str, root: Path | None) -> str:
-    """Return the option by which the next command finds the data; often empty."""
+    """Return " --root FOLDER" for the next command, if it needs that to find the data.
+
+    It does where the user named a root, and for a local split.
+    """
     location = locate_split(split, root=root)
     entry = location.registry.split(location.name)
     if root is not None:

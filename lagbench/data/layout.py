@@ -140,6 +140,10 @@ def major_of(version: str) -> int:
 def expand_path(path: str | Path, where: str) -> Path:
     """Return a path made absolute, ~ replaced by the home folder.
 
+    Args:
+        path: the path that a user gave.
+        where: the option or variable that held it, for the message.
+
     Raises:
         UsageError: the user of ``~user`` has no home folder.
     """

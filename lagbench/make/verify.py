@@ -265,7 +265,7 @@ def _inspect_files(
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
-    """Return some of the ids, evenly spaced, the first and the last included.
+    """Return some of the ids, evenly spaced: the first, and from two on the last.
 
     >>> evenly_spaced(range(60), 3)
     (0, 30, 59)

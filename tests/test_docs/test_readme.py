@@ -191,7 +191,7 @@ def test_thresholds_of_the_flags() -> None:
     assert f"outside {flags.ENERGY[0]:g} to {flags.ENERGY[1]:g} times" in TEXT
     assert f"outside {flags.OCCUPANCY[0]:g} to {flags.OCCUPANCY[1]:g} times" in TEXT
     assert flags.TWIN_REGULAR == 0.1
-    assert "past a tenth of that of persistence" in TEXT
+    assert "more than a tenth of the RMSE of `persistence`" in TEXT
 
 
 def test_every_option_of_score_is_described() -> None:
