@@ -30,6 +30,17 @@ def tab() -> Tab:
     return make_board((("cavity", "mini"),)).tabs[0]
 
 
+def drawn(points: list[CostPoint], solver: float | None) -> ElementTree.Element:
+    """Return the picture of some points."""
+    svg = draw(points, solver, "vorticity_nrmse", "title")
+    return ElementTree.fromstring(svg)
+
+
+def seconds_by_name(tab: Tab) -> dict[str, float]:
+    """Return where points stand along the axis of cost."""
+    return {point.name: point.seconds for point in points_of(tab)}
+
+
 def point(seconds: float, error: float, kind: str = "entry") -> CostPoint:
     """Return a point named after its place."""
     return CostPoint(
@@ -44,17 +55,18 @@ def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
     """An entry twice as fast as the solver on its own machine costs half of the solver
     here.
     """
-    raw = {one.name: one.seconds for one in points_of(tab)}
-    here = {
-        one.name: one.seconds for one in points_of(replace(tab, solver_seconds=0.02))
-    }
+    raw = seconds_by_name(tab)
+    here = seconds_by_name(replace(tab, solver_seconds=0.02))
+    silent = set()
     for row in tab.rows:
-        if row.active and row.entry.cost is not None:
-            assert raw[row.entry.name] == row.entry.cost.seconds_per_frame
-            assert here[row.entry.name] == pytest.approx(
-                0.02 / (row.entry.cost.speed_up or math.nan)
-            )
-    silent = {row.entry.name for row in tab.rows if row.entry.cost is None}
+        name = row.entry.name
+        cost = row.entry.cost
+        if cost is None:
+            silent.add(name)
+        elif row.active:
+            assert raw[name] == cost.seconds_per_frame
+            speed_up = cost.speed_up or math.nan
+            assert here[name] == pytest.approx(0.02 / speed_up)
     assert silent
     assert silent.isdisjoint(raw)
 
@@ -63,12 +75,15 @@ def test_the_front_holds_what_no_other_beats() -> None:
     """By hand: (2, 5) is beaten by (1, 4); (3, 4) costs more than (1, 4) and is no
     better.
     """
-    marks = [point(2, 5), point(1, 4), point(3, 4), point(4, 1), point(5, 0.5)]
-    assert [(one.seconds, one.error) for one in find_front(marks)] == [
-        (1, 4),
-        (4, 1),
-        (5, 0.5),
+    points = [
+        point(2, 5),
+        point(1, 4),
+        point(3, 4),
+        point(4, 1),
+        point(5, 0.5),
     ]
+    front = [(one.seconds, one.error) for one in find_front(points)]
+    assert front == [(1, 4), (4, 1), (5, 0.5)]
 
 
 def classes_of(element: ElementTree.Element) -> list[str]:
@@ -78,7 +93,9 @@ def classes_of(element: ElementTree.Element) -> list[str]:
 
 def place_of(circle: ElementTree.Element) -> tuple[float, float]:
     """Return the middle of a circle."""
-    return float(circle.attrib["cx"]), float(circle.attrib["cy"])
+    x = float(circle.attrib["cx"])
+    y = float(circle.attrib["cy"])
+    return x, y
 
 
 def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
@@ -91,7 +108,7 @@ def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
         point(0.1, 0.25, "classical"),
         point(0.05, 0.9, "naive"),
     ]
-    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    svg = drawn(points, 0.02)
     dots = [element for element in svg.iter() if "dot" in classes_of(element)]
     first, second, third, _ = [place_of(dot[1]) for dot in dots]
     first_step = np.subtract(second, first)
@@ -131,7 +148,8 @@ def text_boxes(
         if classes[0] != kind:
             continue
         width = letter_width * len(text.text or "")
-        share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
+        shares = {"end": 1.0, "middle": 0.5}
+        share = shares.get(classes[-1], 0.0)
         left = float(text.attrib["x"]) - share * width
         base = float(text.attrib["y"])
         boxes.append(Box(left, base - 9, left + width, base + 2))
@@ -149,9 +167,15 @@ def dot_boxes(svg: ElementTree.Element) -> list[Box]:
 
 def test_names_do_not_meet_names_or_dots() -> None:
     """Twenty dots in one place and five near it: no name covers another or a dot."""
-    points = [point(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
-    points += [point(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
-    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    points = []
+    for number in range(20):
+        seconds = 0.01 * (1 + number / 1000)
+        points.append(point(seconds, 0.5))
+    for number in range(5):
+        seconds = 0.01 * (1.2 + number / 5)
+        error = 0.45 + 0.04 * number
+        points.append(point(seconds, error))
+    svg = drawn(points, 0.02)
     texts = text_boxes(svg, "name") + text_boxes(svg, "note")
     assert len(texts) > 3
     dots = dot_boxes(svg)
@@ -172,8 +196,9 @@ def test_a_crowd_at_the_edge_keeps_its_names() -> None:
     }
     points = []
     for name, (seconds, error) in places.items():
-        points.append(CostPoint(name=name, seconds=seconds, error=error, kind="entry"))
-    svg = ElementTree.fromstring(draw(points, None, "vorticity_nrmse", "title"))
+        cost = CostPoint(name=name, seconds=seconds, error=error, kind="entry")
+        points.append(cost)
+    svg = drawn(points, None)
     names = set()
     for text in svg.iter("text"):
         if classes_of(text)[0] == "name":
@@ -184,33 +209,29 @@ def test_a_crowd_at_the_edge_keeps_its_names() -> None:
 def test_axes_end_past_their_values() -> None:
     """All ticks within the axis; values a step off its ends."""
     scale = close_logarithmic(0.3, 1.4)
-    assert scale.low < 0.3 < 1.4 < scale.high
-    assert all(scale.low <= tick.value <= scale.high for tick in scale.ticks)
-    assert next(tick.label for tick in close_logarithmic(1e-6, 1e-2).ticks) in (
-        "10⁻⁶",
-        "10⁻⁷",
-    )
+    assert scale.low < 0.3
+    assert scale.high > 1.4
+    for tick in scale.ticks:
+        assert scale.low <= tick.value <= scale.high
+    decades = close_logarithmic(1e-6, 1e-2)
+    first_tick = decades.ticks[0]
+    assert first_tick.label in ("10⁻⁶", "10⁻⁷")
 
 
 def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
     """Without any entry the floors stand there, and what the solver itself takes."""
-    (tmp_path / "board" / "submissions").mkdir(parents=True)
+    board = tmp_path / "board"
+    (board / "submissions").mkdir(parents=True)
     target = tmp_path / "cost.svg"
-    words = [
-        "leaderboard",
-        "picture",
-        "cavity",
-        "--size",
-        "mini",
-        "--board",
-        str(tmp_path / "board"),
-    ]
-    done = CliRunner().invoke(app, [*words, "-o", str(target)])
-    assert done.exit_code == 0, done.output
-    said = target.read_text()
-    ElementTree.fromstring(said)
+    words = ["leaderboard", "picture", "cavity", "--size", "mini"]
+    options = ["--board", str(board), "-o", str(target)]
+    result = CliRunner().invoke(app, [*words, *options])
+    assert result.exit_code == 0, result.output
+    svg = target.read_text()
+    ElementTree.fromstring(svg)
     size = load().size("cavity", "mini")
-    assert all(name in said for name in shipped(size) or {})
-    assert "the solver itself" in said
+    for name in shipped(size) or {}:
+        assert name in svg
+    assert "the solver itself" in svg
     assert (solver_seconds(size) or 0.0) > 0.0
-    assert not re.search("<script|href=", said)
+    assert not re.search("<script|href=", svg)

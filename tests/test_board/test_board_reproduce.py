@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ import pytest
 from model_board import NAME, PATH, ModelBoard
 from typer.testing import Result
 
-from lagbench.board.entry import Level
+from lagbench.board.check import CheckResult
+from lagbench.board.entry import Level, Verification
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import ReproduceResult, reproduce, sample_scenarios
 from lagbench.board.scores_compared import TOLERANCE
@@ -24,8 +25,9 @@ from lagbench.errors import ChecksFailedError, UsageError
 @pytest.fixture
 def own(model_board: ModelBoard, tmp_path: Path) -> ModelBoard:
     """A copy of the leaderboard that the test may change."""
-    shutil.copytree(model_board.folder, tmp_path / "board")
-    return replace(model_board, folder=tmp_path / "board")
+    board = tmp_path / "board"
+    shutil.copytree(model_board.folder, board)
+    return replace(model_board, folder=board)
 
 
 def run_again(own: ModelBoard, *names: str, **options: Any) -> ReproduceResult:
@@ -39,26 +41,46 @@ def run_again(own: ModelBoard, *names: str, **options: Any) -> ReproduceResult:
     )
 
 
+Content = dict[str, Any]
+
+
+def lines_of(own: ModelBoard) -> Mapping[str, Verification]:
+    """Return the lines of verified.yaml by the path of their entry."""
+    return read_verified(Folder(own.folder))
+
+
+def checks_of(result: CheckResult) -> list[str]:
+    """Return the names of the checks that found something."""
+    return [issue.check for issue in result.findings]
+
+
 def test_a_model_gives_the_scores_of_its_entry(own: ModelBoard) -> None:
     """Its line says so, it is not run twice, and the board has nothing to object."""
     result = run_again(own, NAME, costs=True, time_solver=lambda *_: 0.5)
-    assert (result.exit_code, result.predicted) == (0, [f"{NAME}, seed 0"])
-    line = read_verified(Folder(own.folder))[PATH]
+    assert result.exit_code == 0
+    assert result.predicted == [f"{NAME}, seed 0"]
+    line = lines_of(own)[PATH]
     assert line == result.lines[PATH]
     assert line.level is Level.REPRODUCED
     (one,) = line.reproduced
-    assert (one.scenarios, one.of, one.difference) == (2, 2, 0.0)
+    assert one.scenarios == 2
+    assert one.of == 2
+    assert one.difference == 0.0
     assert one.model == file_sha256(own.weights)
     assert line.cost is not None
     assert line.cost.solver == 0.5
     assert {"projection"} <= line.cost.classical.keys()
     assert line.cost.speed_up == 0.5 / line.cost.seconds_per_frame
 
-    before = (own.folder / "verified.yaml").read_bytes()
-    assert run_again(own, NAME).predicted == []
-    assert run_again(own).predicted == []
-    assert (own.folder / "verified.yaml").read_bytes() == before
-    assert run_again(own, NAME, again=True).predicted == [f"{NAME}, seed 0"]
+    verified = own.folder / "verified.yaml"
+    before = verified.read_bytes()
+    result = run_again(own, NAME)
+    assert result.predicted == []
+    result = run_again(own)
+    assert result.predicted == []
+    assert verified.read_bytes() == before
+    result = run_again(own, NAME, again=True)
+    assert result.predicted == [f"{NAME}, seed 0"]
     assert own.find().findings == ()
 
 
@@ -67,28 +89,34 @@ def test_costs_of_a_data_set_are_of_one_run(own: ModelBoard) -> None:
     options: dict[str, Any] = {"scores": False, "costs": True}
     first = run_again(own, NAME, **options, time_solver=lambda *_: 0.5)
     assert first.measured == [NAME]
-    assert run_again(own, NAME, **options).measured == []
+    second = run_again(own, NAME, **options)
+    assert second.measured == []
 
     other = PATH.replace("gns", "other")
     shutil.copy(own.folder / PATH, own.folder / other)
-    own.edit(
-        own.folder / other,
-        lambda content: content.update(method="other", name="Another one"),
-    )
-    other_name = NAME.replace("gns", "other")
-    second = run_again(own, other_name, **options, time_solver=lambda *_: 0.25)
-    assert second.measured == [NAME, other_name]
-    lines = read_verified(Folder(own.folder))
-    assert [lines[path].cost is not None for path in (PATH, other)] == [True, True]
-    assert {line.cost and line.cost.solver for line in lines.values()} == {0.25}
-    assert run_again(own, **options).measured == []
 
-    own.edit(
-        own.folder / "verified.yaml",
-        lambda content: content[other]["cost"].update(solver=0.5),
-    )
-    third = run_again(own, **options, time_solver=lambda *_: 0.25)
+    def rename(content: Content) -> None:
+        content["method"] = "other"
+        content["name"] = "Another one"
+
+    own.edit(own.folder / other, rename)
+    other_name = NAME.replace("gns", "other")
+    third = run_again(own, other_name, **options, time_solver=lambda *_: 0.25)
     assert third.measured == [NAME, other_name]
+    lines = lines_of(own)
+    assert lines.keys() >= {PATH, other}
+    for line in lines.values():
+        assert line.cost is not None
+        assert line.cost.solver == 0.25
+    fourth = run_again(own, **options)
+    assert fourth.measured == []
+
+    def change_cost(content: Content) -> None:
+        content[other]["cost"]["solver"] = 0.5
+
+    own.edit(own.folder / "verified.yaml", change_cost)
+    fifth = run_again(own, **options, time_solver=lambda *_: 0.25)
+    assert fifth.measured == [NAME, other_name]
 
 
 def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
@@ -97,45 +125,51 @@ def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
     own.submit(own.shifted(0.01), replace=True)
     own.weights.parent.mkdir(parents=True, exist_ok=True)
     own.weights.write_bytes(weights)
-    said = {
+    weights_of_entry = {
         "path": own.weights.relative_to(own.folder).as_posix(),
         "sha256": file_sha256(own.weights),
     }
-    own.edit(
-        own.folder / PATH,
-        lambda content: content["predictions"][0].update(weights=said),
-    )
+
+    def name_weights(content: Content) -> None:
+        content["predictions"][0]["weights"] = weights_of_entry
+
+    own.edit(own.folder / PATH, name_weights)
     result = run_again(own, NAME)
     assert result.exit_code == ChecksFailedError.exit_code
     assert result.differing == [PATH]
-    line = read_verified(Folder(own.folder))[PATH]
+    line = lines_of(own)[PATH]
     assert line.level is Level.AS_SUBMITTED
-    assert line.reproduced[0].difference > TOLERANCE
+    (one,) = line.reproduced
+    assert one.difference > TOLERANCE
 
 
 def test_a_line_holds_for_its_models_only(own: ModelBoard) -> None:
     """Other weights of the same predictions make the line stale."""
     run_again(own, NAME)
-    own.edit(
-        own.folder / "verified.yaml",
-        lambda content: content[PATH]["reproduced"][0].update(model="0" * 64),
-    )
-    assert [issue.check for issue in own.find().findings] == ["verified"]
+
+    def exchange_model(content: Content) -> None:
+        content[PATH]["reproduced"][0]["model"] = "0" * 64
+
+    own.edit(own.folder / "verified.yaml", exchange_model)
+    assert checks_of(own.find()) == ["verified"]
 
 
 def test_what_cannot_be_run_is_refused(own: ModelBoard) -> None:
     """A model that was exchanged, an entry without a model, an unknown entry."""
-    own.weights.write_bytes(own.weights.read_bytes() + b"1")
+    weights = own.weights.read_bytes()
+    own.weights.write_bytes(weights + b"1")
     with pytest.raises(ChecksFailedError) as caught:
         run_again(own, NAME)
     assert caught.value.where == str(own.weights)
     result = run_again(own)
-    assert [failure.entry for failure in result.failures] == [PATH]
+    entries = [failure.entry for failure in result.failures]
+    assert entries == [PATH]
     assert result.exit_code == ChecksFailedError.exit_code
 
-    own.edit(
-        own.folder / PATH, lambda content: content["predictions"][0].pop("weights")
-    )
+    def drop_weights(content: Content) -> None:
+        del content["predictions"][0]["weights"]
+
+    own.edit(own.folder / PATH, drop_weights)
     for name in ("curl-noise/tiny/nobody", NAME):
         with pytest.raises(UsageError):
             run_again(own, name)
@@ -149,16 +183,19 @@ def test_predictions_made_anew_confirm_within_the_tolerance(own: ModelBoard) -> 
     assert confirmation.is_anew
     assert 0.0 < confirmation.difference <= TOLERANCE
     far = own.find(predictions=[own.shifted(1e-2)])
-    assert [issue.check for issue in far.findings] == ["rescored"]
+    assert checks_of(far) == ["rescored"]
 
 
 def test_a_sample_is_the_same_in_every_run() -> None:
     """Models have samples of their own, inside the test subset."""
     scenarios = range(100, 120)
-    samples = [sample_scenarios(scenarios, f"{i}", 4) for i in range(9)]
-    assert samples == [sample_scenarios(scenarios, f"{i}", 4) for i in range(9)]
+    samples = []
+    for model in range(9):
+        sample = sample_scenarios(scenarios, str(model), 4)
+        assert sample == sample_scenarios(scenarios, str(model), 4)
+        assert set(sample) < set(scenarios)
+        samples.append(sample)
     assert len(set(samples)) > 1
-    assert all(set(scenarios) > set(sample) for sample in samples)
     assert sample_scenarios(scenarios, "1", None) == tuple(scenarios)
 
 
@@ -166,8 +203,14 @@ def test_the_command_says_what_it_did(
     own: ModelBoard, run: Callable[..., Result]
 ) -> None:
     """Options that contradict each other are refused before any work."""
+    command = ("leaderboard", "reproduce")
     board = ("--board", own.folder)
-    for words in ((), (NAME, "--all"), (NAME, "--costs", "--no-costs")):
-        assert run("leaderboard", "reproduce", *words, *board).exit_code == 2
-    result = run("leaderboard", "reproduce", "curl-noise/tiny/nobody", *board, "--json")
+    for words in (
+        (),
+        (NAME, "--all"),
+        (NAME, "--costs", "--no-costs"),
+    ):
+        result = run(*command, *words, *board)
+        assert result.exit_code == 2
+    result = run(*command, "curl-noise/tiny/nobody", *board, "--json")
     assert result.exit_code == 2

@@ -23,7 +23,12 @@ from lagbench.data.manifest import (
 )
 from lagbench.errors import DataError
 
-SUBSETS = {"train": (0, 1), "valid": (2,), "test": (3, 4), "extra": (5,)}
+SUBSETS = {
+    "train": (0, 1),
+    "valid": (2,),
+    "test": (3, 4),
+    "extra": (5,),
+}
 STATISTICS = {"velocity_std": (0.00219, 0.00218)}
 
 
@@ -91,7 +96,8 @@ def test_partial_generations_complete_each_other() -> None:
     assert not half.complete
     assert half.dataset_sha256 is None
     assert set(half.subset_sha256) == {"valid"}
-    assert merge(half, (3, 0, 1), statistics=STATISTICS) == whole
+    other_half = (3, 0, 1)
+    assert merge(half, other_half, statistics=STATISTICS) == whole
 
 
 def test_hashes_follow_from_the_content_hashes() -> None:
@@ -99,17 +105,24 @@ def test_hashes_follow_from_the_content_hashes() -> None:
     manifest = merge(None, range(6))
     expected = {}
     for name, scenarios in SUBSETS.items():
-        content = {i: make_entry(i).content_sha256 for i in scenarios}
-        expected[name] = subset_hash(content)
+        hashes = {}
+        for scenario in scenarios:
+            hashes[scenario] = make_entry(scenario).content_sha256
+        expected[name] = subset_hash(hashes)
     assert manifest.subset_sha256 == expected
-    assert manifest.dataset_sha256 == dataset_hash("cavity", "tiny", 1, expected)
-    assert merge(None, range(5)).dataset_sha256 == manifest.dataset_sha256
+    expected_hash = dataset_hash("cavity", "tiny", 1, expected)
+    assert manifest.dataset_sha256 == expected_hash
+    without_extra = merge(None, range(5))
+    assert without_extra.dataset_sha256 == expected_hash
+
+
+OTHER_HASH = "f" * 64
 
 
 def test_new_entries_replace_old_ones() -> None:
     old = merge(None, range(6))
-    changed = merge(old, [make_entry(3, "f" * 64)])
-    assert changed.entry(3).content_sha256 == "f" * 64
+    changed = merge(old, [make_entry(3, OTHER_HASH)])
+    assert changed.entry(3).content_sha256 == OTHER_HASH
     assert changed.dataset_sha256 != old.dataset_sha256
 
 
@@ -125,9 +138,11 @@ def test_entries_under_another_subset_go() -> None:
     """The registry decides which subset has a scenario."""
     whole = merge(None, range(5))
     entries = list(whole.files)
-    entries[3] = entries[3].model_copy(update={"subset": "train"})
+    in_train = entries[3].model_copy(update={"subset": "train"})
+    entries[3] = in_train
     moved = whole.model_copy(update={"files": tuple(entries)})
-    assert listed_scenarios(merge(moved, ())) == [0, 1, 2, 4]
+    merged = merge(moved, ())
+    assert listed_scenarios(merged) == [0, 1, 2, 4]
 
 
 def test_an_incomplete_train_has_no_statistics() -> None:
@@ -138,28 +153,34 @@ def test_an_incomplete_train_has_no_statistics() -> None:
 def test_statistics_stay_when_a_later_run_brings_none() -> None:
     train = merge(None, (0, 1), statistics=STATISTICS)
     assert train.statistics == STATISTICS
-    assert merge(train, (2, 3, 4)).statistics == STATISTICS
+    whole = merge(train, (2, 3, 4))
+    assert whole.statistics == STATISTICS
 
 
 def test_a_new_file_of_train_removes_the_statistics() -> None:
     whole = merge(None, range(5), statistics=STATISTICS)
-    changed = merge(whole, [make_entry(1, "f" * 64)])
+    changed = merge(whole, [make_entry(1, OTHER_HASH)])
     assert changed.complete
     assert changed.statistics == {}
 
 
-def machine(name: str, device: str = "cpu", system: str = "Linux") -> dict[str, str]:
+Environment = dict[str, str]
+
+
+def machine(name: str, device: str = "cpu", system: str = "Linux") -> Environment:
     """Return an environment."""
     return {"machine": name, "system": system, "device": device}
 
 
 def test_environments_add_up() -> None:
     """Equal ones are listed once; a merge that wrote no file adds none."""
-    manifest = merge(None, (0,), environment=machine("x86_64"))
-    manifest = merge(manifest, (1,), environment=machine("aarch64"))
-    manifest = merge(manifest, (2,), environment=machine("x86_64"))
+    this_machine = machine("x86_64")
+    other_machine = machine("aarch64")
+    manifest = merge(None, (0,), environment=this_machine)
+    manifest = merge(manifest, (1,), environment=other_machine)
+    manifest = merge(manifest, (2,), environment=this_machine)
     manifest = merge(manifest, (3,), environment=None)
-    assert manifest.environments == (machine("x86_64"), machine("aarch64"))
+    assert manifest.environments == (this_machine, other_machine)
 
 
 @pytest.mark.parametrize(
@@ -173,33 +194,39 @@ def test_environments_add_up() -> None:
     ],
 )
 def test_identity_needs_a_promise_or_evidence(
-    environment: dict[str, str], identity: str
+    environment: Environment, identity: str
 ) -> None:
     """x86-64 Linux CPUs promise equal bits.
 
     Elsewhere every file needs the hash of datasets.yaml.
     """
+    device = environment["device"]
     entries = []
     recorded = {}
     for scenario in range(3):
         entry = make_entry(scenario)
-        entries.append(entry.model_copy(update={"device": environment["device"]}))
+        entries.append(entry.model_copy(update={"device": device}))
         recorded[scenario] = entry.content_sha256[:16]
     manifest = merge(None, entries, environment=environment)
     assert manifest.identity == identity
 
     def identity_with(recorded: dict[int, str]) -> str:
-        return merge(manifest, (), environment=None, recorded=recorded).identity
+        merged = merge(manifest, (), environment=None, recorded=recorded)
+        return merged.identity
+
+    another_hash = {1: "0" * 16}
+    one_hash = {0: recorded[0]}
 
     assert identity_with(recorded) == "bitwise"
-    assert identity_with(recorded | {1: "0" * 16}) == identity
-    assert identity_with({0: recorded[0]}) == identity
+    assert identity_with(recorded | another_hash) == identity
+    assert identity_with(one_hash) == identity
     with_another = merge(manifest, (3,), environment=machine("x86_64"))
     assert with_another.identity == identity
 
 
 def test_without_perturbed_runs_there_is_no_mean_twin_floor() -> None:
-    assert merge(None, range(5)).mean_twin_floor() == ()
+    manifest = merge(None, range(5))
+    assert manifest.mean_twin_floor() == ()
 
 
 def test_the_mean_twin_floor_is_that_of_test() -> None:
@@ -213,19 +240,28 @@ def test_the_mean_twin_floor_is_that_of_test() -> None:
         twin_floor = twin_floors.get(scenario, ())
         entry = make_entry(scenario)
         entries.append(entry.model_copy(update={"twin_floor": twin_floor}))
-    assert merge(None, entries).mean_twin_floor() == (2e-6, 3e-3)
+    manifest = merge(None, entries)
+    assert manifest.mean_twin_floor() == (2e-6, 3e-3)
 
 
 def test_a_written_manifest_is_read_back(tmp_path: Path) -> None:
     """It is plain JSON, and no temporary file stays."""
     manifest = merge(None, range(5), statistics=STATISTICS)
     path = write_manifest(tmp_path, manifest)
-    assert path == tmp_path / "cavity" / "tiny" / "v1" / "manifest.json"
+    folder = tmp_path / "cavity" / "tiny" / "v1"
+    assert path == folder / "manifest.json"
     assert read_manifest(tmp_path, "cavity", "tiny", 1) == manifest
     assert list(path.parent.iterdir()) == [path]
     content = json.loads(path.read_text())
-    assert content["files"][3]["facts"] == {"energy_last_over_max": 0.25}
+    facts = content["files"][3]["facts"]
+    assert facts == {"energy_last_over_max": 0.25}
     assert read_manifest(tmp_path, "cavity", "tiny", 2) is None
+
+
+def write_whole(folder: Path) -> Path:
+    """Write the manifest of a complete data set."""
+    manifest = merge(None, range(5))
+    return write_manifest(folder, manifest)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +296,7 @@ def test_a_damaged_manifest_names_the_key(
     key: str,
 ) -> None:
     """The error has file, key and fix."""
-    path = write_manifest(tmp_path, merge(None, range(5)))
+    path = write_whole(tmp_path)
     content = json.loads(path.read_text())
     content["files"][3] |= entry_changes
     path.write_text(json.dumps(content | changes))
@@ -271,15 +307,16 @@ def test_a_damaged_manifest_names_the_key(
 
 
 def test_a_truncated_manifest_is_refused(tmp_path: Path) -> None:
-    path = write_manifest(tmp_path, merge(None, range(5)))
-    path.write_text(path.read_text()[:-20])
+    path = write_whole(tmp_path)
+    text = path.read_text()
+    path.write_text(text[:-20])
     with pytest.raises(DataError) as caught:
         read_manifest(tmp_path, "cavity", "tiny", 1)
     assert caught.value.where == f"{path}, key (whole file)"
 
 
 def test_a_fifo_is_no_manifest(tmp_path: Path) -> None:
-    path = write_manifest(tmp_path, merge(None, range(5)))
+    path = write_whole(tmp_path)
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(DataError):

@@ -47,18 +47,25 @@ def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_swirl(tmp_path_factory.mktemp("root"), frames=8)
 
 
-@given(hnp.arrays(np.uint8, images.map(lambda shape: (*shape, 3))))
+shapes_of_images = images.map(lambda shape: (*shape, 3))
+shapes_of_even_images = even_sizes.map(lambda n: (2 * n, 2 * n, 3))
+
+
+@given(hnp.arrays(np.uint8, shapes_of_images))
 def test_packing_keeps_every_pixel(pixels: Pixels) -> None:
     """Unpack is the inverse of pack."""
-    assert_array_equal(unpack(pack(pixels)), pixels)
+    packed = pack(pixels)
+    assert_array_equal(unpack(packed), pixels)
 
 
-@given(hnp.arrays(np.uint8, even_sizes.map(lambda n: (2 * n, 2 * n, 3))))
+@given(hnp.arrays(np.uint8, shapes_of_even_images))
 def test_halving_takes_the_mean_of_four(pixels: Pixels) -> None:
     """Each colour is the mean of four, at most 1.5 below for the two roundings."""
     side = len(pixels) // 2
-    exact = pixels.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))
-    difference = exact - unpack(halve(pack(pixels)))
+    blocks = pixels.reshape(side, 2, side, 2, 3)
+    exact = blocks.mean(axis=(1, 3))
+    halved = halve(pack(pixels))
+    difference = exact - unpack(halved)
     assert difference.min() >= 0.0
     assert difference.max() < 1.5
 
@@ -67,12 +74,14 @@ def paint(path: Path, panel: Panel, frame: int, side: int = 128) -> Pixels:
     """Paint one panel of a scenario."""
     with open_recording(path) as recording:
         painter = Painter(recording, panel, side=side, limit=2.0 * OMEGA)
-        return unpack(painter.paint(recording.scene(frame)))
+        scene = recording.scene(frame)
+        return unpack(painter.paint(scene))
 
 
 def has_colour(pixels: Pixels, colour: str) -> NDArray[np.bool_]:
     """Return which pixels have a colour."""
-    is_equal: NDArray[np.bool_] = (pixels == parse_rgb(colour)).all(axis=-1)
+    colour_of_pixel = parse_rgb(colour)
+    is_equal: NDArray[np.bool_] = (pixels == colour_of_pixel).all(axis=-1)
     return is_equal
 
 
@@ -82,7 +91,8 @@ def test_dots_lie_where_the_particles_are(swirl: Path) -> None:
     is_liquid = has_colour(image, MATERIAL_COLOURS[0])
     y, x = np.mgrid[0:128, 0:128] / 128.0 - 0.5
     radius = np.hypot(x, y)
-    assert is_liquid[radius < 0.35].mean() > 0.9
+    share_inside = is_liquid[radius < 0.35].mean()
+    assert share_inside > 0.9
     assert not is_liquid[radius > 0.44].any()
     assert has_colour(image[64, 1], WALL)
     assert has_colour(image[1, 20], MOVING)
@@ -93,20 +103,28 @@ def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
 
     The sunflower's last points lie on the rim, the first in the middle.
     """
-    path = write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=2)
+    first_colour, second_colour, *_ = MATERIAL_COLOURS
+    path = write_swirl(
+        tmp_path,
+        "multimaterial",
+        0,
+        walls=None,
+        materials=2,
+    )
     image = paint(path, Panel.MATERIAL, 0)
-    assert has_colour(image[64, 64], MATERIAL_COLOURS[0])
+    middle = 64
+    assert has_colour(image[middle, middle], first_colour)
     # 0.35 above the middle: the second material
-    rim = image[64 - int(0.35 * 128), 60:68]
-    assert has_colour(rim, MATERIAL_COLOURS[1]).any()
+    rim = image[middle - int(0.35 * 128), 60:68]
+    assert has_colour(rim, second_colour).any()
 
 
 def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
     """Counter-clockwise rotation is red and even; outside the disc there is paper."""
     image = paint(swirl, Panel.VORTICITY, 3)
-    middle = image[52:76, 52:76].reshape(-1, 3)  # clear of the rim on the 8 x 8 grid
-    red = middle[:, 0].astype(int)
-    blue = middle[:, 2].astype(int)
+    # clear of the rim on the 8 x 8 grid
+    middle = image[52:76, 52:76].reshape(-1, 3)
+    red, _, blue = middle.astype(int).T
     assert (red > blue + 60).all()
     assert has_colour(image[12, 115], PAPER)
 
@@ -114,7 +132,9 @@ def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
 def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:
     """A turning disc is dark in the middle and bright at the rim."""
     image = paint(swirl, Panel.SPEED, 2).astype(int)
-    assert image[64, 64].sum() < image[64, 64 + 48].sum()
+    in_the_middle = image[64, 64].sum()
+    at_the_rim = image[64, 64 + 48].sum()
+    assert in_the_middle < at_the_rim
 
 
 def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> None:
@@ -126,7 +146,8 @@ def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> No
     assert seconds == pytest.approx(8 / 30, abs=0.02)
     meta = next(imageio_ffmpeg.read_frames(first))
     assert meta["size"] == (WIDTH, HEIGHT)
-    assert WIDTH % 2 == HEIGHT % 2 == 0
+    assert WIDTH % 2 == 0
+    assert HEIGHT % 2 == 0
     assert first.read_bytes() == second.read_bytes()
 
 
@@ -138,7 +159,8 @@ def test_two_scenarios_side_by_side_end_with_the_shorter(
     path = animate(swirl, tmp_path / "pair.gif", beside=shorter)
     with GifImageFile(path) as image:
         assert image.n_frames == 5
-        assert image.size[0] == WIDTH + animation.GAP + animation.SIDE
+        width, _ = image.size
+    assert width == WIDTH + animation.GAP + animation.SIDE
 
 
 def test_gif_repeats_and_has_the_same_bytes_twice(
@@ -156,9 +178,12 @@ def test_gif_repeats_and_has_the_same_bytes_twice(
         assert image.info["loop"] == 0  # for ever
         assert image.info["duration"] == 100
         for frame in ImageSequence.Iterator(image):
-            frames.append(np.asarray(frame.convert("RGB")))
-    assert all(has_colour(frame[-1, -1], PAPER) for frame in frames)
-    assert (frames[0] != frames[2]).any()
+            pixels = frame.convert("RGB")
+            frames.append(np.asarray(pixels))
+    for frame in frames:
+        assert has_colour(frame[-1, -1], PAPER)
+    first_frame, _, last_frame = frames
+    assert (first_frame != last_frame).any()
 
 
 def test_an_error_leaves_no_file(
@@ -177,7 +202,8 @@ def test_an_error_leaves_no_file(
     monkeypatch.setattr(Painter, "paint", fail_at_three)
     with pytest.raises(DataError):
         animate(swirl, target)
-    assert [path.name for path in tmp_path.iterdir()] == ["old.mp4"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["old.mp4"]
     assert target.read_bytes() == b"old"
 
 

@@ -28,7 +28,10 @@ from lagbench.make import cards, painting
 from lagbench.make.card_files import PICTURES
 from lagbench.make.croissant import croissant_json
 
-STATISTICS = {"position_mean": (0.5, 0.25), "velocity_std": (1.25e-3, 2.5e-3)}
+STATISTICS = {
+    "position_mean": (0.5, 0.25),
+    "velocity_std": (1.25e-3, 2.5e-3),
+}
 LOADER = """
 import json, sys, mlcroissant
 data = mlcroissant.Dataset(sys.argv[1])
@@ -51,11 +54,8 @@ def make(
     for scenario in scenarios:
         write_swirl(root, split, scenario, frames=4)
         entry = describe_file(root, size.key(scenario))
-        entries.append(
-            entry.model_copy(
-                update={"facts": {"kinetic_energy_first": 0.125 + scenario}}
-            )
-        )
+        facts = {"kinetic_energy_first": 0.125 + scenario}
+        entries.append(entry.model_copy(update={"facts": facts}))
     manifest = build_manifest(
         None,
         entries,
@@ -71,17 +71,22 @@ def make(
 
 def write(root: Path, size: Size, manifest: Manifest) -> list[Path]:
     """Write cards with what our registry says of the split."""
-    return cards.write_cards(root, size, registry.load().split(size.split), manifest)
+    split = registry.load().split(size.split)
+    return cards.write_cards(root, size, split, manifest)
 
 
 def card(size: Size, manifest: Manifest, **update: object) -> str:
     """Return the card without pictures of a data set whose manifest has something
     else.
     """
-    manifest = manifest.model_copy(update=update)
-    return cards.dataset_card(
-        size, registry.load().split(size.split), manifest, pictures=[]
-    )
+    split = registry.load().split(size.split)
+    changed = manifest.model_copy(update=update)
+    return cards.dataset_card(size, split, changed, pictures=[])
+
+
+def run_program(*command: str) -> subprocess.CompletedProcess[str]:
+    """Run another program to its end."""
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +99,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(painting, "paint_pictures", PAINT_PICTURES)
         written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
-    names = {p.relative_to(folder).as_posix() for p in written}
+    names = {path.relative_to(folder).as_posix() for path in written}
     assert names == {"README.md", "croissant.json", *PICTURES}
     return folder
 
@@ -103,19 +108,24 @@ def test_mlcroissant_accepts_and_reads_the_document(folder: Path) -> None:
     """The reference validator only remarks on the missing date; records are what the
     manifest says.
     """
+    document = str(folder / "croissant.json")
     tool = Path(sys.executable).parent / "mlcroissant"
-    command = [str(tool), "validate", "--jsonld", str(folder / "croissant.json")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    remarks = re.findall(r"^ +-  .*$", done.stderr, re.MULTILINE)
-    assert all("datePublished" in remark for remark in remarks), remarks
-    assert "Done" in done.stderr
-    command = [sys.executable, "-c", LOADER, str(folder / "croissant.json")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    rows = json.loads(done.stdout)
-    assert [row["scenario"] for row in rows] == [0, 1, 2, 3, 4]
-    assert {row["subset"] for row in rows} == {"train", "valid", "test"}
-    assert all((row["frames"], row["particles"]) == (4, 324) for row in rows)
+    validation = run_program(str(tool), "validate", "--jsonld", document)
+    assert validation.returncode == 0, validation.stderr
+    remarks = re.findall(r"^ +-  .*$", validation.stderr, re.MULTILINE)
+    for remark in remarks:
+        assert "datePublished" in remark
+    assert "Done" in validation.stderr
+    reading = run_program(sys.executable, "-c", LOADER, document)
+    assert reading.returncode == 0, reading.stderr
+    rows = json.loads(reading.stdout)
+    scenarios = [row["scenario"] for row in rows]
+    assert scenarios == [0, 1, 2, 3, 4]
+    subsets = {row["subset"] for row in rows}
+    assert subsets == {"train", "valid", "test"}
+    for row in rows:
+        assert row["frames"] == 4
+        assert row["particles"] == 324
 
 
 def test_every_file_is_named_with_its_true_sha256(folder: Path) -> None:
@@ -124,9 +134,8 @@ def test_every_file_is_named_with_its_true_sha256(folder: Path) -> None:
     assert document["conformsTo"] == "http://mlcommons.org/croissant/1.1"
     assert document["license"] == "https://creativecommons.org/licenses/by/4.0/"
     objects = {entry["contentUrl"]: entry for entry in document["distribution"]}
-    assert set(objects) == {
-        p.relative_to(folder).as_posix() for p in folder.rglob("*.nc")
-    }
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*.nc")}
+    assert set(objects) == files
     for name, entry in objects.items():
         data = (folder / name).read_bytes()
         assert entry["sha256"] == hashlib.sha256(data).hexdigest()
@@ -145,10 +154,10 @@ def test_the_card_says_all_that_it_must(folder: Path) -> None:
     manifest = json.loads((folder / "croissant.json").read_text())
     for record in manifest["recordSet"][0]["data"]:
         assert record["scenarios/content_sha256"] in body
+    lines = body.splitlines()
     for name, parameter in size.parameters.items():
-        row = next(
-            line for line in body.splitlines() if line.startswith(f"| `{name}` |")
-        )
+        rows = [line for line in lines if line.startswith(f"| `{name}` |")]
+        row = rows[0]
         assert escape(parameter.unit) in row
         assert escape(parameter.description) in row
     command = "lagbench generate --split cavity --size tiny"
@@ -159,17 +168,26 @@ def test_the_card_says_all_that_it_must(folder: Path) -> None:
         "--regenerate 2",
     ):
         assert part in body
-    assert escape(" ".join(split.citation.split())) in body
+    citation = " ".join(split.citation.split())
+    assert escape(citation) in body
 
 
 def test_every_picture_of_the_card_is_there(folder: Path) -> None:
     """Links resolve, and each picture has words in its place."""
-    links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", (folder / "README.md").read_text())
-    assert [target for _, target in links] == list(PICTURES)
+    text = (folder / "README.md").read_text()
+    links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", text)
+    targets = [target for _, target in links]
+    assert targets == list(PICTURES)
     for words, target in links:
         assert len(words) > 10
-        assert (folder / target).stat().st_size < 300_000
-        assert (folder / target).read_bytes().startswith(b"\x89PNG")
+        picture = (folder / target).read_bytes()
+        assert len(picture) < 300_000
+        assert picture.startswith(b"\x89PNG")
+
+
+def written_cards(root: Path, size: Size, manifest: Manifest) -> dict[Path, bytes]:
+    """Write cards and return the content of their files."""
+    return {path: path.read_bytes() for path in write(root, size, manifest)}
 
 
 @pytest.mark.usefixtures("as_shipped")
@@ -178,12 +196,13 @@ def test_the_same_manifest_gives_the_same_bytes(tmp_path: Path) -> None:
     date is in them.
     """
     size, manifest = make(tmp_path)
-    first = {path: path.read_bytes() for path in write(tmp_path, size, manifest)}
-    second = {path: path.read_bytes() for path in write(tmp_path, size, manifest)}
+    first = written_cards(tmp_path, size, manifest)
+    second = written_cards(tmp_path, size, manifest)
     assert first == second
-    text = "".join(
-        data.decode() for path, data in first.items() if path.suffix != ".png"
-    )
+    text = ""
+    for path, content in first.items():
+        if path.suffix != ".png":
+            text += content.decode()
     assert not re.search(r"\b20\d\d-\d\d-\d\d|\d\d:\d\d:\d\d", text)
     assert str(tmp_path) not in text
     assert not list(tmp_path.rglob("*.partial"))
@@ -193,9 +212,14 @@ def test_tables_have_as_many_cells_as_their_heads(folder: Path) -> None:
     """No value breaks a table: every row of a block has the same number of unescaped
     bars.
     """
-    for block in (folder / "README.md").read_text().split("\n\n"):
-        lines = [line for line in block.splitlines() if line.startswith("|")]
-        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) <= 1, block
+    text = (folder / "README.md").read_text()
+    for block in text.split("\n\n"):
+        bar_counts = set()
+        for line in block.splitlines():
+            if line.startswith("|"):
+                bars = re.findall(r"(?<!\\)\|", line)
+                bar_counts.add(len(bars))
+        assert len(bar_counts) <= 1, block
 
 
 @pytest.mark.parametrize("scenarios", [(0, 1, 2, 3, 4), ()])
@@ -210,17 +234,20 @@ def test_without_matplotlib_or_files_there_are_no_pictures(
     size, manifest = make(tmp_path, scenarios=scenarios)
     if scenarios:
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    written = write(tmp_path, size, manifest)
-    assert [path.name for path in written] == ["README.md", "croissant.json"]
-    assert "![" not in written[0].read_text()
-    assert len(json.loads(written[1].read_text())["distribution"]) == len(scenarios)
+    readme, croissant = write(tmp_path, size, manifest)
+    assert readme.name == "README.md"
+    assert croissant.name == "croissant.json"
+    assert "![" not in readme.read_text()
+    document = json.loads(croissant.read_text())
+    assert len(document["distribution"]) == len(scenarios)
 
 
 def test_a_partial_data_set_says_so(tmp_path: Path) -> None:
     """Before it is complete there is no data set hash, and subsets count what is
     there.
     """
-    text = card(*make(tmp_path, scenarios=(0, 3)))
+    size, manifest = make(tmp_path, scenarios=(0, 3))
+    text = card(size, manifest)
     assert "none before it is complete" in text
     assert "| train | 0-1 | 1 of 2 |" in text
     assert "Statistics of train" not in text
@@ -231,18 +258,20 @@ def test_a_copy_of_tolerant_identity_does_not_promise_equal_bits(
 ) -> None:
     """The sentence about equal bits depends on the manifest."""
     size, manifest = make(tmp_path, scenarios=(0,))
-    assert "same bits on every" in card(size, manifest)
-    assert "same bits on every" not in card(size, manifest, identity="tolerance")
+    exact = card(size, manifest)
+    assert "same bits on every" in exact
+    tolerant = card(size, manifest, identity="tolerance")
+    assert "same bits on every" not in tolerant
 
 
 def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
     """The note of multimaterial is on its card and on no other."""
     for name in registry.load().splits:
         size = registry.load().size(name, "tiny")
-        text = card(size, Manifest(split=name, size="tiny", version=size.version))
-        assert ("Pairs with snow come to rest first" in text) == (
-            name == "multimaterial"
-        )
+        manifest = Manifest(split=name, size="tiny", version=size.version)
+        text = card(size, manifest)
+        has_note = "Pairs with snow come to rest first" in text
+        assert has_note == (name == "multimaterial")
 
 
 @pytest.mark.parametrize(
@@ -265,23 +294,22 @@ def test_a_card_lists_the_variables_of_its_files(
     manifest = Manifest(split=split, size="tiny", version=size.version)
     text = card(size, manifest, statistics=measured.statistics)
     for name in ("velocity", "wall_velocity", "body_force"):
-        assert (f"| `{name}` |" in text) == (name in variables)
+        is_listed = f"| `{name}` |" in text
+        assert is_listed == (name in variables)
     assert f"| periodic axes | {axes} |" in text
-    header = "|  | " + " | ".join("xyz"[: size.dimension]) + " |"
-    assert header in text
+    columns = " | ".join("xyz"[: size.dimension])
+    assert f"|  | {columns} |" in text
 
 
 def test_the_twin_floor_is_the_mean_over_test(tmp_path: Path) -> None:
     """Two twins that drift to 2e-3 and 4e-3 have a floor of 3e-3 at the last frame."""
     size, manifest = make(tmp_path, scenarios=(3, 4))
     floors = ((1e-6, 2e-3), (3e-6, 4e-3))
-    files = tuple(
-        e.model_copy(update={"twin_floor": f})
-        for e, f in zip(manifest.files, floors, strict=True)
-    )
-    assert "2e-06 at the first predicted frame, 0.003 at the last" in card(
-        size, manifest, files=files
-    )
+    files = []
+    for entry, floor in zip(manifest.files, floors, strict=True):
+        files.append(entry.model_copy(update={"twin_floor": floor}))
+    text = card(size, manifest, files=tuple(files))
+    assert "2e-06 at the first predicted frame, 0.003 at the last" in text
 
 
 def test_hostile_text_of_a_registry_stays_text() -> None:
@@ -290,13 +318,12 @@ def test_hostile_text_of_a_registry_stays_text() -> None:
     """
     size = registry.load().size("cavity", "tiny")
     split = registry.load().split("cavity")
-    hostile = split.model_copy(
-        update={
-            "title": "<script>alert(1)</script>",
-            "description": "a | b ![x](http://example.org) [y](z)\n---\n# head",
-            "citation": 'quote " and \\ back `tick`',
-        }
-    )
+    hostile_text = {
+        "title": "<script>alert(1)</script>",
+        "description": "a | b ![x](http://example.org) [y](z)\n---\n# head",
+        "citation": 'quote " and \\ back `tick`',
+    }
+    hostile = split.model_copy(update=hostile_text)
     manifest = Manifest(split="cavity", size="tiny", version="1.0.0")
     text = cards.dataset_card(size, hostile, manifest, pictures=[])
     _, head, body = text.split("---\n", 2)
@@ -304,27 +331,37 @@ def test_hostile_text_of_a_registry_stays_text() -> None:
     assert "<script>" not in body
     assert not re.search(r"(?<!\\)\]\((http|z)", body)
     assert "\n# head" not in body
-    assert (
-        json.loads(croissant_json(size, hostile, manifest))["citeAs"]
-        == hostile.citation
-    )
+    document = json.loads(croissant_json(size, hostile, manifest))
+    assert document["citeAs"] == hostile.citation
 
 
-@given(st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"])))
+PRINTABLE = st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"])
+
+
+@given(st.text(PRINTABLE))
 def test_escaping_only_adds_backslashes(text: str) -> None:
     """Taking the backslashes away gives the text on one line; no special character
     stands bare.
     """
     escaped = escape(text)
-    assert re.sub(r"\\([\\`*_\[\]<>|#&~$])", r"\1", escaped) == " ".join(text.split())
-    assert not re.search(r"[`*_\[\]<>|#&~$]", re.sub(r"\\.", "", escaped))
+    on_one_line = " ".join(text.split())
+    without_backslashes = re.sub(r"\\([\\`*_\[\]<>|#&~$])", r"\1", escaped)
+    assert without_backslashes == on_one_line
+    without_pairs = re.sub(r"\\.", "", escaped)
+    assert not re.search(r"[`*_\[\]<>|#&~$]", without_pairs)
 
 
 def test_tables_set_numbers_flush_right() -> None:
     """Whole columns of numbers are flush right, with thousands apart; code stays
     code.
     """
-    assert markdown(("n", "`code`|"), [(1234, "`a_b`"), (5, "c_d")]).splitlines() == [
+    columns = ("n", "`code`|")
+    rows = [
+        (1234, "`a_b`"),
+        (5, "c_d"),
+    ]
+    table = markdown(columns, rows)
+    assert table.splitlines() == [
         r"| n | \`code\`\| |",
         "| ---: | --- |",
         "| 1,234 | `a_b` |",

@@ -29,7 +29,13 @@ PLOT_BOX = LabelBox(0.0, 0.0, 400.0, 200.0)
 
 def draw_bar(label: str, value: float, *, dots: tuple[float, ...] = ()) -> Bar:
     """Return a bar whose text is its value."""
-    return Bar(label=label, value=value, value_text=text(value), dots=dots, kind="s0")
+    return Bar(
+        label=label,
+        value=value,
+        value_text=text(value),
+        dots=dots,
+        kind="s0",
+    )
 
 
 def empty_plot() -> Plot:
@@ -40,7 +46,8 @@ def empty_plot() -> Plot:
 
 def read_plot(plot: Plot) -> Reading:
     """Return the elements of a chart without faults."""
-    reading = read_html(plot.svg("title", "description"))
+    svg = plot.svg("title", "description")
+    reading = read_html(svg)
     assert not reading.faults
     return reading
 
@@ -77,20 +84,25 @@ def test_bars_are_as_long_as_their_values() -> None:
     )
     reading = read_html(chart)
     assert not reading.faults
-    widths = [float(box.attributes["width"]) for box in reading.of_class("bar")]
-    assert len(widths) == 2
-    assert widths[0] == pytest.approx(widths[1] / 2)
+    widths = []
+    for box in reading.of_class("bar"):
+        widths.append(float(box.attributes["width"]))
+    half, whole = widths
+    assert half == pytest.approx(whole / 2)
     assert "none  –" in reading.elements[0].text
 
 
 def test_logarithmic_axis_is_even_in_decades() -> None:
     """Each decade takes the same room; zero and negatives have no place."""
     axis = logarithmic(2e-4, 0.03)
-    assert (axis.low, axis.high) == pytest.approx((1e-4, 0.1))
+    assert axis.low == pytest.approx(1e-4)
+    assert axis.high == pytest.approx(0.1)
     shares = axis.share([1e-4, 1e-3, 1e-2, 1e-1])
     assert_allclose(shares, [0, 1 / 3, 2 / 3, 1], atol=1e-12)
-    assert np.isnan(axis.share([0.0, -1.0, math.nan])).all()
-    assert [tick.label for tick in axis.ticks] == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹"]
+    without_place = axis.share([0.0, -1.0, math.nan])
+    assert np.isnan(without_place).all()
+    labels = [tick.label for tick in axis.ticks]
+    assert labels == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹"]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +116,8 @@ def test_logarithmic_axis_is_even_in_decades() -> None:
 def test_ticks_are_round(high: float, labels: list[str], factor: str) -> None:
     """Steps are 1, 2, 2.5 or 5 times a power of ten; large numbers share a factor."""
     axis = linear(0, high)
-    assert [tick.label for tick in axis.ticks] == labels
+    actual_labels = [tick.label for tick in axis.ticks]
+    assert actual_labels == labels
     assert axis.factor == factor
 
 
@@ -116,7 +129,8 @@ def test_ticks_are_round(high: float, labels: list[str], factor: str) -> None:
 def test_axes_hold_their_range(low: float, width: float, count: int) -> None:
     """A loose axis covers its range, and its labels times its factor are its ticks."""
     high = low + width
-    is_distinct = high - low > 1e-9 * max(abs(low), abs(high))
+    magnitude = max(abs(low), abs(high))
+    is_distinct = high - low > 1e-9 * magnitude
     if not is_distinct:
         return
     axis = linear(low, high, count=count)
@@ -146,7 +160,15 @@ def test_wide_ranges_are_logarithmic(values: list[float], is_logarithmic: bool) 
         assert axis.low <= 0.0
 
 
-@pytest.mark.parametrize("values", [[], [math.nan], [0.0], [math.inf, 1e301]])
+@pytest.mark.parametrize(
+    "values",
+    [
+        [],
+        [math.nan],
+        [0.0],
+        [math.inf, 1e301],
+    ],
+)
 def test_series_without_numbers_have_an_axis(values: list[float]) -> None:
     """Values that are not finite or too large are left out."""
     axis = spanning([values])
@@ -178,12 +200,15 @@ def test_an_interval_without_an_end_is_empty() -> None:
     assert interval((math.nan, 1.0)) == ""
 
 
+PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
 @given(st.floats(-1e300, 1e300, allow_subnormal=False))
 def test_numbers_are_right(value: float) -> None:
     """A text reads back to three digits."""
     written = text(value).replace("−", "-")
     mantissa, _, power = written.partition("×10")
-    exponent = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or "0"
+    exponent = power.translate(PLAIN_DIGITS) or "0"
     number = float(f"{mantissa}e{exponent}")
     assert number == pytest.approx(value, rel=5.1e-3, abs=1e-300)
 
@@ -205,7 +230,8 @@ def test_labels_cover_nothing(dots: list[tuple[float, float]]) -> None:
         if label is not None:
             assert label.box.left >= 0.0
             assert label.box.right <= 400.0
-            assert not any(label.box.overlaps(other) for other in boxes)
+            for box in boxes:
+                assert not label.box.overlaps(box)
             boxes.append(label.box)
 
 
@@ -226,14 +252,16 @@ def test_a_dot_without_room_for_a_label_says_its_name() -> None:
     spots = []
     for number in range(20):
         name = f"method number {number}"
-        spots.append(Spot(x=2, y=2, name=name, description=name, kind="entry"))
+        spot = Spot(x=2, y=2, name=name, description=name, kind="entry")
+        spots.append(spot)
     plot.spots(spots)
     reading = read_plot(plot)
     labels = [element.text for element in reading.of_class("name")]
     assert labels[0] == "method number 0"
     assert len(labels) < len(spots)
     titles = {element.text for element in reading.named("title")}
-    assert {spot.description for spot in spots} <= titles
-    dots = reading.of_class("dot")
-    assert all(dot.attributes["tabindex"] == "0" for dot in dots)
+    descriptions = {spot.description for spot in spots}
+    assert descriptions <= titles
+    for dot in reading.of_class("dot"):
+        assert dot.attributes["tabindex"] == "0"
     assert not re.search("nan", plot.svg("title", "description"))

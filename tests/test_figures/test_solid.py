@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import PIL.Image
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.figures.canvas import (
@@ -20,26 +22,34 @@ from lagbench.figures.canvas import (
 )
 from lagbench.figures.solid import PALEST, RIM, View, shade
 
-BOXES = {
-    "cube": Box.from_bounds([(0.0, 1.0)] * 3),
-    "flat": Box.from_bounds([(0.1, 0.9), (0.2, 0.4), (0.0, 1.0)], [True, False, True]),
-}
+CUBE = Box.from_bounds([(0.0, 1.0)] * 3)
+FLAT = Box.from_bounds(
+    [(0.1, 0.9), (0.2, 0.4), (0.0, 1.0)],
+    periodic=[True, False, True],
+)
+BOXES = {"cube": CUBE, "flat": FLAT}
+
+
+def corners_of(box: Box) -> NDArray[np.float64]:
+    """Return the eight corners of a box, shape [corner, axis]."""
+    corners = list(itertools.product(*box.bounds))
+    return np.array(corners)
 
 
 @pytest.mark.parametrize("name", BOXES)
 def test_a_box_fills_the_picture_and_no_more(name: str) -> None:
-    corners = np.array(list(itertools.product(*BOXES[name].bounds)))
-    places = View(BOXES[name]).place(corners)
+    box = BOXES[name]
+    places = View(box).place(corners_of(box))
     reach = np.abs(places - 0.5).max()
     assert reach == pytest.approx(0.5 - RIM)
 
 
 def test_lengths_across_the_line_of_sight_keep_their_scale() -> None:
     """An orthographic view is a rotation: places and depth give back the distance."""
-    box = BOXES["cube"]
-    view = View(box)
-    points = np.random.default_rng(0).random((20, 3))
-    corners = np.array(list(itertools.product(*box.bounds)))
+    view = View(CUBE)
+    rng = np.random.default_rng(0)
+    points = rng.random((20, 3))
+    corners = corners_of(CUBE)
     depths = view.depth(corners)
     assert depths.min() == 0.0
     assert depths.max() == 1.0
@@ -47,35 +57,48 @@ def test_lengths_across_the_line_of_sight_keep_their_scale() -> None:
     farthest = corners[depths.argmax()]
     assert_array_equal(nearest + farthest, [1.0, 1.0, 1.0])
     # the longest depth follows from Pythagoras on the diagonal of the cube
-    across = np.linalg.norm(view.place(farthest) - view.place(nearest)) / view.scale
+    between_places = view.place(farthest) - view.place(nearest)
+    across = np.linalg.norm(between_places) / view.scale
     longest = np.sqrt(3.0 - across**2)
-    way = points - box.centre
     place = (view.place(points) - 0.5) / view.scale
     away = (view.depth(points) - 0.5) * longest
-    length = np.sqrt((place**2).sum(axis=1) + away**2)
-    assert_allclose(length, np.linalg.norm(way, axis=1), rtol=1e-12)
+    square_place = np.sum(place**2, axis=1)
+    length = np.sqrt(square_place + away**2)
+    expected = np.linalg.norm(points - CUBE.centre, axis=1)
+    assert_allclose(length, expected, rtol=1e-12)
 
 
 def test_up_is_up_and_the_back_is_farther() -> None:
-    view = View(BOXES["cube"])
+    view = View(CUBE)
     centre = np.full(3, 0.5)
     right, up, back = np.eye(3) * 0.1
-    assert view.place(centre + right)[0] > 0.5
-    assert view.place(centre + up)[1] > 0.5
-    assert view.place(centre + up)[0] == pytest.approx(0.5)
+    right_x, _ = view.place(centre + right)
+    assert right_x > 0.5
+    up_x, up_y = view.place(centre + up)
+    assert up_x == pytest.approx(0.5)
+    assert up_y > 0.5
     assert view.depth(centre + back) > view.depth(centre)
 
 
 def test_three_edges_meet_in_front() -> None:
-    edges = list(View(BOXES["cube"]).edges())
+    edges = list(View(CUBE).edges())
     assert len(edges) == 12
-    assert sum(is_front for _, is_front in edges) == 3
+    front_count = sum(is_front for _, is_front in edges)
+    assert front_count == 3
 
 
 def test_the_farthest_particle_is_the_palest() -> None:
-    colours = np.zeros((2, 3))
-    shaded = shade(colours, np.array([0.0, 1.0]), np.ones(3))
-    assert_allclose(shaded, [[0.0] * 3, [1.0 - PALEST] * 3])
+    black = np.zeros((2, 3))
+    depths = np.array([0.0, 1.0])
+    nearest, farthest = shade(black, depths, np.ones(3))
+    assert_allclose(nearest, 0.0)
+    assert_allclose(farthest, 1.0 - PALEST)
+
+
+def written_colours(image: PIL.Image.Image, palette: Any) -> NDArray[np.float64]:
+    """Return the colours of a picture as its file has them."""
+    reduced = reduce_colours(image, palette).convert("RGB")
+    return np.asarray(reduced).astype(float)
 
 
 def test_pale_particles_keep_their_hue() -> None:
@@ -89,10 +112,10 @@ def test_pale_particles_keep_their_hue() -> None:
     image = PIL.Image.fromarray(exact)
     palette = choose_palette(image)
     assert not np.array_equal(palette, build_palette())
-    reduced = np.asarray(reduce_colours(image, palette).convert("RGB"))
-    difference = reduced.astype(float) - exact
+    difference = written_colours(image, palette) - exact
     assert np.abs(difference).max() <= 24
-    assert np.sqrt(np.mean(difference**2)) <= 7
+    mean_square = np.mean(difference**2)
+    assert np.sqrt(mean_square) <= 7
 
 
 def test_flat_pictures_keep_their_palette() -> None:
@@ -101,5 +124,5 @@ def test_flat_pictures_keep_their_palette() -> None:
     image = PIL.Image.fromarray(colours)
     palette = choose_palette(image)
     assert_array_equal(palette, build_palette())
-    reduced = np.asarray(reduce_colours(image, palette).convert("RGB"))
-    assert np.abs(reduced.astype(float) - colours).max() <= 8
+    difference = written_colours(image, palette) - colours
+    assert np.abs(difference).max() <= 8

@@ -47,16 +47,18 @@ def make_trace(
     No shift fits better.
     """
     rms = np.array(error)
+    rms = np.array(error)
     ones = np.ones(len(rms))
     products = cosine * rms[1:] * rms[:-1]
+    square_motion = motion**2 * ones
     return Trace(
         error=rms**2,
         overlap=np.concatenate([[np.nan], products]),
-        motion=motion**2 * ones,
-        predicted_motion=motion**2 * ones,
+        motion=square_motion,
+        predicted_motion=square_motion,
         shifted=dict.fromkeys(SHIFTS, 4.0 * rms**2),
         occupancy=ones,
-        outside=np.zeros(len(rms)),
+        outside=np.zeros_like(ones),
     )
 
 
@@ -67,12 +69,14 @@ def test_trace_of_an_offset_that_grows() -> None:
     """
     truth = rollout()
     frames = np.array([0, 0, 1, 2, 3, 4, 5, 6])[:, None, None]
-    trace = trace_of(truth, truth + frames * np.array([0.01, 0.0]))
+    offset = np.array([0.01, 0.0])
+    trace = trace_of(truth, truth + frames * offset)
     errors = [0.5, 2.0, 4.5, 8.0, 12.5, 18.0]
     overlaps = [1.0, 3.0, 6.0, 10.0, 15.0]
-    assert_allclose(trace.error * 1e4, errors, rtol=1e-9)
-    assert_allclose(trace.overlap[1:] * 1e4, overlaps, rtol=1e-9)
-    assert math.isnan(trace.overlap[0])
+    first_overlap, *other_overlaps = 1e4 * trace.overlap
+    assert_allclose(1e4 * trace.error, errors, rtol=1e-9)
+    assert_allclose(other_overlaps, overlaps, rtol=1e-9)
+    assert math.isnan(first_overlap)
 
     # cosine 1 throughout; the smallest ratio is 6/5; the last quarter is the last
     # frame: 6/1
@@ -106,7 +110,8 @@ def test_particles_out_of_the_box_are_counted() -> None:
     truth = rollout()
     prediction = truth.copy()
     prediction[2:, ::4] = 2.0
-    assert_allclose(trace_of(truth, prediction).outside, 0.25)
+    trace = trace_of(truth, prediction)
+    assert_allclose(trace.outside, 0.25)
 
 
 def test_a_cloud_in_half_the_box_occupies_half() -> None:
@@ -114,9 +119,11 @@ def test_a_cloud_in_half_the_box_occupies_half() -> None:
     truth = rollout()
     squeezed = truth.copy()
     squeezed[:, :, 0] /= 2.0
-    occupancy = trace_of(truth, squeezed).occupancy
-    assert np.all(np.abs(occupancy - 0.5) <= 0.1)
-    assert_allclose(trace_of(truth, truth).occupancy, 1.0)
+    trace = trace_of(truth, squeezed)
+    error = np.abs(trace.occupancy - 0.5)
+    assert np.all(error <= 0.1)
+    whole = trace_of(truth, truth)
+    assert_allclose(whole.occupancy, 1.0)
 
 
 GROWING = make_trace([1, 2, 3, 4, 5, 6])
@@ -205,7 +212,8 @@ def test_a_wrong_energy_raises_the_flag(energy: float, is_raised: bool) -> None:
 def test_a_wrong_area_raises_the_flag() -> None:
     trace = make_trace([1, 2, 3])
     wide = replace(trace, occupancy=2.0 * trace.occupancy)
-    assert "area" in judge_physics([wide]).reasons[0]
+    flag = judge_physics([wide])
+    assert "area" in flag.reasons[0]
 
 
 def one_step(truth: Floats, n: int, h: int) -> Floats:
@@ -218,10 +226,11 @@ def one_step(truth: Floats, n: int, h: int) -> Floats:
 def noisy(truth: Floats, n: int, h: int) -> Floats:
     """Add noise of a twentieth of a frame's motion to the truth."""
     rng = np.random.Generator(np.random.PCG64(1))
-    motion = np.sqrt(np.mean(np.diff(truth, axis=0) ** 2))
-    frames = truth[n : n + h]
-    noise = rng.standard_normal(frames.shape)
-    return np.asarray(frames + 0.05 * motion * noise)
+    steps = np.diff(truth, axis=0)
+    motion = np.sqrt(np.mean(steps**2))
+    future = truth[n : n + h]
+    noise = rng.standard_normal(future.shape)
+    return np.asarray(future + 0.05 * motion * noise)
 
 
 def restarted(truth: Floats, n: int, h: int) -> Floats:
@@ -239,15 +248,17 @@ def trace_scenarios(bench: ScoreBench, predict: Predict) -> list[Trace]:
         with bench.task.opened(number) as opened:
             scenario = opened.scenario
             tracer = Tracer(scenario)
-            positions = predict(opened.file.read("position"), first, horizon)
+            truth = opened.file.read("position")
+            prediction = predict(truth, first, horizon)
             frames = zip(
                 range(first, first + horizon),
                 opened.snapshots(),
-                snapshots(scenario, positions),
+                snapshots(scenario, prediction),
                 strict=True,
             )
             for frame, true, predicted in frames:
-                tracer.add(FramePair(scenario, frame, true, predicted))
+                pair = FramePair(scenario, frame, true, predicted)
+                tracer.add(pair)
             traces.append(tracer.result())
     return traces
 

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import xarray as xr
@@ -66,7 +67,9 @@ def url(folder: Store) -> str:
 
 @pytest.fixture
 def tiny(
-    unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path
+    unmeasured: Registry,
+    monkeypatch: pytest.MonkeyPatch,
+    unmeasured_path: Path,
 ) -> Registry:
     """The splits without hashes, also for functions that take no registry."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
@@ -82,8 +85,23 @@ def list_copy(url: str) -> list[str]:
 def drop_entries(text: bytes, key: str, value: object) -> bytes:
     """Return a manifest without the files of a scenario or subset."""
     content = json.loads(text)
-    content["files"] = [entry for entry in content["files"] if entry[key] != value]
+    entries = []
+    for entry in content["files"]:
+        if entry[key] != value:
+            entries.append(entry)
+    content["files"] = entries
     return json.dumps(content).encode()
+
+
+def open_and_close(root: str, **options: Any) -> None:
+    """Open the data set, by which its files come."""
+    lagbench.open_split(SPLIT, size=SIZE, root=root, **options).close()
+
+
+def assert_verified(root: str, registry: Registry) -> None:
+    """Assert that the data set is complete and sound."""
+    result = verify(SPLIT, SIZE, root=root, complete=True, registry=registry)
+    result.check()
 
 
 def test_only_the_files_of_a_subset_come(
@@ -100,9 +118,9 @@ def test_only_the_files_of_a_subset_come(
 
 
 def test_a_second_look_fetches_nothing(store: Store, tiny: Registry) -> None:
-    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    open_and_close(store.url)
     store.remove(f"{FOLDER}/test/0003.nc")
-    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
+    open_and_close(store.url)
     if store.server:
         assert store.server.count("0004.nc") == 1
 
@@ -126,17 +144,34 @@ def test_scores_are_those_of_the_folder(
     The reference that reads train is scored only where train is.
     """
     path = tmp_path / "p.nc"
-    template(SPLIT, SIZE, output=path, root=generated.root, registry=tiny)
+    template(
+        SPLIT,
+        SIZE,
+        output=path,
+        root=generated.root,
+        registry=tiny,
+    )
     result = lagbench.validate(path, root=url, require_truth=True, registry=tiny)
     assert result.valid
     assert not result.skipped
     assert list_copy(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
 
-    from_store = lagbench.score(path, root=url, write=False, registry=tiny)
-    from_folder = lagbench.score(path, root=generated.root, write=False, registry=tiny)
+    from_store = lagbench.score(
+        path,
+        root=url,
+        write=False,
+        registry=tiny,
+    )
+    from_folder = lagbench.score(
+        path,
+        root=generated.root,
+        write=False,
+        registry=tiny,
+    )
     rows = from_store.as_json()["rows"]
     expected = from_folder.as_json()["rows"]
-    assert expected.keys() - rows.keys() == {"analog"}
+    missing = expected.keys() - rows.keys()
+    assert missing == {"analog"}
     for row, scores in rows.items():
         assert expected[row] == scores
 
@@ -145,15 +180,17 @@ def test_baselines_read_from_a_store(
     url: str, generated: GenerationResult, tiny: Registry
 ) -> None:
     """The dataset info needs one file; training needs those of train and valid."""
-    dataset_info = read_dataset_info(SPLIT, SIZE, root=url)
-    assert dataset_info == read_dataset_info(SPLIT, SIZE, root=generated.root)
+    from_store = read_dataset_info(SPLIT, SIZE, root=url)
+    from_folder = read_dataset_info(SPLIT, SIZE, root=generated.root)
+    assert from_store == from_folder
     assert list_copy(url) == ["manifest.json", "train/0000.nc"]
 
     size = tiny.size(SPLIT, SIZE)
     paths = copy.scenario_files(size, resolve_root(url), ("train", "valid"))
     names = ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
     for path, name in zip(paths.values(), names, strict=True):
-        assert path.read_bytes() == (generated.folder / name).read_bytes()
+        expected = (generated.folder / name).read_bytes()
+        assert path.read_bytes() == expected
 
 
 def test_an_export_from_a_store_has_the_same_bytes(
@@ -187,20 +224,22 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     assert listing.state == "yes"
     assert listing.present == {"train": 2, "valid": 1, "test": 2}
     assert list_copy(url) == []
-    assert overview(size, resolve_root(f"{url}/nothing")).state == "no"
+    nothing = overview(size, resolve_root(f"{url}/nothing"))
+    assert nothing.state == "no"
 
 
 def test_verify_mends_the_copy(store: Store, tiny: Registry) -> None:
     """A damaged file comes again."""
-    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    assert_verified(store.url, tiny)
     path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
-    path.write_bytes(path.read_bytes()[:-9] + bytes(9))
-    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    content = path.read_bytes()
+    path.write_bytes(content[:-9] + bytes(9))
+    assert_verified(store.url, tiny)
 
 
 def test_verify_names_an_object_that_is_gone(store: Store, tiny: Registry) -> None:
     """A server that lists nothing cannot tell."""
-    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    assert_verified(store.url, tiny)
     store.remove(f"{FOLDER}/valid/0002.nc")
     if not store.server:
         with pytest.raises(DataError) as caught:
@@ -210,12 +249,15 @@ def test_verify_names_an_object_that_is_gone(store: Store, tiny: Registry) -> No
 
 def test_files_of_the_copy_make_no_store_whole(store: Store, tiny: Registry) -> None:
     """Be it one file or all."""
-    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
-    store.put(MANIFEST, drop_entries(store.read(MANIFEST), "scenario", 3))
-    problems = verify(SPLIT, SIZE, root=store.url, registry=tiny).problems
-    assert "scenario 3 is in the working copy alone, not in the store" in problems
+    assert_verified(store.url, tiny)
+    manifest = store.read(MANIFEST)
+    store.put(MANIFEST, drop_entries(manifest, "scenario", 3))
+    result = verify(SPLIT, SIZE, root=store.url, registry=tiny)
+    problem = "scenario 3 is in the working copy alone, not in the store"
+    assert problem in result.problems
     store.remove(MANIFEST)
-    assert len(verify(SPLIT, SIZE, root=store.url, registry=tiny).problems) == 5
+    result = verify(SPLIT, SIZE, root=store.url, registry=tiny)
+    assert len(result.problems) == 5
 
 
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "another scenario"])
@@ -228,7 +270,8 @@ def test_other_content_is_refused(folder: Store, tiny: Registry, damage: str) ->
     elif damage == "truncated":
         content.pop()
     else:
-        content = bytearray(folder.read(f"{FOLDER}/test/0004.nc"))
+        another = folder.read(f"{FOLDER}/test/0004.nc")
+        content = bytearray(another)
     folder.put(name, bytes(content))
     with pytest.raises((WrongContentError, WrongLengthError)) as caught:
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
@@ -263,7 +306,8 @@ def test_a_wrong_manifest_is_refused(
             entry[key] = value
     else:
         manifest[key] = value
-    folder.put(MANIFEST, json.dumps(manifest).encode())
+    text = json.dumps(manifest)
+    folder.put(MANIFEST, text.encode())
     before = set(tmp_path.rglob("manifest.json"))
     with pytest.raises(error):
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
@@ -279,10 +323,10 @@ def test_a_terminal_shows_the_progress(
 ) -> None:
     """A line on stderr counts files and bytes; with --quiet there is none."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    lagbench.open_split(SPLIT, size=SIZE, root=url).close()
+    open_and_close(url)
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
     with copy.silence_fetching():
-        lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
+        open_and_close(url, subset="valid")
     assert capsys.readouterr() == ("", "")
 
 
@@ -295,7 +339,7 @@ def test_files_that_only_the_copy_has_stay_in_its_manifest(
     (root / FOLDER / "test/0003.nc").unlink()
     manifest = folder.read(MANIFEST)
     folder.put(MANIFEST, drop_entries(manifest, "subset", "train"))
-    lagbench.open_split(SPLIT, size=SIZE, root=folder.url).close()
+    open_and_close(folder.url)
     assert (root / MANIFEST).read_bytes() == manifest
 
 
@@ -316,11 +360,21 @@ def test_the_default_root_may_be_a_url(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_copy_of_a_working_copy_has_no_url(tmp_path: Path) -> None:
     root = resolve_root("s3://bucket/some/where/")
-    shutil.copytree(root, tmp_path / root.name)
-    assert url_of(tmp_path / root.name) is None
+    copied_root = tmp_path / root.name
+    shutil.copytree(root, copied_root)
+    assert url_of(copied_root) is None
 
 
-@pytest.mark.parametrize("path", ["data", "/data", "C:/data", "./s3:", Path("data")])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "data",
+        "/data",
+        "C:/data",
+        "./s3:",
+        Path("data"),
+    ],
+)
 def test_paths_are_no_urls(path: str | Path) -> None:
     assert as_url(path) is None
 
