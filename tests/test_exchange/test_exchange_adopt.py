@@ -4,6 +4,7 @@ error says why not.
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import shutil
@@ -40,7 +41,11 @@ from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
 from lagbench.submission.predictions import open_predictions
 from lagbench.work.progress import Progress
 
-BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+BASIC: dict[str, Any] = {
+    "radius": 0.1,
+    "frame_interval": 0.25,
+}
+UNIT_SQUARE = ((0.0, 1.0), (0.0, 1.0))
 Runs = list[NDArray[np.float32]]
 Run = Callable[..., Result]
 
@@ -48,17 +53,27 @@ Run = Callable[..., Result]
 def save_runs(folder: Path, runs: Runs) -> list[Path]:
     """Write each trajectory to a .npy file."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"run{number}.npy" for number in range(len(runs))]
-    for path, run in zip(paths, runs, strict=True):
+    paths = []
+    for number, run in enumerate(runs):
+        path = folder / f"run{number}.npy"
         np.save(path, run)
+        paths.append(path)
     return paths
 
 
 def adopted(folder: Path, runs: Runs, **options: Any) -> LocalSplit:
     """Adopt each trajectory from a file of its own."""
-    return adopt(
-        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **options}
-    )
+    paths = save_runs(folder / "in", runs)
+    return adopt(paths, output=folder / "mine", **(BASIC | options))
+
+
+Adopt = Callable[..., LocalSplit]
+
+
+@pytest.fixture
+def adopt_here(tmp_path: Path) -> Adopt:
+    """A function that adopts trajectories as ``mine`` in the folder of the test."""
+    return functools.partial(adopt, output=tmp_path / "mine", **BASIC)
 
 
 def stored(own_split: LocalSplit, number: int, name: str) -> NDArray[Any]:
@@ -86,18 +101,20 @@ def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None
 
     v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
     """
-    for subset, expected in {
-        "train": runs[:4],
-        "valid": runs[4:5],
-        "test": runs[5:],
-    }.items():
+    for subset, expected in (
+        ("train", runs[:4]),
+        ("valid", runs[4:5]),
+        ("test", runs[5:]),
+    ):
         with lagbench.open_split(str(own.folder), subset=subset) as data:
-            assert_array_equal(data["position"].values, np.stack(expected))
+            positions = data["position"].values
+            assert_array_equal(positions, np.stack(expected))
             assert data["time"].values[-1] == 11 * 0.25
     velocity = stored(own, 0, "velocity")
-    expected = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
-    assert_array_equal(velocity[1:], expected)
-    assert_array_equal(velocity[0], expected[0])
+    steps = np.diff(runs[0].astype(np.float64), axis=0)
+    expected_velocity = (steps / 0.25).astype(np.float32)
+    assert_array_equal(velocity[1:], expected_velocity)
+    assert_array_equal(velocity[0], expected_velocity[0])
 
 
 def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
@@ -105,29 +122,33 @@ def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
     records.
     """
     size, root, _ = locate(str(own.folder))
-    content = {i: check_scenario(size.path(root, i)) for i in range(6)}
-    parts = {
-        "train": range(4),
-        "valid": [4],
-        "test": [5],
-    }
-    subsets = {
-        name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()
-    }
-    assert own.dataset_sha256 == dataset_hash("mine", "full", 1, subsets)
-    assert size.measured is not None
-    assert size.measured.dataset_sha256 == own.dataset_sha256
-    assert size.measured.scenario_sha256 == {
-        i: digest[:16] for i, digest in content.items()
-    }
+    measured = size.measured
+    assert measured is not None
+    subset_hashes = {}
+    for name, scenarios in (
+        ("train", range(4)),
+        ("valid", [4]),
+        ("test", [5]),
+    ):
+        hashes = {}
+        for scenario in scenarios:
+            hashes[scenario] = check_scenario(size.path(root, scenario))
+            beginning = hashes[scenario][:16]
+            assert measured.scenario_sha256[scenario] == beginning
+        subset_hashes[name] = subset_hash(hashes)
+    assert len(measured.scenario_sha256) == 6
+    expected = dataset_hash("mine", "full", 1, subset_hashes)
+    assert own.dataset_sha256 == expected
+    assert measured.dataset_sha256 == expected
 
 
 def test_the_same_arrays_give_the_same_split(
-    own: LocalSplit, tmp_path: Path, runs: Runs
+    own: LocalSplit, tmp_path: Path, runs: Runs, adopt_here: Adopt
 ) -> None:
     """Once in files of their own, once as one array of four dimensions."""
-    np.save(tmp_path / "all.npy", np.stack(runs))
-    own_split = adopt(tmp_path / "all.npy", output=tmp_path / "mine", test=1, **BASIC)
+    path = tmp_path / "all.npy"
+    np.save(path, np.stack(runs))
+    own_split = adopt_here(path, test=1)
     assert own_split.dataset_sha256 == own.dataset_sha256
     assert (own_split.folder / "split.yaml").read_bytes() == (
         own.folder / "split.yaml"
@@ -150,9 +171,10 @@ def test_a_local_split_is_verified_templated_and_scored(
         output_dir=tmp_path,
         workers=1,
     )
-    floor = card.scores["constant-velocity"]["position_rmse"]
-    assert np.max(floor.per_frame) < 1e-5
-    assert np.min(card.scores["persistence"]["position_rmse"].per_frame) > 1e-3
+    straight = card.scores["constant-velocity"]["position_rmse"]
+    assert np.max(straight.per_frame) < 1e-5
+    at_rest = card.scores["persistence"]["position_rmse"]
+    assert np.min(at_rest.per_frame) > 1e-3
     assert card.header.split == "mine"
 
 
@@ -163,11 +185,13 @@ def test_predictions_for_a_local_split_are_compared(
     target = tmp_path / "predictions.nc"
     lagbench.template(str(own.folder), output=target)
     result = lagbench.compare(target, "persistence", split=f"{own.folder}/")
-    assert (result.split, result.second) == ("mine", "persistence")
+    assert result.split == "mine"
+    assert result.second == "persistence"
 
     lagbench.score(target, split=str(own.folder), output_dir=tmp_path)
     scores = tmp_path / "scores.json"
-    assert lagbench.compare(scores, "persistence", split=own.folder).split == "mine"
+    result = lagbench.compare(scores, "persistence", split=own.folder)
+    assert result.split == "mine"
     with pytest.raises(UsageError) as caught:
         lagbench.compare(scores, "persistence", split="cavity")
     assert caught.value.where == str(scores)
@@ -176,18 +200,14 @@ def test_predictions_for_a_local_split_are_compared(
 
 def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
     """Each subset ends with all of its trajectories written, of as many."""
-    last_reports: dict[str, Progress] = {}
-    adopted(
-        tmp_path,
-        straight_runs(6),
-        test=2,
-        progress=lambda news: last_reports.update({news.stage: news}),
-    )
-    counts = {
-        stage: (news.scenarios_done, news.scenarios, news.total)
-        for stage, news in last_reports.items()
-    }
-    assert counts == {
+    last_counts: dict[str, tuple[int, int, int]] = {}
+
+    def note(report: Progress) -> None:
+        counts = (report.scenarios_done, report.scenarios, report.total)
+        last_counts[report.stage] = counts
+
+    adopted(tmp_path, straight_runs(6), test=2, progress=note)
+    assert last_counts == {
         "writing train": (3, 3, 3),
         "writing valid": (1, 1, 1),
         "writing test": (2, 2, 2),
@@ -198,10 +218,11 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     """Files count by the numbers in their names, as a shell lists them or in a folder;
     others stay.
     """
-    names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
-    for name in names:
-        (tmp_path / name).write_bytes(b"1")
-    listed_paths = [tmp_path / name for name in names]
+    listed_paths = []
+    for number in (0, 1, 10, 11, 2):
+        path = tmp_path / f"run{number}.npz"
+        path.write_bytes(b"1")
+        listed_paths.append(path)
     expected = {
         "train": ["run0", "run1", "run2"],
         "valid": ["run10"],
@@ -209,11 +230,13 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     }
     for paths in (listed_paths, [tmp_path]):
         subsets = _divide_into_subsets(paths, valid=1, test=1)
-        assert {
-            subset: [path.stem for path, _ in rows] for subset, rows in subsets.items()
-        } == expected
+        assert subsets.keys() == expected.keys()
+        for subset, rows in subsets.items():
+            stems = [path.stem for path, _ in rows]
+            assert stems == expected[subset]
     subsets = _divide_into_subsets(listed_paths[::-1], valid=1, test=1)
-    assert [path.stem for path, _ in subsets["test"]] == ["run0"]
+    ((last_path, _),) = subsets["test"]
+    assert last_path.stem == "run0"
 
 
 @pytest.mark.parametrize("ending", ["npy", "npz", "nc"])
@@ -228,26 +251,28 @@ def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
 
 def motion(run: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return velocities as forward differences over a quarter of a second."""
-    step = np.diff(run, axis=0, append=2 * run[-1:] - run[-2:-1])
+    beyond_the_last = 2 * run[-1:] - run[-2:-1]
+    step = np.diff(run, axis=0, append=beyond_the_last)
     return np.asarray(4 * step, np.float32)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 0.1, 10.0])
 def test_velocities_that_contradict_the_motion_are_refused(
-    tmp_path: Path, factor: float
+    tmp_path: Path, factor: float, adopt_here: Adopt
 ) -> None:
     """Another unit or direction is a mistake; nothing is written."""
+    folder = tmp_path / "in"
+    folder.mkdir()
     for number, run in enumerate(straight_runs(3)):
-        path = tmp_path / "in" / f"{number}.npz"
-        path.parent.mkdir(exist_ok=True)
-        np.savez(path, position=run, velocity=factor * motion(run))
+        velocity = factor * motion(run)
+        np.savez(folder / f"{number}.npz", position=run, velocity=velocity)
     with pytest.raises(DataError, match="contradict the motion") as caught:
-        adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+        adopt_here(folder)
     assert "0.npz" in str(caught.value.where)
     assert not (tmp_path / "mine").exists()
 
 
-def test_two_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_arrays_of_one_name_are_refused(tmp_path: Path, adopt_here: Adopt) -> None:
     """Which one counts would depend on the reader."""
     paths = [tmp_path / f"{number}.npz" for number in range(3)]
     for path, run in zip(paths, straight_runs(3), strict=True):
@@ -260,13 +285,13 @@ def test_two_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
     ):
         archive.writestr("position.npy", content)
     with pytest.raises(UnreadableFileError) as caught:
-        adopt(paths, output=tmp_path / "mine", **BASIC)
+        adopt_here(paths)
     assert caught.value.where == str(paths[0])
 
 
 @pytest.mark.parametrize("ending", ["npy", "nc"])
 def test_exchanged_axes_are_refused_until_they_are_stated(
-    tmp_path: Path, ending: str
+    tmp_path: Path, ending: str, adopt_here: Adopt
 ) -> None:
     """Stated, the split is that of the usual order."""
     runs = straight_runs(3, frames=12, particles=40)
@@ -281,24 +306,29 @@ def test_exchanged_axes_are_refused_until_they_are_stated(
         with netCDF4.Dataset(path, "w") as file:
             variable(file, exchanged.shape, "f4")[:] = exchanged
     with pytest.raises(DataError, match="look exchanged"):
-        adopt(paths, output=tmp_path / "mine", **BASIC)
-    axes = ("particle", "frame", "space")
-    own_split = adopt(paths, output=tmp_path / "mine", axes=axes, **BASIC)
-    assert_array_equal(stored(own_split, 2, "position"), runs[2])
+        adopt_here(paths)
+    own_split = adopt_here(paths, axes=("particle", "frame", "space"))
+    position = stored(own_split, 2, "position")
+    assert_array_equal(position, runs[2])
     with pytest.raises(UsageError, match="no order of axes"):
-        adopt(paths, output=tmp_path / "other", axes=("frame", "space"), **BASIC)
+        adopt_here(paths, output=tmp_path / "other", axes=("frame", "space"))
 
 
-def test_a_lattice_that_flies_far_is_no_exchange(tmp_path: Path) -> None:
+def test_a_lattice_that_flies_far_is_no_exchange(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
     """Its particles are nearer to each other than two frames of one of them."""
-    lattice = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1)
-    start = 0.1 + 0.004 * lattice.reshape(-1, 2)
+    x, y = np.meshgrid(np.arange(20), np.arange(20))
+    lattice = np.stack([x, y], axis=-1).reshape(-1, 2)
+    start = 0.1 + 0.004 * lattice
     rng = np.random.default_rng(0)
     start = start[rng.permutation(len(start))]
     time = np.arange(30)[:, None, None]
-    run = (start + 0.02 * time * np.array([1.0, 0.3])).astype(np.float32)
+    flight = 0.02 * time * np.array([1.0, 0.3])
+    run = (start + flight).astype(np.float32)
     paths = save_runs(tmp_path / "in", [run, run + 1e-3, run + 2e-3])
-    assert adopt(paths, output=tmp_path / "mine", **BASIC).frames == 90
+    own_split = adopt_here(paths)
+    assert own_split.frames == 90
 
 
 def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
@@ -310,50 +340,67 @@ def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
         assert words in str(caught.value)
 
 
-@pytest.mark.parametrize(("count", "test_count"), [(4, 1), (12, 4), (20, 6), (70, 7)])
+@pytest.mark.parametrize(
+    ("count", "test_count"),
+    [
+        (4, 1),
+        (12, 4),
+        (20, 6),
+        (70, 7),
+    ],
+)
 def test_test_has_enough_trajectories_for_a_p_value(
-    tmp_path: Path, count: int, test_count: int
+    tmp_path: Path, count: int, test_count: int, adopt_here: Adopt
 ) -> None:
     """Six where train can spare them; with fewer a note says so."""
-    np.save(tmp_path / "runs.npy", np.stack(straight_runs(count)))
-    own_split = adopt(tmp_path / "runs.npy", output=tmp_path / "mine", **BASIC)
+    path = tmp_path / "runs.npy"
+    np.save(path, np.stack(straight_runs(count)))
+    own_split = adopt_here(path)
+    has_note = bool(own_split.notes)
     assert own_split.scenarios["test"] == test_count
-    assert bool(own_split.notes) == (test_count < 6)
+    assert has_note == (test_count < 6)
 
 
-def test_without_bounds_the_extent_of_all_positions_is_fitted(tmp_path: Path) -> None:
+def test_without_bounds_the_extent_of_all_positions_is_fitted(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
     """A scale that is a power of two."""
     runs = [8.0 * run - 5.0 for run in straight_runs(3)]
     paths = save_runs(tmp_path / "in", runs)
-    basic = {**BASIC, "radius": 0.8}
-    own_split = adopt(paths, output=tmp_path / "mine", rescale=True, **basic)
+    own_split = adopt_here(paths, rescale=True, radius=0.8)
     size = locate(own_split.folder).size
-    low = np.min([run.min(axis=(0, 1)) for run in runs], axis=0)
-    high = np.max([run.max(axis=(0, 1)) for run in runs], axis=0)
-    scale = 2.0 ** np.ceil(np.log2((high - low).max()))
-    expected = np.stack([0.0 * low, (high - low) / scale], axis=1)
+    all_positions = np.stack(runs).reshape(-1, 2)
+    extent = np.ptp(all_positions, axis=0)
+    scale = 2.0 ** np.ceil(np.log2(extent.max()))
+    expected = np.stack([np.zeros(2), extent / scale], axis=1)
     assert_allclose(size.bounds, expected)
 
 
-def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
+def test_named_arrays(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
+    wall_velocity = np.zeros((4, 2))
+    wall_velocity[3, 0] = 0.5
     named = {
         "material": np.arange(40) % 4,
-        "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]]),
+        "wall_velocity": wall_velocity,
     }
+    paths = []
     for number, run in enumerate(runs[:3]):
+        path = tmp_path / f"{number}.npz"
+        paths.append(path)
         np.savez(
-            tmp_path / f"{number}.npz",
+            path,
             position=run,
             velocity=motion(run),
             **named,
         )
-    own_split = adopt(
-        [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
-    )
-    assert_array_equal(stored(own_split, 2, "velocity"), motion(runs[2]))
-    assert_array_equal(stored(own_split, 2, "material"), named["material"])
-    assert_array_equal(stored(own_split, 2, "wall_velocity")[5], named["wall_velocity"])
+    own_split = adopt_here(paths)
+    velocity = stored(own_split, 2, "velocity")
+    assert_array_equal(velocity, motion(runs[2]))
+    material = stored(own_split, 2, "material")
+    assert_array_equal(material, named["material"])
+    stored_wall_velocity = stored(own_split, 2, "wall_velocity")
+    assert_array_equal(stored_wall_velocity[5], wall_velocity)
 
 
 def variable(
@@ -368,35 +415,42 @@ def variable(
     return file.createVariable("position", kind, names)
 
 
-def test_netcdf(tmp_path: Path, runs: Runs) -> None:
+def test_netcdf(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame,
     rounded once.
     """
     for number, subset in enumerate(("train", "valid", "test")):
-        (tmp_path / "in" / subset).mkdir(parents=True)
-        with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
-            variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
-    own_split = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+        folder = tmp_path / "in" / subset
+        folder.mkdir(parents=True)
+        run = runs[number]
+        with netCDF4.Dataset(folder / "a.nc", "w") as file:
+            position = variable(file, run.shape, "f8")
+            position[:] = run + 1e-9
+    own_split = adopt_here(tmp_path / "in")
     assert own_split.scenarios == {
         "train": 1,
         "valid": 1,
         "test": 1,
     }
-    expected = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
-    assert_array_equal(stored(own_split, 2, "position"), expected)
+    in_doubles = runs[2].astype(np.float64) + 1e-9
+    position = stored(own_split, 2, "position")
+    assert_array_equal(position, in_doubles.astype(np.float32))
 
 
-def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
+def test_packed_netcdf_is_refused(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
     """Values that stand for others by scale_factor would be taken for positions: the
     file is named.
     """
     paths = save_runs(tmp_path, runs[:2])
-    with netCDF4.Dataset(tmp_path / "packed.nc", "w") as file:
+    packed = tmp_path / "packed.nc"
+    with netCDF4.Dataset(packed, "w") as file:
         position = variable(file, runs[2].shape, "f4")
         position.scale_factor = 2.0
         position[:] = runs[2]
     with pytest.raises(UnreadableFileError) as caught:
-        adopt([*paths, tmp_path / "packed.nc"], output=tmp_path / "mine", **BASIC)
+        adopt_here([*paths, packed])
     assert caught.value.where.endswith("packed.nc, position, scale_factor")
 
 
@@ -419,34 +473,41 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     """Ragged trajectories are padded when opened; the task follows the shortest test
     scenario.
     """
-    shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
-    ragged = [
-        straight_runs(
-            1,
-            frames=f,
-            particles=p,
-            seed=f,
-        )[0]
-        for f, p in shapes
-    ]
+    ragged = []
+    for frames, particles in (
+        (12, 40),
+        (20, 30),
+        (15, 25),
+        (30, 40),
+        (18, 40),
+    ):
+        (run,) = straight_runs(1, frames=frames, particles=particles, seed=frames)
+        ragged.append(run)
     own_split = adopted(tmp_path, ragged, test=2)
     assert own_split.horizon == 12
     assert own_split.particles == (25, 40)
     with lagbench.open_split(str(own_split.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
         assert data["particle_count"].values.tolist() == [40, 30]
-        assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
-    lagbench.template(str(own_split.folder), output=tmp_path / "p.nc")
-    assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
+        position = data["position"].values
+    assert_array_equal(position[1, :20, :30], ragged[1])
+    path = tmp_path / "p.nc"
+    lagbench.template(str(own_split.folder), output=path)
+    result = lagbench.validate(path, root=tmp_path)
+    assert result.valid
 
 
 def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) -> None:
     """Each scenario has as many particles in its predictions as in its file."""
-    ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
+    ragged = []
+    for particles in (40, 40, 30, 20):
+        (run,) = straight_runs(1, particles=particles)
+        ragged.append(run)
     own_split = adopted(tmp_path, ragged, test=2, valid=1)
     path = tmp_path / "p.nc"
     lagbench.template(str(own_split.folder), output=path)
-    assert lagbench.validate(path, root=tmp_path).valid
+    result = lagbench.validate(path, root=tmp_path)
+    assert result.valid
     with open_predictions(path) as predictions:
         first = predictions.header.frames[0]
         for scenario, count in ((2, 30), (3, 20)):
@@ -469,7 +530,8 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     assert size.task.radius == 0.075
     assert size.bounds[0] == (0.0, 0.75)
     assert size.value("source_scale") == 4.0
-    assert_array_equal(stored(own_split, 0, "position") * 4, wide[0])
+    position = stored(own_split, 0, "position")
+    assert_array_equal(4 * position, wide[0])
 
 
 @pytest.mark.parametrize(
@@ -512,8 +574,10 @@ def test_a_fitted_box_lies_in_the_unit_box(
 def test_the_spacing_of_a_lattice_is_found() -> None:
     """On a square lattice the estimate is within 5 % of the lattice constant."""
     axis = 0.2 + 0.01 * np.arange(40)
-    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    assert math.isclose(estimate_spacing(lattice, 0.015), 0.01, rel_tol=0.05)
+    x, y = np.meshgrid(axis, axis)
+    lattice = np.stack([x, y], axis=-1).reshape(-1, 2)
+    spacing = estimate_spacing(lattice, 0.015)
+    assert math.isclose(spacing, 0.01, rel_tol=0.05)
 
 
 def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.float32]:
@@ -522,26 +586,54 @@ def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.floa
     return run
 
 
-BROKEN: dict[
-    str, tuple[Callable[[NDArray[np.float32]], NDArray[Any]], type[LagbenchError], str]
-] = {
-    "flat": (lambda run: run[0], UnreadableFileError, "no positions"),
+Run = NDArray[np.float32]
+Fault = tuple[Callable[[Run], NDArray[Any]], type[LagbenchError], str]
+BROKEN: dict[str, Fault] = {
+    "flat": (
+        lambda run: run[0],
+        UnreadableFileError,
+        "no positions",
+    ),
     "space": (
         lambda run: np.concatenate([run, run], axis=-1),
         DataError,
         "4 components",
     ),
-    "transposed": (lambda run: run.swapaxes(1, 2), DataError, "40 components"),
-    "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
-    "single": (lambda run: run[:1], DataError, "too little"),
-    "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
-    "missing at once": (lambda run: holed(run, 0, np.nan), DataError, "not finite"),
+    "transposed": (
+        lambda run: run.swapaxes(1, 2),
+        DataError,
+        "40 components",
+    ),
+    "integer": (
+        lambda run: run.astype(np.int32),
+        UnreadableFileError,
+        "no positions",
+    ),
+    "single": (
+        lambda run: run[:1],
+        DataError,
+        "too little",
+    ),
+    "missing": (
+        lambda run: holed(run, 3, np.nan),
+        DataError,
+        "not finite",
+    ),
+    "missing at once": (
+        lambda run: holed(run, 0, np.nan),
+        DataError,
+        "not finite",
+    ),
     "beyond float32": (
         lambda run: run.astype(np.float64) * 1e300,
         DataError,
         "not finite",
     ),
-    "outside": (lambda run: holed(run, 3, 1.5), DataError, "outside the unit box"),
+    "outside": (
+        lambda run: holed(run, 3, 1.5),
+        DataError,
+        "outside the unit box",
+    ),
     "objects": (
         lambda run: np.array([run, None], dtype=object),
         UnreadableFileError,
@@ -551,15 +643,19 @@ BROKEN: dict[
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None:
+def test_what_is_no_trajectory_leaves_nothing(
+    tmp_path: Path, kind: str, adopt_here: Adopt
+) -> None:
     """Each fault has its message, which names the file, and no folder is made."""
     broken, error, words = BROKEN[kind]
     paths = save_runs(tmp_path / "in", straight_runs(3))
-    np.save(paths[2], broken(straight_runs(1)[0]), allow_pickle=True)
+    (run,) = straight_runs(1)
+    np.save(paths[2], broken(run), allow_pickle=True)
     with pytest.raises(error, match=words) as caught:
-        adopt(paths, output=tmp_path / "mine", **BASIC)
+        adopt_here(paths)
     assert "run2.npy" in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["in"]
 
 
 @pytest.mark.parametrize(
@@ -622,9 +718,11 @@ def test_what_a_user_says_is_checked(
         **BASIC,
         **changes,
     }
+    options["output"] = tmp_path / options["output"]
     with pytest.raises(UsageError, match=words):
-        adopt(paths, **{**options, "output": tmp_path / options["output"]})
-    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+        adopt(paths, **options)
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["in"]
 
 
 def test_command(tmp_path: Path, run: Run) -> None:
@@ -662,7 +760,7 @@ PLAIN: dict[str, Any] = {
     "input_frames": 3,
     "horizon": 8,
     "frames_of_interest": (10,),
-    "bounds": ((0.0, 1.0), (0.0, 1.0)),
+    "bounds": UNIT_SQUARE,
     "full_box": True,
 }
 
@@ -749,11 +847,11 @@ def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
     ],
 )
 def test_a_value_that_does_not_fit_names_its_key(
-    tmp_path: Path, wish: dict[str, Any], key: str
+    tmp_path: Path, wish: dict[str, Any], key: str, adopt_here: Adopt
 ) -> None:
     """By adopt and by import, before a file is looked at."""
     with pytest.raises(UsageError) as adopted:
-        adopt(tmp_path / "none", output=tmp_path / "mine", **{**BASIC, **wish})
+        adopt_here(tmp_path / "none", **wish)
     with pytest.raises(UsageError) as imported:
         import_split(
             tmp_path / "none",
@@ -765,7 +863,9 @@ def test_a_value_that_does_not_fit_names_its_key(
     assert not list(tmp_path.iterdir())
 
 
-def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
+def test_walls_in_some_trajectories_only_are_refused(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
     """Whichever of them come first, the error names the first that is otherwise."""
     for walled in ({0}, {1, 2}):
         paths = []
@@ -774,7 +874,7 @@ def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
             walls = {"wall_velocity": np.zeros((4, 2))} if number in walled else {}
             np.savez(paths[-1], position=run, **walls)
         with pytest.raises(DataError) as caught:
-            adopt(paths, output=tmp_path / "mine", **BASIC)
+            adopt_here(paths)
         assert caught.value.where == str(paths[1])
         assert not (tmp_path / "mine").exists()
 
@@ -876,7 +976,7 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
     tmp_path: Path, run: Callable[..., Result]
 ) -> None:
     paths = save_runs(tmp_path / "in", drifting_runs(3))
-    options = {"bounds": ((0.0, 1.0), (0.0, 1.0)), **BASIC}
+    options = {"bounds": UNIT_SQUARE, **BASIC}
     with pytest.raises(DataError) as caught:
         adopt(paths, output=tmp_path / "walls", **options)
     assert caught.value.where is not None
@@ -928,7 +1028,7 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
     own_split = adopt(
         save_runs(tmp_path / "in", drifting_runs(3)),
         output=tmp_path / "mine",
-        bounds=((0.0, 1.0), (0.0, 1.0)),
+        bounds=UNIT_SQUARE,
         periodic=["x", "y"],
         input_frames=3,
         **BASIC,
@@ -943,7 +1043,13 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
     assert_allclose(at_rest, drift / np.sqrt(2.0), rtol=0.01)
 
 
-@pytest.mark.parametrize(("axes", "ends"), [(["x"], 4), (["x", "z"], 6)])
+@pytest.mark.parametrize(
+    ("axes", "ends"),
+    [
+        (["x"], 4),
+        (["x", "z"], 6),
+    ],
+)
 def test_a_periodic_axis_without_bounds_is_told_their_form(
     tmp_path: Path, axes: list[str], ends: int
 ) -> None:
@@ -953,16 +1059,19 @@ def test_a_periodic_axis_without_bounds_is_told_their_form(
     fix = str(caught.value.fix)
     example = re.search(r"--bounds (\S+)", fix)
     assert example is not None
-    assert len(example[1].split(",")) == ends
+    numbers = example[1].split(",")
+    assert len(numbers) == ends
     assert caught.value.where == "--periodic"
 
 
-def test_a_periodic_axis_needs_a_name_and_bounds(tmp_path: Path) -> None:
+def test_a_periodic_axis_needs_a_name_and_bounds(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
     paths = save_runs(tmp_path / "in", drifting_runs(3))
     for options in (
         {"periodic": ["x"]},
-        {"periodic": ["q"], "bounds": ((0.0, 1.0), (0.0, 1.0))},
+        {"periodic": ["q"], "bounds": UNIT_SQUARE},
     ):
         with pytest.raises(UsageError) as caught:
-            adopt(paths, output=tmp_path / "mine", **options, **BASIC)
+            adopt_here(paths, **options)
         assert caught.value.where == "--periodic"
