@@ -157,6 +157,16 @@ def direction(rng: RandomSource) -> tuple[float, float]:
             return x / length, y / length
 
 
+def direction_in_space(rng: RandomSource) -> tuple[float, float, float]:
+    """Draw a unit vector, uniform over the sphere, as :func:`direction` does."""
+    while True:
+        x, y, z = (2.0 * rng.random((3,)) - 1.0).tolist()
+        square = x * x + y * y + z * z
+        if 2.0**-20 <= square <= 1.0:
+            length = math.sqrt(square)
+            return x / length, y / length, z / length
+
+
 def fill(
     rng: RandomSource, count: int, *, low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from .constants import constants, free_surface_walls, interval
 from .draws import RandomSource, choice, quantise, uniform
-from .solids import Ball, Block, Solid, sample_solid
+from .shapes import Body, sample_points
+from .solids import Ball, Block, Solid
 from .split import (
     FreeSurface3DParameters,
     FreeSurfaceParameters,
@@ -143,7 +144,8 @@ def _state(
         if index < len(bodies) - 1:
             count = int(size.particles * (solid.volume / total_volume))
         left_count -= count
-        positions.append(sample_solid(rng, solid, centre, count))
+        body = Body(solid, np.array(centre))
+        positions.append(sample_points(rng, body, count))
         velocities.append(np.tile(np.array(velocity), (count, 1)))
 
     low, high = free_surface_walls(size)

@@ -11,14 +11,15 @@ the splits.
 """
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .driver import Driver, Kernels, stack
+from .driver import Driver, stack
+from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
 from .solver import Health
 from .soundness import sound_speeds
@@ -61,17 +62,36 @@ class Energy:
         return self.kinetic + self.gravitational + self.elastic
 
 
-class ExtremeKernels(Kernels, Protocol):
-    """Kernels that keep the extremes of each particle."""
-
-    extremes: Any  # largest speed, smallest and largest J, largest abs(v) + abs(A o)
-    reach_bound: float  # of abs(v) + abs(A o), what sums have room for [length/s]
-
-
 class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
-    """What solvers of free surfaces share: extremes, and the bound of their sums."""
+    """What solvers of free surfaces share in the plane and in space."""
 
-    _kernels: ExtremeKernels
+    _kernels: FreeSurfaceKernels
+
+    @abstractmethod
+    def deformation(self) -> NDArray[np.float32]:
+        """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
+        particle, axis, axis].
+        """
+
+    @abstractmethod
+    def _set_deformation(self, gradients: NDArray[np.float32]) -> None:
+        """Fill the field of F, shape [scenario, particle, axis, axis]."""
+
+    def _start(self, states: Sequence[InitialState]) -> None:
+        shape = (self.scenarios, self.parameters.particles)
+        kernels = self._kernels
+        # Material of each particle, shape [scenario, particle]
+        self._material = stack(states, "material").astype(np.int32)
+        kernels.solid = bool((self._material != Material.LIQUID).any())
+        matter = np.zeros((*shape, 4), np.float32)
+        matter[:, :, 0] = self._material
+        matter[:, :, 1:] = 1.0
+        kernels.matter.from_numpy(matter)
+        identity = np.eye(self.dimension, dtype=np.float32)
+        gradients = np.broadcast_to(identity, (*shape, *identity.shape))
+        self._set_deformation(gradients.copy())
+        friction = np.array([state.friction for state in states], np.float32)
+        kernels.friction.from_numpy(friction)
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
@@ -100,44 +120,12 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             return {name: f"{quantity} = {reach:.6g}"}
         return {}
 
-
-class FreeSurface(FreeSurfaceDriver):
-    """Solver of a free surface; its methods are those of :class:`.Solver`."""
-
-    _kernels: ParticleStress
-
-    def _compile(self, atomic: bool, threads: int) -> ParticleStress:
-        return ParticleStress(
-            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
-        )
-
-    def _start(self, states: Sequence[InitialState]) -> None:
-        particle_count = self.parameters.particles
-        kernels = self._kernels
-        # Material of each particle, shape [scenario, particle]
-        self._material = stack(states, "material").astype(np.int32)
-        kernels.solid = bool((self._material != Material.LIQUID).any())
-        matter = np.zeros((self.scenarios, particle_count, 4), np.float32)
-        matter[:, :, 0] = self._material
-        matter[:, :, 1:] = 1.0
-        kernels.matter.from_numpy(matter)
-        identity = np.eye(2, dtype=np.float32)
-        shape = (self.scenarios, particle_count, 2, 2)
-        kernels.f.from_numpy(np.broadcast_to(identity, shape).copy())
-        friction = np.array([state.friction for state in states], np.float32)
-        kernels.friction.from_numpy(friction)
-
     def affine(self) -> NDArray[np.float32]:
-        """APIC matrices C = grad v [1/s], shape [scenario, particle, 2, 2]."""
-        slope_x = self._kernels.slope_x.to_numpy()[..., :2]
-        slope_y = self._kernels.slope_y.to_numpy()[..., :2]
-        return np.stack([slope_x, slope_y], axis=-1)
-
-    def deformation(self) -> NDArray[np.float32]:
-        """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
-        particle, 2, 2].
-        """
-        return np.asarray(self._kernels.f.to_numpy())
+        """APIC matrices C = grad v [1/s], shape [scenario, particle, axis, axis]."""
+        columns = []
+        for slope in self._kernels.slopes:
+            columns.append(slope.to_numpy()[..., : self.dimension])
+        return np.stack(columns, axis=-1)
 
     def volume_ratio(self) -> NDArray[np.float32]:
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario,
@@ -158,8 +146,7 @@ class FreeSurface(FreeSurfaceDriver):
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario,
         particle].
         """
-        f = self.deformation()
-        determinant = f[..., 0, 0] * f[..., 1, 1] - f[..., 0, 1] * f[..., 1, 0]
+        determinant = np.linalg.det(self.deformation())
         is_liquid = self._material == Material.LIQUID
         return np.where(is_liquid, self.volume_ratio(), determinant)
 
@@ -184,15 +171,13 @@ class FreeSurface(FreeSurfaceDriver):
         kernels = self._kernels
         f = self.deformation().astype(np.float64)
         ratio = self.volume_ratio().astype(np.float64)
-        a = f[..., 0, 0]
-        b = f[..., 0, 1]
-        c = f[..., 1, 0]
-        d = f[..., 1, 1]
-        # abs(F - R)^2 = abs(F)^2 - 2 tr(R^T F) + 2, and tr(R^T F) is twice the mean
-        # stretch.
-        norm_square = a * a + b * b + c * c + d * d
-        shear = norm_square - 2.0 * np.hypot(a + d, c - b) + 2.0
-        bulk = 0.5 * (a * d - b * c - 1.0) ** 2
+        # abs(F - R)^2 is the sum of (stretch - 1)^2; where F inverts, the least stretch
+        # is negative.
+        stretches = np.linalg.svd(f, compute_uv=False)
+        jacobian = np.linalg.det(f)
+        stretches[..., -1] *= np.sign(jacobian)
+        shear = ((stretches - 1.0) ** 2).sum(axis=-1)
+        bulk = 0.5 * (jacobian - 1.0) ** 2
         hardening = np.exp(p.snow_hardening * (1.0 - ratio))
         hardening = np.clip(hardening, p.snow_hardening_min, p.snow_hardening_max)
 
@@ -208,3 +193,23 @@ class FreeSurface(FreeSurfaceDriver):
                 psi = psi * hardening
             density = np.where(self._material == material, psi, density)
         return np.asarray(density)
+
+
+class FreeSurface(FreeSurfaceDriver):
+    """Solver of a free surface; its methods are those of :class:`.Solver`."""
+
+    _kernels: ParticleStress
+
+    def _compile(self, atomic: bool, threads: int) -> ParticleStress:
+        return ParticleStress(
+            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
+        )
+
+    def deformation(self) -> NDArray[np.float32]:
+        """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
+        particle, 2, 2].
+        """
+        return np.asarray(self._kernels.f.to_numpy())
+
+    def _set_deformation(self, gradients: NDArray[np.float32]) -> None:
+        self._kernels.f.from_numpy(gradients)

@@ -8,27 +8,23 @@ splashes and settles, snow breaks and stays, rope bends, jelly rebounds. Two sno
 rest after about 100 frames.
 
 The subset ``shift`` lies outside train on purpose: three bodies, see :data:`TRIPLES`.
+
+What is said here holds for :mod:`.multimaterial_3d` too, whose shapes fill a cube.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.errors import WorkFailedError
 
-from .constants import (
-    constants,
-    free_surface_walls,
-    interval,
-    ranges,
-    shift_number,
-)
+from .constants import constants, free_surface_walls, interval, shift_number
 from .draws import RandomSource, choice, direction, quantise, uniform
 from .shapes import Body, Disc, Rectangle, Shape, place, sample_points
 from .split import FreeSurfaceParameters, InitialState, Material
@@ -54,7 +50,13 @@ TRIPLES = (
 )
 """Materials of the three bodies of shift, by place in the subset modulo 4."""
 
+ShapeDraw: TypeAlias = "Callable[[RandomSource, Material, Size], Shape]"
+"""Draws the shape of a body of a material."""
+
 _NAMES = ("first", "second", "third")
+
+# what a shape states of its extent, by number of axes
+_MEASURES = {2: "area", 3: "volume"}
 
 # when to give up; no scenario of datasets.yaml comes near it
 _ATTEMPTS = 1000
@@ -78,12 +80,11 @@ def _draw_shape(rng: RandomSource, material: Material, size: Size) -> Shape:
 
 def _probe_nodes(shape: Shape, cell_count: int) -> NDArray[np.float64]:
     """Return nodes of a grid over a bounding box about the origin [length], shape
-    [node, 2].
+    [node, axis].
     """
     side = (2.0 * np.arange(cell_count + 1) - cell_count) / cell_count
-    reach_x, reach_y = shape.reach
-    x, y = np.meshgrid(side * reach_x, side * reach_y)
-    return np.stack([x.ravel(), y.ravel()], axis=-1)
+    coordinates = np.meshgrid(*(side * reach for reach in shape.reach))
+    return np.stack([along.ravel() for along in coordinates], axis=-1)
 
 
 def _keeps_gap(
@@ -111,7 +112,7 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
     offsets = [_probe_nodes(shape, cell_count) for shape in shapes]
 
     for _ in range(_ATTEMPTS):
-        bodies = [place(rng, shape, (inner, inner)) for shape in shapes]
+        bodies = [place(rng, shape, size.dimension * [inner]) for shape in shapes]
         pairs = combinations(range(len(bodies)), 2)
         if all(_keeps_gap(bodies[i], bodies[j], offsets[j], gap) for i, j in pairs):
             return bodies
@@ -125,21 +126,26 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
 def _body_parameters(
     name: str, body: Body, velocity: NDArray[np.float64]
 ) -> dict[str, int | float | str]:
-    """Return what a file states of one body: shape, area, centre and velocity."""
-    centre_x, centre_y = body.centre.tolist()
-    velocity_x, velocity_y = velocity.tolist()
-    return {
+    """Return what a file states of one body: shape, area or volume, centre and
+    velocity.
+    """
+    parameters: dict[str, int | float | str] = {
         f"{name}_shape": type(body.shape).__name__.lower(),
-        f"{name}_area": body.shape.area,
-        f"{name}_centre_x": centre_x,
-        f"{name}_centre_y": centre_y,
-        f"{name}_velocity_x": velocity_x,
-        f"{name}_velocity_y": velocity_y,
+        f"{name}_{_MEASURES[len(velocity)]}": _measure(body.shape),
     }
+    for quantity, vector in (("centre", body.centre), ("velocity", velocity)):
+        for axis, component in zip("xyz", vector.tolist(), strict=False):
+            parameters[f"{name}_{quantity}_{axis}"] = component
+    return parameters
+
+
+def _measure(shape: Shape) -> float:
+    """Return the area of a shape [length^2], in space its volume [length^3]."""
+    return float(getattr(shape, _MEASURES[len(shape.reach)]))
 
 
 def _share_particles(particle_count: int, areas: Sequence[float]) -> list[int]:
-    """Return the particles of each body, in proportion to the areas [length^2]."""
+    """Return the particles of each body, in proportion to the areas or volumes."""
     area = sum(areas)
     counts = []
     for body_area in areas[:-1]:
@@ -156,19 +162,31 @@ def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
     return TRIPLES[number % len(TRIPLES)]
 
 
+def _draw_attractor(rng: RandomSource, size: Size) -> NDArray[np.float64]:
+    """Draw the point that attracts all bodies [length], shape [axis]."""
+    point = []
+    for axis in "xyz"[: size.dimension]:
+        point.append(uniform(rng, *interval(size, f"attractor_{axis}")))
+    return np.array(point)
+
+
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw the bodies, their places and their velocities."""
+    return draw_bodies(size, scenario, rng, _draw_shape)
+
+
+def draw_bodies(
+    size: Size, scenario: int, rng: RandomSource, draw_shape: ShapeDraw
+) -> InitialState:
+    """Draw the bodies of a scenario in the plane or in space, by their shapes."""
     materials = _materials(size, scenario)
-    shapes = [_draw_shape(rng, material, size) for material in materials]
+    shapes = [draw_shape(rng, material, size) for material in materials]
     bodies = _place_apart(rng, size, shapes)
-    areas = [shape.area for shape in shapes]
+    areas = [_measure(shape) for shape in shapes]
     counts = _share_particles(size.particles, areas)
 
     # the attractor: velocity of each body = rate (point - centre) [length/s]
-    x_range, y_range = ranges(size, "attractor")
-    point_x = uniform(rng, *x_range)
-    point_y = uniform(rng, *y_range)
-    point = np.array([point_x, point_y])
+    point = _draw_attractor(rng, size)
     rate = uniform(rng, *interval(size, "attraction"))
     velocities = [quantise(rate * (point - body.centre)) for body in bodies]
 
@@ -186,12 +204,14 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     }
     for name, body, velocity in zip(_NAMES, bodies, velocities, strict=False):
         parameters |= _body_parameters(name, body, velocity)
+    dimension = size.dimension
     return InitialState(
         position=np.concatenate(points),
         velocity=np.repeat(np.stack(velocities), counts, axis=0),
-        affine=np.zeros((size.particles, 2, 2)),
+        affine=np.zeros((size.particles, dimension, dimension)),
         material=np.repeat(np.array(materials, dtype=np.int8), counts),
         area=sum(areas),
+        wall_velocity=np.zeros((2 * dimension, dimension)),
         friction=friction,
         parameters=parameters,
     )

@@ -25,17 +25,15 @@ without it a settled liquid loses a fifth of its depth.
 
 import taichi as ti
 
-from . import backend
 from .constitutive import (
     corotated_stress,
     hardening,
-    lame,
     larger,
     liquid_stress,
     plastic_return,
     viscous_stress,
 )
-from .split import FreeSurfaceParameters, Material
+from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, largest_of
 from .transfer import (
     Nothing,
     Template,
@@ -43,87 +41,30 @@ from .transfer import (
     accumulate,
     base_node,
     bounded,
-    fixed_point_scale,
     from_fixed,
     stencil,
     stepped,
 )
 
-_INSET = 1e-3  # distance that particles keep from a wall [cells]
-# bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2
-_REACH = 64.0
-_HUGE = 3e38  # stands for what is not a number where extremes are kept
-_LIQUID = int(Material.LIQUID)
-_SNOW = int(Material.SNOW)
-_ROPE = int(Material.ROPE)
-
 
 @ti.data_oriented
-class ParticleStress:
+class ParticleStress(FreeSurfaceKernels):
     """Fields of a batch of scenarios and the kernels that advance them."""
 
-    def __init__(
-        self,
-        parameters: FreeSurfaceParameters,
-        *,
-        scenarios: int,
-        atomic: bool,
-        threads: int,
-    ) -> None:
-        """Round the constants and take the memory."""
-        p = parameters
-        self.parameters = parameters  # constants that the scenarios share
-        self.scenarios = scenarios  # scenarios advanced together
-        self.atomic = atomic  # whether several threads run the phases
-        self.threads = threads  # threads of the parallel loops on a CPU
-        self.solid = True  # whether some particles are no liquid
-        self.inv_dx = float(p.grid)
-        self.dx = 1.0 / p.grid
-        self.dt = p.dt
-        self.width = p.grid + 1
-        self.low = p.wall
-        self.high = p.grid - p.wall
-        # smallest and largest coordinate of a particle
-        self.least = (self.low + _INSET) * self.dx
-        self.most = (self.high - _INSET) * self.dx
-        self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
-        # of abs(v) + abs(A o), what sums have room for
-        self.reach_bound = _REACH * self.speed_bound
-        self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
-        self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
-        self.velocity_unit = 1.0 / self.velocity_scale
-        self.count_unit = 1.0 / self.count_scale
-        self.impulse = 4.0 * p.dt * p.grid / p.density
-        self.fall = p.gravity * p.dt
-        self.liquid_viscosity = p.density * p.liquid_viscosity
-        self.solid_viscosity = p.density * p.elastic_damping
-        self.jelly = lame(p.jelly_modulus, p.jelly_poisson)
-        self.rope = lame(p.rope_modulus, p.rope_poisson)
-        self.snow = lame(p.snow_modulus, p.snow_poisson)
-        self.yield_low = 1.0 - p.snow_compression
-        self.yield_high = 1.0 + p.snow_stretch
-        self._declare_fields()
-        self._place_fields()
+    dimension = 2
+    reach = 64.0  # a violent impact reaches 2
+    at_rest = (0.0, 0.0, 1.0, 1.0)
 
     def _declare_fields(self) -> None:
-        """Name the fields; they have no memory yet."""
-        # particle positions [length], and two zeros
-        self.x = ti.Vector.field(4, ti.f32)
-        # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
-        self.carried = ti.Vector.field(4, ti.f32)
-        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # of a particle at rest
-        # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
-        self.slope_x = ti.Vector.field(4, ti.f32)
-        self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
-        self.slopes = (self.slope_x, self.slope_y)
+        """Name the fields; they have no memory yet.
+
+        P2G spreads v_x, v_y, 1, and J of liquid or 1. Slopes are those of v_x, v_y, r
+        and Jbar.
+        """
+        super()._declare_fields()
+        self.slope_x, self.slope_y = self.slopes
         # deformation gradients of the solids [1]
         self.f = ti.Matrix.field(2, 2, ti.f32)
-        # Material, J of liquid or plastic Jp of snow (1 in other solids), and the
-        # smallest and largest that this was since the start
-        self.matter = ti.Vector.field(4, ti.f32)
-        # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
-        # advance began
-        self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
         # first column of A, scaled, and two zeros
         self.a_x = ti.Vector.field(4, ti.f32)
@@ -131,33 +72,12 @@ class ParticleStress:
         self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
-        self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
-        # Coulomb friction of the walls, shape [scenario]
-        self.friction = ti.field(ti.f32)
 
-    def _place_fields(self) -> None:
-        """Give the fields their memory, each an array of its own."""
-        particle_fields = (
-            self.x,
-            self.carried,
-            self.slope_x,
-            self.slope_y,
-            self.f,
-            self.matter,
-            self.extremes,
-            *self.rows,
-            self.a_x,
-            self.a_y,
-            self.here,
-        )
-        particle_shape = (self.scenarios, self.parameters.particles)
-        node_shape = (self.scenarios, self.width**2)
-        backend.place(
-            *((particle_shape, [field]) for field in particle_fields),
-            (node_shape, [self.sums]),
-            (node_shape, [self.node]),
-            ((self.scenarios,), [self.fill, self.friction]),
-        )
+    def _particle_fields(self) -> tuple[ti.Field, ...]:
+        return self.f, *self.rows, self.a_x, self.a_y, self.here
+
+    def _node_fields(self) -> tuple[ti.Field, ...]:
+        return self.sums, self.node
 
     # The phases: each function is one phase at one particle or node.
 
@@ -175,10 +95,10 @@ class ParticleStress:
             mu = self.jelly[0]
             la = self.jelly[1]
             damping = self.solid_viscosity
-            if kind == _ROPE:
+            if kind == ROPE:
                 mu = self.rope[0]
                 la = self.rope[1]
-            if kind == _SNOW:
+            if kind == SNOW:
                 factor = hardening(
                     ratio,
                     self.parameters.snow_hardening,
@@ -189,8 +109,8 @@ class ParticleStress:
                 la = self.snow[1] * factor
                 damping = 0.0
             elastic = corotated_stress(self.f[s, p], mu, la)
-            tau = ti.select(kind == _LIQUID, tau, elastic)
-            viscosity = ti.select(kind == _LIQUID, viscosity, damping)
+            tau = ti.select(kind == LIQUID, tau, elastic)
+            viscosity = ti.select(kind == LIQUID, viscosity, damping)
         return tau + viscous_stress(c, viscosity)
 
     @ti.func
@@ -285,23 +205,11 @@ class ParticleStress:
         """
         new_normal = normal
         new_tangential = tangential
-        if (index <= self.low and normal < 0.0) or (
-            index >= self.high and normal > 0.0
-        ):
+        if self.is_outward(index, normal):
             loss = friction * ti.abs(normal) / larger(ti.abs(tangential), 1e-9)
             new_normal = 0.0
             new_tangential = tangential * larger(1.0 - loss, 0.0)
         return new_normal, new_tangential
-
-    @ti.func
-    def image(self, index: ti.i32) -> ti.i32:
-        """Return the mirror image of a node within a cell of a wall, else -1."""
-        mirrored = -1
-        if index <= self.low + 1:
-            mirrored = 2 * self.low - index
-        if index >= self.high - 1:
-            mirrored = 2 * self.high - index
-        return mirrored
 
     @ti.func
     def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.i64:
@@ -364,14 +272,14 @@ class ParticleStress:
             jp_max = self.parameters.snow_jp_max
             jp = bounded(old * growth, jp_min, jp_max)
             # Chosen, not branched upon: else no vectors.
-            deformed = ti.select(kind == _SNOW, yielded, f)
-            f = ti.select(kind == _LIQUID, resting, deformed)
+            deformed = ti.select(kind == SNOW, yielded, f)
+            f = ti.select(kind == LIQUID, resting, deformed)
             self.f[s, p] = f
-            plastic = ti.select(kind == _SNOW, jp, old)
-            ratio = ti.select(kind == _LIQUID, j, plastic)
+            plastic = ti.select(kind == SNOW, jp, old)
+            ratio = ti.select(kind == LIQUID, j, plastic)
             determinant = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-            jacobian = ti.select(kind == _LIQUID, j, determinant)
-            spread = ti.select(kind == _LIQUID, j, 1.0)
+            jacobian = ti.select(kind == LIQUID, j, determinant)
+            spread = ti.select(kind == LIQUID, j, 1.0)
         lowest = -larger(-ratio, -lowest)
         highest = larger(ratio, highest)
         self.matter[s, p] = ti.Vector([kind, ratio, lowest, highest])
@@ -456,18 +364,7 @@ class ParticleStress:
             v = self.carried[s, p]
             f = self.f[s, p]
             jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-            if self.matter[s, p][0] == _LIQUID:
+            if self.matter[s, p][0] == LIQUID:
                 jacobian = v[3]
             speed = largest_of(ti.abs(v[0]), ti.abs(v[1]))
             self.extremes[s, p] = ti.Vector([speed, jacobian, jacobian, 0.0])
-
-
-@ti.func
-def largest_of(a: ti.f32, b: ti.f32) -> ti.f32:
-    """Return the larger of two positive values.
-
-    It is :data:`_HUGE` if either is not a number.
-    """
-    finite_a = ti.select(a < _HUGE, a, _HUGE)
-    finite_b = ti.select(b < _HUGE, b, _HUGE)
-    return larger(finite_a, finite_b)

@@ -1,12 +1,15 @@
 """Shapes of bodies, where they may lie, and evenly spread particles inside them.
 
-A shape stands about the origin. Its distance function is negative inside, so that one
-definition says what the shape contains and how far it keeps from another.
+A shape stands about the origin, in the plane or in space. Its distance function is
+negative inside, so that one definition says what the shape contains and how far it
+keeps from another. The shapes of the plane stand here, those of space in
+:mod:`.solids`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,23 +33,24 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Region = tuple[tuple[float, float], tuple[float, float]]
-"""Where a bounding box may lie: (left, right), (bottom, top) [length]."""
+Region = Sequence[tuple[float, float]]
+"""Where a bounding box may lie: lowest and highest coordinate along each axis [length].
+"""
 
-# Roberts' R2 sequence: 1/g and 1/g^2 for the real root g of g^3 = g + 1.
-_R2 = np.array([0.7548776662466927, 0.5698402909980532])
+# Roberts' low-discrepancy sequences by number of axes: 1/g, 1/g^2, ... for the real
+# root g of g^3 = g + 1 in the plane and of g^4 = g + 1 in space.
+_ROBERTS = {
+    2: np.array([0.7548776662466927, 0.5698402909980532]),
+    3: np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703]),
+}
 
 
 class Shape(Protocol):
     """A body's outline about the origin."""
 
     @property
-    def area(self) -> float:
-        """Area [length^2]."""
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """Half the width and half the height of the bounding box [length]."""
+    def reach(self) -> tuple[float, ...]:
+        """Half the sides of the bounding box [length]."""
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance, negative inside [length], shape [point]."""
@@ -178,16 +182,16 @@ class Body:
     """A shape put somewhere."""
 
     shape: Shape  # outline about the origin
-    centre: Array  # where the origin lies [length], shape [2]
+    centre: Array  # where the origin lies [length], shape [axis]
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance from the outline, negative inside [length]."""
         return self.shape.distance(position - self.centre)
 
 
-def body_at(shape: Shape, x: float, y: float) -> Body:
+def body_at(shape: Shape, *centre: float) -> Body:
     """Put a shape at a point, rounded to multiples of 2^-20."""
-    return Body(shape, quantise([x, y]))
+    return Body(shape, quantise(centre))
 
 
 def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
@@ -212,24 +216,25 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
 def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     """Spread particles evenly inside a body.
 
-    These are the first ``count`` points inside it of Roberts' R2 low-discrepancy
-    sequence. The sequence is laid by a random shift over the smallest square about the
-    bounding box, so that spacings are alike in both directions however slender the
-    body is.
+    These are the first ``count`` points inside it of Roberts' low-discrepancy sequence.
+    The sequence is laid by a random shift over the smallest square, or cube, about the
+    bounding box, so that spacings are alike in all directions however slender the body
+    is.
 
     Returns:
-        Positions [length], multiples of 2^-20, shape [count, 2].
+        Positions [length], multiples of 2^-20, shape [count, axis].
     """
-    shift = rng.random((2,))
+    steps = _ROBERTS[len(body.shape.reach)]
+    shift = rng.random(steps.shape)
     side = 2.0 * max(body.shape.reach)
     # in blocks: a million particles take no memory beside their own
     block_size = min(4 * count, 1 << 16)
-    blocks = [np.empty((0, 2))]
+    blocks = [np.empty((0, len(steps)))]
     missing_count = count
     start = 1
     while missing_count > 0:
         index = np.arange(start, start + block_size, dtype=np.float64)[:, None]
-        turns = shift + index * _R2
+        turns = shift + index * steps
         local = (turns - np.floor(turns) - 0.5) * side
         is_inside = body.shape.distance(local) <= 0.0
         points = local[is_inside][:missing_count]

@@ -1,7 +1,4 @@
-"""Bodies in three dimensions and evenly spread particles inside them.
-
-A solid stands about the origin. Its distance function is negative inside.
-"""
+"""Shapes of bodies in three dimensions; those of the plane stand in :mod:`.shapes`."""
 
 from __future__ import annotations
 
@@ -12,18 +9,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .draws import RandomSource, quantise
-
-__all__ = ["Ball", "Block", "Solid", "sample_solid"]
+__all__ = ["Ball", "Block", "Rod", "Solid"]
 
 Array = NDArray[np.float64]
 
-# Roberts' R3 sequence: 1/g, 1/g^2 and 1/g^3 for the real root g of g^4 = g + 1.
-_R3 = np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])
-
 
 class Solid(Protocol):
-    """A body's surface about the origin."""
+    """A :class:`.Shape` in three dimensions."""
 
     @property
     def volume(self) -> float:
@@ -42,6 +34,11 @@ class Ball:
     """A ball of a given radius [length]."""
 
     radius: float
+
+    @classmethod
+    def of_volume(cls, volume: float) -> Ball:
+        """Return the ball that fills this volume [length^3]."""
+        return cls(cube_root(volume / (4.0 / 3.0 * math.pi)))
 
     @property
     def volume(self) -> float:
@@ -65,6 +62,15 @@ class Block:
 
     sides: tuple[float, float, float]  # extents along x, y and z [length]
 
+    @classmethod
+    def of_volume(cls, volume: float, aspects: tuple[float, float]) -> Block:
+        """Return the block of a volume [length^3] whose x and z are these multiples of
+        its height [1].
+        """
+        along_x, along_z = aspects
+        height = cube_root(volume / (along_x * along_z))
+        return cls((along_x * height, height, along_z * height))
+
     @property
     def volume(self) -> float:
         """Product of the sides."""
@@ -84,39 +90,56 @@ class Block:
         return np.asarray(outside + inside)
 
 
-def sample_solid(
-    rng: RandomSource, solid: Solid, centre: tuple[float, float, float], count: int
-) -> Array:
-    """Spread particles evenly inside a solid.
+@dataclass(frozen=True)
+class Rod:
+    """A round rod, that is a cylinder, whose length lies along a unit vector."""
 
-    These are the first ``count`` points inside it of Roberts' R3 low-discrepancy
-    sequence. The sequence is laid by a random shift over the smallest cube about the
-    bounding box, so that spacings are alike in all directions however slender the
-    solid is.
+    length: float  # extent along 'axis' [length]
+    radius: float  # of its cross-section [length]
+    axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # unit vector
 
-    Args:
-        rng: source of the shift.
-        solid: the solid about the origin.
-        centre: where its origin lies [length].
-        count: how many particles.
+    @property
+    def volume(self) -> float:
+        """Pi times the radius squared times the length."""
+        return math.pi * self.radius * self.radius * self.length
 
-    Returns:
-        Positions [length], multiples of 2^-20, shape [count, 3].
+    @property
+    def reach(self) -> tuple[float, float, float]:
+        """Half the bounding box of the turned rod."""
+        x, y, z = (self._reach_along(component) for component in self.axis)
+        return x, y, z
+
+    def _reach_along(self, component: float) -> float:
+        sine = math.sqrt(max(0.0, 1.0 - component * component))
+        return 0.5 * self.length * abs(component) + self.radius * sine
+
+    def distance(self, position: Array) -> Array:
+        """Return the exact signed distance."""
+        x, y, z = position.T
+        a, b, c = self.axis
+        height = a * x + b * y + c * z
+        square = x * x + y * y + z * z - height * height
+        # distances beyond the ends and beyond the side, negative between them
+        along = np.abs(height) - 0.5 * self.length
+        across = np.sqrt(np.maximum(square, 0.0)) - self.radius
+        inside = np.minimum(np.maximum(along, across), 0.0)
+        along = np.maximum(along, 0.0)
+        across = np.maximum(across, 0.0)
+        outside = np.sqrt(along * along + across * across)
+        return np.asarray(outside + inside)
+
+
+def cube_root(value: float) -> float:
+    """Return the cube root of a positive number by Newton's method.
+
+    Only + - * / are used, so that the result has the same bits on every machine.
+
+    >>> cube_root(27.0)
+    3.0
     """
-    shift = rng.random((3,))
-    side = 2.0 * max(solid.reach)
-    # in blocks: a million particles take no memory beside their own
-    block_size = min(4 * count, 1 << 16)
-    blocks = [np.empty((0, 3))]
-    missing_count = count
-    start = 1
-    while missing_count > 0:
-        index = np.arange(start, start + block_size, dtype=np.float64)[:, None]
-        turns = shift + index * _R3
-        local = (turns - np.floor(turns) - 0.5) * side
-        is_inside = solid.distance(local) <= 0.0
-        points = local[is_inside][:missing_count]
-        blocks.append(points)
-        missing_count -= len(points)
-        start += block_size
-    return quantise(np.array(centre) + np.concatenate(blocks))
+    root = max(1.0, value)
+    while True:
+        smaller = root - (root * root * root - value) / (3.0 * root * root)
+        if not smaller < root:
+            return root
+        root = smaller

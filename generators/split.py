@@ -109,10 +109,10 @@ class FreeSurfaceParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class FreeSurface3DParameters(FreeSurfaceParameters):
-    """Constants of the MLS-MPM solver for a liquid in a cube.
+    """Constants of the MLS-MPM solver for liquid, jelly, snow and rope in a cube.
 
-    The equations stand in :mod:`.liquid_stress_3d`. Densities are per length^3, moduli
-    in mass/(length s^2). The constants of solids have no meaning yet.
+    The equations stand in :mod:`.particle_stress_3d`. Densities are per length^3,
+    moduli in mass/(length s^2).
     """
 
 

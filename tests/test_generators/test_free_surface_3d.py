@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size, load
-from lagbench.errors import UsageError
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import free_surface_walls, solver_constants
 from lagbench.generators.draws import quantise
 from lagbench.generators.fluid_3d import FAMILIES
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.free_surface_3d import FreeSurface3D
-from lagbench.generators.solids import Ball, Block, Solid, sample_solid
+from lagbench.generators.shapes import Body, sample_points
+from lagbench.generators.solids import Ball, Block, Solid
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import (
     FreeSurface3DParameters,
@@ -68,7 +68,7 @@ def falling_ball() -> InitialState:
     """Return the state of a ball that turns as it flies."""
     rng = np.random.default_rng(SEED)
     ball = Ball(0.16)
-    position = sample_solid(rng, ball, (0.4, 0.45, 0.5), 400)
+    position = sample_points(rng, Body(ball, np.array((0.4, 0.45, 0.5))), 400)
     affine = 4.0 * rng.random((400, 3, 3)) - 2.0
     return liquid(position, np.tile((1.0, -1.5, 0.5), (400, 1)), ball.volume, affine)
 
@@ -114,7 +114,8 @@ def test_threads_and_orders_of_particles_change_no_bit() -> None:
 
 def test_free_flight_is_a_parabola() -> None:
     """A ball without spin moves by v t - g t (t + dt) / 2, as semi-implicit steps."""
-    position = sample_solid(np.random.default_rng(0), Ball(0.1), (0.4, 0.6, 0.5), 300)
+    ball = Body(Ball(0.1), np.array((0.4, 0.6, 0.5)))
+    position = sample_points(np.random.default_rng(0), ball, 300)
     velocity = (0.5, 0.25, -0.25)
     solver = start(liquid(position, np.tile(velocity, (300, 1)), Ball(0.1).volume))
     substeps = 60
@@ -220,17 +221,6 @@ def size_constants(size: Size) -> FreeSurface3DParameters:
     return constants
 
 
-def test_solids_and_friction_are_refused() -> None:
-    """There is liquid only, between walls without friction."""
-    state = falling_ball()
-    jelly = dataclasses.replace(
-        state, material=np.full(len(state.material), Material.JELLY, np.int8)
-    )
-    for impossible in (jelly, dataclasses.replace(state, friction=0.3)):
-        with pytest.raises(UsageError, match="three dimensions"):
-            start(impossible)
-
-
 @pytest.mark.parametrize(
     ("solid", "volume"),
     [(Ball(0.25), math.pi / 48), (Block((0.5, 0.25, 0.125)), 1 / 64)],
@@ -238,7 +228,8 @@ def test_solids_and_friction_are_refused() -> None:
 def test_points_fill_solids_evenly(solid: Solid, volume: float) -> None:
     """The volume is the closed form's; the points lie inside and have its moments."""
     assert solid.volume == pytest.approx(volume)
-    points = sample_solid(np.random.default_rng(1), solid, (0.5, 0.5, 0.5), 4000)
+    body = Body(solid, np.full(3, 0.5))
+    points = sample_points(np.random.default_rng(1), body, 4000)
     local = points - 0.5
     assert solid.distance(local).max() < 1e-6
     assert local.mean(axis=0) == pytest.approx(np.zeros(3), abs=2e-3)

@@ -1,135 +1,68 @@
-"""One substep of MLS-MPM in three dimensions: a liquid with a free surface.
+"""One substep of MLS-MPM with a free surface in three dimensions.
 
-The equations are those of the liquid in :mod:`.particle_stress`, in a cube. For
-particles of equal mass m, positions x_p, grid spacing dx, weights w_ip and
-o = (x_i - x_p) / dx:
+The equations are those of :mod:`.particle_stress`, in a cube; the relative density is
+r_i = n_i m / (rho dx^3). The stresses of solids stand in :mod:`.constitutive_3d`. Where
+a wall is rough, Coulomb friction brakes both tangential components alike. The second
+axis points up.
 
-1. P2G:  n_i = sum w,   (n v)_i = sum w (v_p + A_p o),   (n J)_i = sum w J_p,
-   with A = dx C - (4 dt / (rho dx)) tau,
-   tau = K (J - 1) I + rho nu (C + C^T).
-2. Grid: v_i = (n v)_i / n_i + dt g; the walls take the outward normal velocity.
-   Jbar = (n J)/n. Relative density r_i = n_i m / (rho dx^3), where n_i counts mirror
-   images at the walls.
-3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,
-   x_p <- x_p + dt v_p, kept in the box.
-   J <- J (1 + dt tr C) + kappa (Jbar - J), then
-   J <- J + theta (1/max(r, 1) - J), within [J_min, J_max].
-
-The second axis points up. Only ``+ - * /`` and comparisons are used, and sums are
-integers (:mod:`.transfer`): no order of particles or threads changes a bit.
+Only ``+ - * /``, ``sqrt`` and comparisons are used, and sums are integers
+(:mod:`.transfer`): no order of particles or threads changes a bit.
 
 Source: Hu et al. 2018; Jiang et al. 2015 (APIC).
 """
 
 import taichi as ti
 
-from . import backend
-from .constitutive import larger
-from .split import FreeSurfaceParameters
+from .constitutive import hardening, larger, liquid_stress
+from .constitutive_3d import corotated_stress, determinant, plastic_return
+from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, finite
 from .transfer import (
     Nothing,
+    Template,
+    Value,
     accumulate,
     bounded,
-    fixed_point_scale,
     from_fixed,
     stepped,
     to_fixed,
 )
 
-_INSET = 1e-3  # distance that particles keep from a wall [cells]
-# bound of abs(v_p + A o) over dx/dt, the largest speed [1], twice that of the plane
-_REACH = 128.0
-_HUGE = 3e38  # stands for what is not a number where extremes are kept
 _AXES = (0, 1, 2)
 
 
 @ti.data_oriented
-class LiquidStress3D:
+class ParticleStress3D(FreeSurfaceKernels):
     """Fields of a batch of scenarios and the kernels that advance them."""
 
-    def __init__(
-        self,
-        parameters: FreeSurfaceParameters,
-        *,
-        scenarios: int,
-        atomic: bool,
-        threads: int,
-    ) -> None:
-        """Round the constants and take the memory."""
-        p = parameters
-        self.parameters = parameters  # constants that the scenarios share
-        self.scenarios = scenarios  # scenarios advanced together
-        self.atomic = atomic  # whether several threads run the phases
-        self.threads = threads  # threads of the parallel loops on a CPU
-        self.inv_dx = float(p.grid)
-        self.dx = 1.0 / p.grid
-        self.dt = p.dt
-        self.width = p.grid + 1  # nodes along an axis
-        self.stride = (self.width**2, self.width, 1)  # of a node's number, by axis
-        self.low = p.wall
-        self.high = p.grid - p.wall
-        # smallest and largest coordinate of a particle
-        self.least = (self.low + _INSET) * self.dx
-        self.most = (self.high - _INSET) * self.dx
-        self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
-        # of abs(v) + abs(A o), what sums have room for
-        self.reach_bound = _REACH * self.speed_bound
-        self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
-        self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
-        self.velocity_unit = 1.0 / self.velocity_scale
-        self.count_unit = 1.0 / self.count_scale
-        self.impulse = 4.0 * p.dt * p.grid / p.density
-        self.fall = p.gravity * p.dt
-        self.viscosity = p.density * p.liquid_viscosity
-        self._declare_fields()
-        self._place_fields()
+    dimension = 3
+    reach = 128.0  # twice that of the plane
+    at_rest = (0.0, 0.0, 0.0, 1.0)
 
     def _declare_fields(self) -> None:
-        """Name the fields; they have no memory yet."""
-        self.x = ti.Vector.field(4, ti.f32)  # particle positions [length], and a zero
-        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_p, J_p
-        self.at_rest = (0.0, 0.0, 0.0, 1.0)  # of a particle at rest
-        # derivative of the nodal v at the particles, along each axis: columns of C
-        self.slopes = [ti.Vector.field(4, ti.f32) for _ in _AXES]
+        """Name the fields; they have no memory yet.
+
+        P2G spreads v, and J of liquid or 1. Slopes are those of v and Jbar.
+        """
+        super()._declare_fields()
+        self.stride = (self.width**2, self.width, 1)  # of a node's number, by axis
+        # columns of the deformation gradients of the solids [1], and a zero
+        self.f = [ti.Vector.field(4, ti.f32) for _ in _AXES]
         # columns of A, scaled
         self.pull = [ti.Vector.field(4, ti.f32) for _ in _AXES]
         # the three weights of a particle along each axis
         self.weights = [ti.Vector.field(4, ti.f32) for _ in _AXES]
         # offset from the middle node [cells], and the bits of the lowest node's number
         self.spot = ti.Vector.field(4, ti.f32)
-        # largest velocity component, smallest and largest J, largest abs(v) + abs(A o)
-        # since the advance began
-        self.extremes = ti.Vector.field(4, ti.f32)
-        # smallest and largest J since the start
-        self.ratio_range = ti.Vector.field(2, ti.f32)
         self.sums = ti.Vector.field(4, ti.i64)  # n v, n J
         self.count = ti.field(ti.i64)  # n
         self.node = ti.Vector.field(4, ti.f32)  # v, Jbar
         self.density = ti.field(ti.f32)  # r
-        self.fill = ti.field(ti.f32)  # m / (rho dx^3), shape [scenario]
 
-    def _place_fields(self) -> None:
-        """Give the fields their memory, each an array of its own."""
-        particle_fields = (
-            self.x,
-            self.carried,
-            *self.slopes,
-            *self.pull,
-            *self.weights,
-            self.spot,
-            self.extremes,
-            self.ratio_range,
-        )
-        particle_shape = (self.scenarios, self.parameters.particles)
-        node_shape = (self.scenarios, self.width**3)
-        backend.place(
-            *((particle_shape, [field]) for field in particle_fields),
-            (node_shape, [self.sums]),
-            (node_shape, [self.count]),
-            (node_shape, [self.node]),
-            (node_shape, [self.density]),
-            ((self.scenarios,), [self.fill]),
-        )
+    def _particle_fields(self) -> tuple[ti.Field, ...]:
+        return *self.f, *self.pull, *self.weights, self.spot
+
+    def _node_fields(self) -> tuple[ti.Field, ...]:
+        return self.sums, self.count, self.node, self.density
 
     # The phases: each function is one phase at one particle or node.
 
@@ -166,20 +99,70 @@ class LiquidStress3D:
         self.spot[s, p] = ti.Vector([offset[0], offset[1], offset[2], bits])
 
     @ti.func
-    def stress(self, s: ti.i32, p: ti.i32) -> None:
+    def gradient(self, s: ti.i32, p: ti.i32) -> ti.math.mat3:
+        """Return C of a particle."""
+        slope_x = self.slopes[0][s, p]
+        slope_y = self.slopes[1][s, p]
+        slope_z = self.slopes[2][s, p]
+        return columns(slope_x, slope_y, slope_z)
+
+    @ti.func
+    def deformation(self, s: ti.i32, p: ti.i32) -> ti.math.mat3:
+        """Return F of a particle."""
+        return columns(self.f[0][s, p], self.f[1][s, p], self.f[2][s, p])
+
+    @ti.func
+    def elastic_stress(self, s: ti.i32, p: ti.i32, pressure: ti.f32) -> ti.math.mat3:
+        """Return the Kirchhoff stress without viscosity, of a liquid or a solid."""
+        kind = self.matter[s, p][0]
+        mu = self.jelly[0]
+        la = self.jelly[1]
+        if kind == ROPE:
+            mu = self.rope[0]
+            la = self.rope[1]
+        if kind == SNOW:
+            factor = hardening(
+                self.matter[s, p][1],
+                self.parameters.snow_hardening,
+                self.parameters.snow_hardening_min,
+                self.parameters.snow_hardening_max,
+            )
+            mu = self.snow[0] * factor
+            la = self.snow[1] * factor
+        isotropic = ti.Matrix(
+            [[pressure, 0.0, 0.0], [0.0, pressure, 0.0], [0.0, 0.0, pressure]]
+        )
+        elastic = corotated_stress(self.deformation(s, p), mu, la)
+        return ti.select(kind == LIQUID, isotropic, elastic)
+
+    @ti.func
+    def viscosity(self, s: ti.i32, p: ti.i32) -> ti.f32:
+        """Return the dynamic viscosity of a liquid, or the damping of a solid."""
+        kind = self.matter[s, p][0]
+        damping = ti.select(kind == SNOW, 0.0, self.solid_viscosity)
+        return ti.select(kind == LIQUID, self.liquid_viscosity, damping)
+
+    @ti.func
+    def stress(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Compute A of a particle, and the largest that it spreads."""
         carried = self.carried[s, p]
-        pressure = self.parameters.liquid_modulus * (carried[3] - 1.0)
+        pressure = liquid_stress(carried[3], self.parameters.liquid_modulus)
+        c = self.gradient(s, p)
+        viscosity = self.liquid_viscosity
+        elastic = ti.Matrix.zero(ti.f32, 3, 3)
+        if ti.static(solid):
+            viscosity = self.viscosity(s, p)
+            elastic = self.elastic_stress(s, p, pressure)
         reach = ti.Vector([0.0, 0.0, 0.0])
         for column in ti.static(_AXES):
-            slope = self.slopes[column][s, p]
             a = ti.Vector([0.0, 0.0, 0.0, 0.0])
             for row in ti.static(_AXES):
-                shear = slope[row] + self.slopes[row][s, p][column]
-                tau = self.viscosity * shear
-                if ti.static(row == column):
+                tau = viscosity * (c[row, column] + c[column, row])
+                if ti.static(solid):
+                    tau = tau + elastic[row, column]
+                elif ti.static(row == column):
                     tau = tau + pressure
-                a[row] = self.dx * slope[row] - self.impulse * tau
+                a[row] = self.dx * c[row, column] - self.impulse * tau
                 reach[row] = reach[row] + 1.5 * ti.abs(a[row])
             self.pull[column][s, p] = self.velocity_scale * a
         seen = self.extremes[s, p]
@@ -231,7 +214,15 @@ class LiquidStress3D:
             self.count[node] = self.count[node] + scaled
 
     @ti.func
-    def update(self, s: ti.i32, i: ti.i32, j: ti.i32, k: ti.i32, fill: ti.f32) -> None:
+    def update(
+        self,
+        s: ti.i32,
+        i: ti.i32,
+        j: ti.i32,
+        k: ti.i32,
+        fill: ti.f32,
+        friction: ti.f32,
+    ) -> None:
         """Divide by n, add gravity, meet the walls; an empty node is at rest."""
         number = self.at(i, j, k)
         state = ti.Vector([0.0, 0.0, 0.0, 1.0])
@@ -243,36 +234,40 @@ class LiquidStress3D:
             v = from_fixed(total[1], self.velocity_unit) / n - self.fall
             w = from_fixed(total[2], self.velocity_unit) / n
             jacobian = from_fixed(total[3], self.count_unit) / n
-            state = ti.Vector(
-                [
-                    self.contact(i, u),
-                    self.contact(j, v),
-                    self.contact(k, w),
-                    jacobian,
-                ]
-            )
+            u, v, w = self.contact(i, u, v, w, friction)
+            v, w, u = self.contact(j, v, w, u, friction)
+            w, u, v = self.contact(k, w, u, v, friction)
+            state = ti.Vector([u, v, w, jacobian])
             count = self.mirrored_count(s, i, j, k)
             density = from_fixed(count, self.count_unit) * fill
         self.node[s, number] = state
         self.density[s, number] = density
 
     @ti.func
-    def contact(self, index: ti.i32, velocity: ti.f32) -> ti.f32:
-        """Return the velocity along an axis behind the contact with its walls."""
-        moves_out = (index <= self.low and velocity < 0.0) or (
-            index >= self.high and velocity > 0.0
-        )
-        return ti.select(moves_out, 0.0, velocity)
+    def contact(
+        self,
+        index: ti.i32,
+        normal: ti.f32,
+        first: ti.f32,
+        second: ti.f32,
+        friction: ti.f32,
+    ) -> Value:
+        """Return the velocity behind the contact with a wall, in the same order.
 
-    @ti.func
-    def image(self, index: ti.i32) -> ti.i32:
-        """Return the mirror image of a node within a cell of a wall, else -1."""
-        mirrored = -1
-        if index <= self.low + 1:
-            mirrored = 2 * self.low - index
-        if index >= self.high - 1:
-            mirrored = 2 * self.high - index
-        return mirrored
+        ``index`` counts nodes along the normal of the two walls across an axis;
+        ``first`` and ``second`` are the tangential components.
+        """
+        new_normal = normal
+        new_first = first
+        new_second = second
+        if self.is_outward(index, normal):
+            sliding = ti.sqrt(first * first + second * second)
+            loss = friction * ti.abs(normal) / larger(sliding, 1e-9)
+            kept = larger(1.0 - loss, 0.0)
+            new_normal = 0.0
+            new_first = first * kept
+            new_second = second * kept
+        return new_normal, new_first, new_second
 
     @ti.func
     def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32, k: ti.i32) -> ti.i64:
@@ -291,7 +286,7 @@ class LiquidStress3D:
         return count
 
     @ti.func
-    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+    def g2p(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Gather v, Jbar and r with the slopes of v; move the particle, update J."""
         spot = self.spot[s, p]
         lowest = ti.bit_cast(spot[3], ti.i32)
@@ -318,11 +313,18 @@ class LiquidStress3D:
         self.slopes[0][s, p] = gradient * slope_x
         self.slopes[1][s, p] = gradient * slope_y
         self.slopes[2][s, p] = gradient * slope_z
-        self.flow(s, p, here, density)
+        self.flow(s, p, here, density, solid)
 
     @ti.func
-    def flow(self, s: ti.i32, p: ti.i32, here: ti.math.vec4, density: ti.f32) -> None:
-        """Move a particle with the grid, and update its J."""
+    def flow(
+        self,
+        s: ti.i32,
+        p: ti.i32,
+        here: ti.math.vec4,
+        density: ti.f32,
+        solid: Template,
+    ) -> None:
+        """Move a particle with the grid, and update J of a liquid."""
         x = ti.Vector([0.0, 0.0, 0.0])
         speed = 0.0
         for axis in ti.static(_AXES):
@@ -331,7 +333,8 @@ class LiquidStress3D:
             speed = larger(finite(ti.abs(here[axis])), speed)
         self.x[s, p] = ti.Vector([x[0], x[1], x[2], 0.0])
 
-        old = self.carried[s, p][3]
+        matter = self.matter[s, p]
+        old = matter[1]
         divergence = (
             self.slopes[0][s, p][0] + self.slopes[1][s, p][1] + self.slopes[2][s, p][2]
         )
@@ -339,70 +342,139 @@ class LiquidStress3D:
         j += self.parameters.jacobian_relaxation * (here[3] - old)
         j += self.parameters.density_coupling * (1.0 / larger(density, 1.0) - j)
         j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
-        self.carried[s, p] = ti.Vector([here[0], here[1], here[2], j])
+        ratio = j
+        spread = j
+        if ti.static(solid):
+            ratio = ti.select(matter[0] == LIQUID, j, old)
+            spread = ti.select(matter[0] == LIQUID, j, 1.0)
+        self.carried[s, p] = ti.Vector([here[0], here[1], here[2], spread])
+        self.keep_ratio(s, p, ratio)
 
         seen = self.extremes[s, p]
         self.extremes[s, p] = ti.Vector(
-            [
-                larger(speed, seen[0]),
-                ti.select(j < seen[1], j, seen[1]),
-                larger(j, seen[2]),
-                seen[3],
-            ]
+            [larger(speed, seen[0]), seen[1], seen[2], seen[3]]
         )
-        range_seen = self.ratio_range[s, p]
-        self.ratio_range[s, p] = ti.Vector(
-            [ti.select(j < range_seen[0], j, range_seen[0]), larger(j, range_seen[1])]
+        if ti.static(not solid):
+            self.keep_jacobian(s, p)
+
+    @ti.func
+    def keep_ratio(self, s: ti.i32, p: ti.i32, ratio: ti.f32) -> None:
+        """Keep J of a liquid or Jp of snow, and the extremes since the start."""
+        matter = self.matter[s, p]
+        least = ti.select(ratio < matter[2], ratio, matter[2])
+        self.matter[s, p] = ti.Vector(
+            [matter[0], ratio, least, larger(ratio, matter[3])]
         )
+
+    @ti.func
+    def jacobian(self, s: ti.i32, p: ti.i32) -> ti.f32:
+        """Return J of a liquid or det F of a solid."""
+        matter = self.matter[s, p]
+        in_solid = determinant(self.deformation(s, p))
+        return ti.select(matter[0] == LIQUID, matter[1], in_solid)
+
+    @ti.func
+    def keep_jacobian(self, s: ti.i32, p: ti.i32) -> None:
+        """Keep the extremes of J of a liquid or det F of a solid in this advance."""
+        jacobian = self.jacobian(s, p)
+        seen = self.extremes[s, p]
+        least = ti.select(jacobian < seen[1], jacobian, seen[1])
+        self.extremes[s, p] = ti.Vector(
+            [seen[0], least, larger(jacobian, seen[2]), seen[3]]
+        )
+
+    @ti.func
+    def deform(self, s: ti.i32, p: ti.i32) -> None:
+        """Update F of a solid with the velocity gradient: F <- (I + dt C) F."""
+        is_liquid = self.matter[s, p][0] == LIQUID
+        f = self.deformation(s, p)
+        f = ti.select(is_liquid, f, f + self.dt * (self.gradient(s, p) @ f))
+        self.keep_deformation(s, p, f)
+
+    @ti.func
+    def yield_snow(self, s: ti.i32, p: ti.i32) -> None:
+        """Let snow flow: its F is a trial gradient."""
+        if self.matter[s, p][0] == SNOW:
+            trial = self.deformation(s, p)
+            f, growth = plastic_return(trial, self.yield_low, self.yield_high)
+            jp_min = self.parameters.snow_jp_min
+            jp_max = self.parameters.snow_jp_max
+            jp = bounded(self.matter[s, p][1] * growth, jp_min, jp_max)
+            self.keep_deformation(s, p, f)
+            self.keep_ratio(s, p, jp)
+
+    @ti.func
+    def keep_deformation(self, s: ti.i32, p: ti.i32, f: ti.math.mat3) -> None:
+        """Store F, column by column."""
+        for column in ti.static(_AXES):
+            self.f[column][s, p] = ti.Vector(
+                [f[0, column], f[1, column], f[2, column], 0.0]
+            )
 
     # The drivers: the same phases in the same order.
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""
-        self._serial_substeps(substeps, self.parameters.particles, self.width)
+        self._serial_substeps(
+            substeps, self.parameters.particles, self.width, self.solid
+        )
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
-        self._parallel_substep(self.parameters.particles, self.width)
+        self._parallel_substep(self.parameters.particles, self.width, self.solid)
 
     @ti.kernel
     def _serial_substeps(
-        self, substeps: ti.i32, particles: ti.i32, width: ti.i32
+        self, substeps: ti.i32, particles: ti.i32, width: ti.i32, solid: Template
     ) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             fill = self.fill[0]
+            friction = self.friction[0]
             for n in range(width * width * width):
                 self.clear(0, n)
             for p in range(particles):
                 self.locate(0, p)
             for p in range(particles):
-                self.stress(0, p)
+                self.stress(0, p, solid)
             for p in range(particles):
                 self.p2g(0, p)
             for i in range(width):
                 for j in range(width):
                     for k in range(width):
-                        self.update(0, i, j, k, fill)
+                        self.update(0, i, j, k, fill, friction)
             for p in range(particles):
-                self.g2p(0, p)
+                self.g2p(0, p, solid)
+            if ti.static(solid):
+                for p in range(particles):
+                    self.deform(0, p)
+                for p in range(particles):
+                    self.yield_snow(0, p)
+                for p in range(particles):
+                    self.keep_jacobian(0, p)
 
     @ti.kernel
-    def _parallel_substep(self, particles: ti.i32, width: ti.i32) -> Nothing:
+    def _parallel_substep(
+        self, particles: ti.i32, width: ti.i32, solid: Template
+    ) -> Nothing:
         ti.loop_config(parallelize=self.threads)
         for s, n in ti.ndrange(self.scenarios, width * width * width):
             self.clear(s, n)
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
             self.locate(s, p)
-            self.stress(s, p)
+            self.stress(s, p, solid)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j, k in ti.ndrange(self.scenarios, width, width, width):
-            self.update(s, i, j, k, self.fill[s])
+            self.update(s, i, j, k, self.fill[s], self.friction[s])
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
-            self.g2p(s, p)
+            self.g2p(s, p, solid)
+            if ti.static(solid):
+                self.deform(s, p)
+                self.yield_snow(s, p)
+                self.keep_jacobian(s, p)
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
@@ -413,13 +485,22 @@ class LiquidStress3D:
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
             now = self.carried[s, p]
+            jacobian = self.jacobian(s, p)
             speed = 0.0
             for axis in ti.static(_AXES):
                 speed = larger(finite(ti.abs(now[axis])), speed)
-            self.extremes[s, p] = ti.Vector([speed, now[3], now[3], 0.0])
+            self.extremes[s, p] = ti.Vector([speed, jacobian, jacobian, 0.0])
 
 
 @ti.func
-def finite(value: ti.f32) -> ti.f32:
-    """Return a positive value, or :data:`_HUGE` if it is not a finite number."""
-    return ti.select(value < _HUGE, value, _HUGE)
+def columns(
+    first: ti.math.vec4, second: ti.math.vec4, third: ti.math.vec4
+) -> ti.math.mat3:
+    """Return the matrix with these columns, of which the fourth entry is left out."""
+    return ti.Matrix(
+        [
+            [first[0], second[0], third[0]],
+            [first[1], second[1], third[1]],
+            [first[2], second[2], third[2]],
+        ]
+    )

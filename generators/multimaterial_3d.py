@@ -1,0 +1,48 @@
+"""Two bodies of different materials collide and fall in a cube.
+
+Pairs, the attractor and the shares of the particles are those of :mod:`.multimaterial`:
+pairs by id % 6 are liquid-snow, rope-snow, rope-liquid, snow-snow, rope-jelly ball and
+liquid-liquid. The bodies are solids: a rope is a round rod, jelly is a ball, anything
+else is a block or a ball.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .constants import constants, interval
+from .draws import RandomSource, choice, direction_in_space, uniform
+from .multimaterial import draw_bodies
+from .solids import Ball, Block, Rod, Solid
+from .split import (
+    FreeSurface3DParameters,
+    FreeSurfaceParameters,
+    InitialState,
+    Material,
+)
+
+if TYPE_CHECKING:
+    from lagbench.data.registry import Size
+
+
+def solver_parameters(size: Size) -> FreeSurfaceParameters:
+    """Return the solver's constants at this size."""
+    return constants(FreeSurface3DParameters, size)
+
+
+def _draw_solid(rng: RandomSource, material: Material, size: Size) -> Solid:
+    """Draw a rope, a ball of jelly, or a block or ball of anything else."""
+    if material is Material.ROPE:
+        length = uniform(rng, *interval(size, "rope_length"))
+        return Rod(length, size.value("rope_radius"), direction_in_space(rng))
+    volume = uniform(rng, *interval(size, "volume"))
+    if material is Material.JELLY or choice(rng, 2) == 1:
+        return Ball.of_volume(volume)
+    along_x = uniform(rng, *interval(size, "aspect"))
+    along_z = uniform(rng, *interval(size, "aspect"))
+    return Block.of_volume(volume, (along_x, along_z))
+
+
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw the bodies, their places and their velocities."""
+    return draw_bodies(size, scenario, rng, _draw_solid)
