@@ -11,7 +11,7 @@ import taichi as ti
 from . import backend
 from .constitutive import lame, larger
 from .split import FreeSurfaceParameters, Material
-from .transfer import fixed_point_scale
+from .transfer import Value, fixed_point_scale
 
 LIQUID = int(Material.LIQUID)
 SNOW = int(Material.SNOW)
@@ -116,6 +116,27 @@ class FreeSurfaceKernels:
     def _node_fields(self) -> tuple[ti.Field, ...]:
         """Return the fields of nodes."""
         raise NotImplementedError
+
+    @ti.func
+    def touched_nodes(self, particles: ti.i32) -> Value:
+        """Return the first node that particles of scenario 0 touch along each axis, and
+        the one behind the last.
+
+        A node next to a wall counts its image, which no particle need touch.
+        """
+        first = ti.Vector([self.high for _ in range(self.dimension)])
+        last = ti.Vector([0 for _ in range(self.dimension)])
+        for p in range(particles):
+            for axis in ti.static(range(self.dimension)):
+                base = ti.cast(self.x[0, p][axis] * self.inv_dx - 0.5, ti.i32)
+                first[axis] = ti.min(first[axis], base)
+                last[axis] = ti.max(last[axis], base + 3)
+        for axis in ti.static(range(self.dimension)):
+            if first[axis] <= self.low + 1:
+                first[axis] = self.low - 1
+            if last[axis] >= self.high:
+                last[axis] = self.high + 2
+        return first, last
 
     @ti.func
     def image(self, index: ti.i32) -> ti.i32:

@@ -310,19 +310,7 @@ class ParticleStress(FreeSurfaceKernels):
             # no vectors.
             fill = self.fill[0]
             friction = self.friction[0]
-            first = ti.Vector([self.high, self.high])
-            last = ti.Vector([0, 0])
-            for p in range(self.parameters.particles):
-                x = ti.Vector([self.x[0, p][0], self.x[0, p][1]])
-                base = ti.cast(x * self.inv_dx - 0.5, ti.i32)
-                first = ti.min(first, base)
-                last = ti.max(last, base + 3)
-            # A node next to a wall counts its image, which no particle need touch.
-            for a in ti.static(range(2)):
-                if first[a] <= self.low + 1:
-                    first[a] = self.low - 1
-                if last[a] >= self.high:
-                    last[a] = self.high + 2
+            first, last = self.touched_nodes(self.parameters.particles)
             for i in range(first[0], last[0]):
                 for j in range(first[1], last[1]):
                     self.clear(0, i, j)

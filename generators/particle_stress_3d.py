@@ -414,10 +414,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     # The drivers: the same phases in the same order.
 
     def run_serially(self, substeps: int) -> None:
-        """Advance scenario 0 by many substeps in one thread."""
-        self._serial_substeps(
-            substeps, self.parameters.particles, self.width, self.solid
-        )
+        """Advance scenario 0 by many substeps in one thread, on the nodes that
+        particles touch.
+        """
+        self._serial_substeps(substeps, self.parameters.particles, self.solid)
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
@@ -425,23 +425,26 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.kernel
     def _serial_substeps(
-        self, substeps: ti.i32, particles: ti.i32, width: ti.i32, solid: Template
+        self, substeps: ti.i32, particles: ti.i32, solid: Template
     ) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             fill = self.fill[0]
             friction = self.friction[0]
-            for n in range(width * width * width):
-                self.clear(0, n)
+            first, last = self.touched_nodes(particles)
+            for i in range(first[0], last[0]):
+                for j in range(first[1], last[1]):
+                    for k in range(first[2], last[2]):
+                        self.clear(0, self.at(i, j, k))
             for p in range(particles):
                 self.locate(0, p)
             for p in range(particles):
                 self.stress(0, p, solid)
             for p in range(particles):
                 self.p2g(0, p)
-            for i in range(width):
-                for j in range(width):
-                    for k in range(width):
+            for i in range(first[0], last[0]):
+                for j in range(first[1], last[1]):
+                    for k in range(first[2], last[2]):
                         self.update(0, i, j, k, fill, friction)
             for p in range(particles):
                 self.g2p(0, p, solid)
