@@ -109,6 +109,20 @@ class FreeSurfaceKernels:
             ((self.scenarios,), [self.fill, self.friction]),
         )
 
+    def run_serially(self, substeps: int) -> None:
+        """Advance scenario 0 by many substeps in one thread, on the nodes that
+        particles touch.
+        """
+        raise NotImplementedError
+
+    def run_in_parallel(self) -> None:
+        """Advance every scenario by one substep: one launch per phase."""
+        raise NotImplementedError
+
+    def restart_extremes(self) -> None:
+        """Start an advance: the extremes are those of the present state."""
+        raise NotImplementedError
+
     def _particle_fields(self) -> tuple[ti.Field, ...]:
         """Return the fields of particles that this dimension adds."""
         raise NotImplementedError
@@ -149,7 +163,7 @@ class FreeSurfaceKernels:
         return mirrored
 
     @ti.func
-    def is_outward(self, index: ti.i32, normal: ti.f32) -> bool:
+    def is_outward(self, index: ti.i32, normal: ti.f32) -> Value:
         """Tell whether a node at a wall, or behind it, moves out of the box."""
         return (index <= self.low and normal < 0.0) or (
             index >= self.high and normal > 0.0
