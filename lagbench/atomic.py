@@ -127,6 +127,7 @@ def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
     return WorkFailedError(
         "cannot write there",
         where=str(target),
+        expected="a place that can be written to",
         got=error.strerror or error,
         fix=f"{hint}, or name a folder that you may write to: {option}",
     )

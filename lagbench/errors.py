@@ -310,5 +310,7 @@ def _not_installed(module: str, extra: str) -> UsageError:
     return UsageError(
         f"{package} is not installed",
         where=f"this needs the extra {extra!r}",
+        expected=f"the package {package}",
+        got="no such package",
         fix=f"pip install 'lagbench[{extra}]'",
     )

@@ -74,7 +74,11 @@ def load_plain(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: A
         length = path.stat().st_size
     except OSError as error:
         raise UnreadableFileError(
-            "cannot read the YAML file", where=str(path), got=error.strerror
+            "cannot read the YAML file",
+            where=str(path),
+            expected="a file that can be read",
+            got=error.strerror,
+            fix="check the path and that you may read the file",
         ) from error
 
     if is_regular and length <= longest:

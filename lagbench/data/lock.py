@@ -72,6 +72,7 @@ def dataset_lock(
         raise WorkFailedError(
             "cannot write there, so the data set cannot be locked",
             where=str(folder),
+            expected="a folder that can be written to",
             got=error.strerror or error,
             fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
         ) from error

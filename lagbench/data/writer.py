@@ -374,6 +374,7 @@ def _write_errors(path: Path) -> Iterator[None]:
         raise WorkFailedError(
             "cannot write a scenario file",
             where=str(path),
+            expected="a place that can be written to",
             got=f"{error}; {free_bytes:,} bytes free",
             fix="free disk space, or name a folder that you may write to: --root or "
             "LAGBENCH_ROOT",

@@ -120,13 +120,16 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         raise UnreadableFileError(
             "cannot read the YAML file",
             where=str(path),
+            expected="a file that can be read",
             got=error.strerror or error,
+            fix="check the path and that you may read the file",
         ) from error
     # PyYAML raises other types too, as for impossible dates.
     except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:
         raise UnreadableFileError(
             "not a plain YAML file",
             where=str(path),
+            expected="YAML of mappings, lists, numbers and texts",
             got=" ".join(str(error).split()),
             fix="use plain mappings, lists, numbers and strings, in UTF-8",
         ) from error

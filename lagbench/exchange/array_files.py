@@ -87,18 +87,26 @@ def list_trajectories(path: Path) -> list[Row]:
             return rows
 
     if path.suffix not in READABLE or not path.is_file():
-        got = None
+        got = f"a file {path.suffix}" if path.suffix else "a file without suffix"
         if path.is_dir():
             got = "a folder without such files"
+        elif not path.exists():
+            got = "no such file"
         raise UnreadableFileError(
             "no trajectories are there",
             where=str(path),
             expected=f"a file {', '.join(READABLE)}, or a folder of them",
             got=got,
+            fix="save each trajectory with np.save, shape [frame, particle, space]; "
+            "docs/exchange.md describes all forms",
         )
     if path.stat().st_size == 0:
         raise UnreadableFileError(
-            "the file is empty", where=str(path), expected="a trajectory"
+            "the file is empty",
+            where=str(path),
+            expected="a trajectory",
+            got="0 bytes",
+            fix="save it again, or leave it out",
         )
     if path.suffix != ".npy":
         return [(path, None)]

@@ -153,6 +153,7 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
                     "a position is not finite",
                     where=f"{trajectory.name}, frame {number}",
                     expected="numbers",
+                    got="NaN or infinity",
                     fix="end the trajectory before this frame",
                 )
             if low is None or high is None or len(low) != len(frame_low):
@@ -476,6 +477,7 @@ class SplitBuilder:
                 "a position is not finite",
                 where=where,
                 expected="numbers",
+                got="NaN or infinity",
                 fix="end the trajectory before this frame",
             )
         if (low < 0.0).any() or (high > 1.0).any():

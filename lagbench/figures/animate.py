@@ -141,7 +141,13 @@ def check_ending(path: Path) -> None:
 def _check_kind(kind: Panel | str | None) -> None:
     if kind is not None and kind not in KINDS:
         fix = suggest_name(str(kind), map(str, KINDS))
-        raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
+        raise UsageError(
+            f"an animation cannot show {str(kind)!r}",
+            where="--kind",
+            expected=", ".join(KINDS),
+            got=ascii(str(kind)),
+            fix=fix,
+        )
 
 
 def _check_pace(frames_per_second: float, every: int) -> None:

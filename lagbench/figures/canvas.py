@@ -260,9 +260,10 @@ def save(drawn: Figure, output: str | Path) -> Path:
     if ending not in ENDINGS:
         raise UsageError(
             "pictures are PNG, PDF or SVG files",
-            where="output",
+            where="--output",
             expected=f"a name ending in {', '.join(ENDINGS)}",
             got=path,
+            fix=f"name it {path.with_suffix(ENDINGS[0]).name}",
         )
     if ending == ".png":
         data = png_bytes(drawn)

@@ -505,6 +505,8 @@ def _choose_metrics(metrics: Collection[str], judging: Sequence[str]) -> set[str
             raise UsageError(
                 f"no metric {name!r} to compare by",
                 where="--metric",
+                expected="a metric that judges, of both methods",
+                got=ascii(name),
                 fix=suggest_name(name, judging),
             )
     return set(metrics or judging)

@@ -285,8 +285,9 @@ def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) 
             expected=f"at most {MAX_DISTANCE:g} lengths of the unit box outside "
             f"the walls",
             got=f"up to {farthest:.3g} outside",
-            fix="freeze a diverging rollout before that and name the frame in "
-            "diverged_at",
+            fix="give positions in lengths of the unit box, as the given frames have "
+            "them; if the rollout diverges, freeze it before that and name the frame "
+            "in diverged_at",
         )
         return
 

@@ -51,7 +51,7 @@ def check_split(
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
         got=f"{quote(split_name)}, {quote(size_name)}",
-        fix=f"{hint}; or say where a split of your own lies: --root FOLDER",
+        fix=f"{hint}; or name the folder of a split of your own: --split own/",
     )
     return None
 

@@ -1,0 +1,168 @@
+"""Mistakes that are typed often: each message has where, expected, got and fix."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+from score_bench import ScoreBench, still
+from typer.testing import Result
+
+PARTS = ("where:", "expected:", "got:", "fix:")
+
+ADOPT = ("adopt", "-o", "mine", "--radius", "0.1", "--frame-interval", "0.25")
+
+
+@pytest.fixture(scope="module")
+def files(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sound file of predictions, and faulty ones."""
+    folder = tmp_path_factory.mktemp("files")
+    bench.submit(folder / "good.nc", still)
+    for name, fault in FAULTS.items():
+        path = Path(shutil.copy(folder / "good.nc", folder / f"{name}.nc"))
+        with netCDF4.Dataset(path, "a") as file:
+            fault(file)
+    write_transposed(folder / "good.nc", folder / "axes.nc")
+    (folder / "notes.txt").write_text("a note\n")
+    (folder / "empty.nc").touch()
+    (folder / "bad.yaml").write_text("format: 1\nrecipes: [\n")
+    runs = np.stack(straight_runs(3))
+    np.save(folder / "runs.npy", runs)
+    np.save(folder / "axes.npy", np.moveaxis(runs, 1, 3))
+    np.save(folder / "metres.npy", 1000.0 * runs)
+    runs[0, 5, 3, 1] = np.nan
+    np.save(folder / "nan.npy", runs)
+    return folder
+
+
+def set_values(file: netCDF4.Dataset, values: np.ndarray) -> None:
+    file["position"][:] = values
+
+
+def add_nan(file: netCDF4.Dataset) -> None:
+    values = file["position"][:].filled()
+    values[0, 5, 3, 1] = np.nan
+    set_values(file, values)
+
+
+def write_transposed(source: Path, target: Path) -> None:
+    """Write the predictions of a file with frames behind particles."""
+    dimensions = ("scenario", "particle", "frame", "space")
+    with netCDF4.Dataset(source) as good, netCDF4.Dataset(target, "w") as file:
+        file.setncatts({name: good.getncattr(name) for name in good.ncattrs()})
+        for name, dimension in good.dimensions.items():
+            file.createDimension(name, len(dimension))
+        for name in ("scenario", "frame"):
+            file.createVariable(name, good[name].dtype, (name,))[:] = good[name][:]
+        values = np.moveaxis(good["position"][:].filled(), 1, 2)
+        file.createVariable("position", "f4", dimensions)[:] = values
+
+
+FAULTS: dict[str, Callable[[netCDF4.Dataset], None]] = {
+    "nan": add_nan,
+    "units": lambda file: set_values(file, 1000.0 * file["position"][:]),
+    "old": lambda file: file.setncattr("dataset_version", "0.9.0"),
+    "another": lambda file: file.setncattr("split", "cavitty"),
+}
+
+MISTAKES: dict[str, tuple[str, ...]] = {
+    "a misspelt split": ("generate", "cavitty", "--size", "tiny"),
+    "a misspelt size": ("generate", "cavity", "--size", "tny"),
+    "a misspelt split in a file": ("score", "another.nc"),
+    "no data": ("plot", "cavity", "--size", "tiny", "--root", "nothing"),
+    "no data to score by": ("score", "good.nc", "--root", "nothing"),
+    "a picture with another suffix": ("plot", "SCENARIO", "-o", "x.jpg"),
+    "a film with another suffix": ("animate", "SCENARIO", "-o", "x.avi"),
+    "a file that is no predictions": ("score", "notes.txt"),
+    "a file that is not there": ("score", "goood.nc"),
+    "an empty file": ("score", "empty.nc"),
+    "no folder to write to": ("score", "good.nc", "-o", "notes.txt/scores"),
+    "values that are no numbers": ("score", "nan.nc"),
+    "other units": ("score", "units.nc"),
+    "exchanged axes": ("score", "axes.nc"),
+    "an old version": ("score", "old.nc"),
+    "an unknown option": ("score", "good.nc", "--spilt", "cavity"),
+    "an unknown command": ("scroe", "good.nc"),
+    "a word for a number": ("generate", "cavity", "--workers", "two"),
+    "nothing to score": ("score",),
+    "no such scenario": ("plot", "curl-noise", "--size", "tiny", "--scenario", "99"),
+    "no such frame": ("plot", "SCENARIO", "--frame", "999"),
+    "no such picture": ("plot", "SCENARIO", "--kind", "vortcity"),
+    "no such film": ("animate", "SCENARIO", "--kind", "streamlines", "-o", "x.gif"),
+    "no such metric": ("compare", "good.nc", "persistence", "--metric", "mse"),
+    "no such reference": ("compare", "good.nc", "persistance"),
+    "another split to compare": ("compare", "good.nc", "still", "--split", "cavity"),
+    "a text as trajectories": (*ADOPT, "notes.txt"),
+    "a folder without trajectories": (*ADOPT, "."),
+    "exchanged axes of trajectories": (*ADOPT, "axes.npy"),
+    "trajectories with NaN": (*ADOPT, "nan.npy"),
+    "trajectories in millimetres": (*ADOPT, "metres.npy"),
+    "a period without bounds": (*ADOPT, "runs.npy", "--periodic", "x"),
+    "an axis that is none": (
+        *ADOPT,
+        *("runs.npy", "--periodic", "q", "--bounds", "0,1,0,1"),
+    ),
+    "bounds in another form": (*ADOPT, "runs.npy", "--bounds", "0..1"),
+    "bounds from high to low": (*ADOPT, "runs.npy", "--bounds", "1,0,0,1"),
+    "YAML that is none": (
+        *("train", "curl-noise", "--size", "tiny", "--baseline", "gns"),
+        *("--recipe", "bad.yaml"),
+    ),
+    "a misspelt model": ("train", "curl-noise", "--size", "tiny", "--baseline", "gnss"),
+    "a misspelt setting": (
+        *("train", "curl-noise", "--size", "tiny", "--baseline", "gns"),
+        *("--set", "training.step=3"),
+    ),
+    "weights that are none": ("predict", "notes.txt", "-o", "x.nc"),
+    "a description that is not there": ("submit", "good.nc", "--from", "meta.yaml"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_told_with_all_that_is_needed(
+    mistake: str,
+    run: Callable[..., Result],
+    bench: ScoreBench,
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(files)
+    monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
+    scenario = bench.size.path(bench.root, 3)
+    words = []
+    for word in MISTAKES[mistake]:
+        words.append(str(scenario) if word == "SCENARIO" else word)
+    result = run(*words)
+    assert result.exit_code in {1, 2, 3, 4, 5}
+    missing = [part for part in PARTS if part not in result.stderr]
+    assert not missing, result.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")
+def test_a_folder_that_refuses_is_told(
+    run: Callable[..., Result], files: Path, bench: ScoreBench
+) -> None:
+    command = ("score", files / "good.nc", "--root", bench.root, "-o", "/proc/x")
+    result = run(*command)
+    assert result.exit_code == 5
+    assert all(part in result.stderr for part in PARTS), result.stderr
+
+
+def test_a_library_that_is_missing_is_told(
+    run: Callable[..., Result], bench: ScoreBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fix is the command that installs it."""
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda *_: None)
+    command = ("train", "curl-noise", "--size", "tiny", "--baseline", "gns")
+    result = run(*command, "--root", bench.root)
+    assert result.exit_code == 2
+    assert all(part in result.stderr for part in PARTS), result.stderr
+    assert "pip install" in result.stderr
