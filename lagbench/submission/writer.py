@@ -411,6 +411,7 @@ class PredictionsWriter:
             raise WorkFailedError(
                 "cannot write the predictions",
                 where=str(self.path),
+                expected="a place that can be written to",
                 got=error,
                 fix="free disk space, or name a folder that you may write to: --output",
             ) from error
