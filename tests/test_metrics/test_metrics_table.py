@@ -8,6 +8,7 @@ import math
 import pickle
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -51,8 +52,10 @@ KINDS = ("liquid", "jelly")
 def trajectories() -> tuple[Floats, Floats]:
     """Return a truth and a prediction that drifts from it."""
     truth = rollout()
-    noise = np.random.default_rng(5).standard_normal(truth.shape)
-    return truth, truth + 0.003 * np.arange(8)[:, None, None] * noise
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal(truth.shape)
+    growth = 0.003 * np.arange(8)[:, None, None]
+    return truth, truth + growth * noise
 
 
 @functools.cache
@@ -81,8 +84,11 @@ def same_bits(first: Tally, second: Tally) -> bool:
 
 def of_pearson(*values: float) -> Tally:
     """Return a tally of correlations at frames 2, 3, ..."""
-    numbered = {f: {"vorticity_pearson": v} for f, v in enumerate(values, 2)}
-    return Tally.of(["vorticity_pearson"], list(numbered), numbered)
+    name = "vorticity_pearson"
+    numbered = {}
+    for frame, value in enumerate(values, start=2):
+        numbered[frame] = {name: value}
+    return Tally.of([name], list(numbered), numbered)
 
 
 @given(st.lists(st.integers(0, 6), max_size=4), st.randoms(use_true_random=False))
@@ -93,12 +99,13 @@ def test_chunks_in_any_order_give_the_same_bits(
     bytes.
     """
     edges = [0, *sorted(cuts), 6]
-    chunks = [
-        tally(pairs()[a:b], ALL, CONFIG.predicted_frames)
-        for a, b in itertools.pairwise(edges)
-    ]
+    chunks = []
+    for begin, end in itertools.pairwise(edges):
+        chunk = tally(pairs()[begin:end], ALL, CONFIG.predicted_frames)
+        chunks.append(chunk)
     random.shuffle(chunks)  # type: ignore[attr-defined]
-    assert same_bits(functools.reduce(Tally.__add__, chunks), tallied())
+    total = functools.reduce(Tally.__add__, chunks)
+    assert same_bits(total, tallied())
 
 
 @settings(max_examples=15)
@@ -109,10 +116,16 @@ def test_particle_order_changes_nothing(random: object) -> None:
     """
     order = list(range(400))
     random.shuffle(order)  # type: ignore[attr-defined]
-    truth, prediction = (x[:, order] for x in trajectories())
-    scenario = scenario_of(truth, material=MATERIAL[order], materials=KINDS)
-    permuted = tallied(*pairs_of(scenario, truth, prediction))
-    assert_allclose(permuted.total, tallied().total, rtol=1e-9, atol=1e-13)
+    truth, prediction = trajectories()
+    scenario = scenario_of(
+        truth[:, order],
+        material=MATERIAL[order],
+        materials=KINDS,
+    )
+    permuted_pairs = pairs_of(scenario, truth[:, order], prediction[:, order])
+    permuted = tallied(*permuted_pairs)
+    expected = tallied()
+    assert_allclose(permuted.total, expected.total, rtol=1e-9, atol=1e-13)
 
 
 def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
@@ -121,23 +134,23 @@ def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
     """
     truth, prediction = trajectories()
     scenario = scenario_of(truth, material=MATERIAL, materials=KINDS)
-    true = list(snapshots(scenario, truth[2:]))
+    true_snapshots = list(snapshots(scenario, truth[2:]))
     for positions in (prediction, truth):
         sides = zip(
             CONFIG.predicted_frames,
-            true,
+            true_snapshots,
             snapshots(scenario, positions[2:]),
             strict=True,
         )
-        shared = [FramePair(scenario, f, t, p) for f, t, p in sides]
-        assert same_bits(
-            tallied(*shared), tallied(*pairs_of(scenario, truth, positions))
-        )
-    late = (
-        next(iter(snapshots(scenario, x[5:], previous=x[4])))
-        for x in (truth, prediction)
-    )
-    assert measure(FramePair(scenario, 5, *late), ALL) == measure(pairs()[3], ALL)
+        shared = []
+        for frame, true, predicted in sides:
+            shared.append(FramePair(scenario, frame, true, predicted))
+        apart = pairs_of(scenario, truth, positions)
+        assert same_bits(tallied(*shared), tallied(*apart))
+    true, *_ = snapshots(scenario, truth[5:], previous=truth[4])
+    predicted, *_ = snapshots(scenario, prediction[5:], previous=prediction[4])
+    late = FramePair(scenario, 5, true, predicted)
+    assert measure(late, ALL) == measure(pairs()[3], ALL)
 
 
 def test_undefined_frames_are_left_out_and_counted() -> None:
@@ -155,20 +168,24 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
     assert stable.mean == 1.0
 
     at_rest = [math.nan] * 89
-    still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *at_rest)})
+    tallies = {3: of_pearson(0.99, *at_rest)}
+    still = score(METRICS["stable_frames"], tallies)
     assert still.mean == 1.0
     assert still.undefined == (89,)
+
+
+UNDEFINED = (math.nan, math.nan)
 
 
 @pytest.mark.parametrize(
     ("values", "mean", "undefined"),
     [
         # scenario 4 has no correlation: the mean is that of scenario 2, in id order
-        ({4: (math.nan, math.nan), 2: (0.5, 0.7)}, 0.6, (0, 2)),
+        ({4: UNDEFINED, 2: (0.5, 0.7)}, 0.6, (0, 2)),
         # scenario means 0.6 and 1.0 of two and of one defined frame: 0.8, not (0.5 +
         # 0.7 + 1.0) / 3
         ({0: (0.5, 0.7), 1: (math.nan, 1.0)}, 0.8, (0, 1)),
-        ({0: (0.5, 0.7), 1: (0.8, math.nan), 2: (math.nan, math.nan)}, 0.7, (0, 1, 2)),
+        ({0: (0.5, 0.7), 1: (0.8, math.nan), 2: UNDEFINED}, 0.7, (0, 1, 2)),
     ],
 )
 def test_means_over_frames_come_before_those_over_scenarios(
@@ -201,7 +218,8 @@ def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None
     for scenario, row in enumerate(values):
         tallies[scenario] = of_pearson(*row)
         is_defined = ~np.isnan(row)
-        means.append(np.mean(row[is_defined].copy()))
+        defined = row[is_defined].copy()
+        means.append(np.mean(defined))
     correlation = score(METRICS["vorticity_pearson"], tallies)
     assert_array_equal(correlation.values, means)
 
@@ -227,8 +245,9 @@ def test_tallies_add() -> None:
         assert_array_equal(twice.series(name), once.series(name))
     with pytest.raises(UsageError):
         of_pearson(0.1) + of_pearson(0.1, 0.2)
+    values_by_frame = {3: {"vorticity_mse": 1.0}}
     with pytest.raises(UsageError):
-        Tally.of(["vorticity_mse"], [2], {3: {"vorticity_mse": 1.0}})
+        Tally.of(["vorticity_mse"], [2], values_by_frame)
 
 
 NAMES = sorted(METRICS)
@@ -246,7 +265,8 @@ STATES = ("liquid", "jelly", "snow", "rope")
 def scores(size: float) -> dict[str, Score]:
     """Score a rollout of all four materials whose error has this size."""
     truth = rollout(frames=54, side=40, speed=0.002)
-    scattered = np.random.default_rng(7).standard_normal(truth.shape[1:])
+    rng = np.random.default_rng(7)
+    scattered = rng.standard_normal(truth.shape[1:])
     step = truth[1:] - truth[:-1]
     drift = np.array([2e-4, 1e-4])
     expansion = 0.01 * (truth[:-1] - 0.4)
@@ -261,10 +281,12 @@ def scores(size: float) -> dict[str, Score]:
             "grid": Grid(20, placement),
             "radius": 0.04,
         }
-        scenario = scenario_of(truth, material=np.repeat(range(4), 400), **task)
+        material = np.repeat(range(4), 400)
+        scenario = scenario_of(truth, material=material, **task)
         pairs = pairs_of(scenario, truth, truth + size * error)
-        tallies = {0: tally(pairs, MEASURED, scenario.config.predicted_frames)}
-        scores_of_boxes = aggregate(MEASURED, tallies) | scores_of_boxes
+        pieces = tally(pairs, MEASURED, scenario.config.predicted_frames)
+        scores_of_box = aggregate(MEASURED, {0: pieces})
+        scores_of_boxes = scores_of_box | scores_of_boxes
     return scores_of_boxes
 
 
@@ -280,13 +302,16 @@ def test_every_metric_is_told(name: str) -> None:
     assert LENGTHS.fullmatch(metric.unit), metric.unit
     assert SOURCES.match(metric.source)
     assert re.fullmatch(r"[A-Z0-9].{7,98}[^.]", metric.summary)
-    assert all(needed in METRICS for needed in metric.of)
-    assert (metric.direction is Direction.NONE) <= (metric.perfect is None)
+    for needed in metric.of:
+        assert needed in METRICS
+    if metric.direction is Direction.NONE:
+        assert metric.perfect is None
 
 
-@pytest.mark.parametrize(
-    "name", [m.name for m in MEASURED if m.direction is not Direction.NONE]
-)
+JUDGED = [metric for metric in MEASURED if metric.direction is not Direction.NONE]
+
+
+@pytest.mark.parametrize("name", [metric.name for metric in JUDGED])
 def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(
     name: str,
 ) -> None:
@@ -300,46 +325,53 @@ def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(
     expected = metric.perfect if name != "stable_frames" else 52.0
     assert actual.mean == expected
     assert actual.undefined == (0,)
-    losses = [metric.loss(scores(size)[name].mean) for size in (0.0, 0.1, 0.5, 2.5)]
+    losses = []
+    for size in (0.0, 0.1, 0.5, 2.5):
+        mean = scores(size)[name].mean
+        losses.append(metric.loss(mean))
     assert losses == sorted(losses)
     assert losses[-1] > losses[0]
 
 
 def test_the_metrics_of_the_thesis_and_of_the_docs_are_complete() -> None:
     """Every metric of docs/scoring.md has an entry, and this rollout has its value."""
-    assert set(scores(0.1)) == {m.name for m in MEASURED}
-    assert not any(math.isnan(actual.mean) for actual in scores(0.1).values())
-    mse = scores(0.1)["vorticity_mse"]
+    scores_of_rollout = scores(0.1)
+    assert set(scores_of_rollout) == {metric.name for metric in MEASURED}
+    for actual in scores_of_rollout.values():
+        assert not math.isnan(actual.mean)
+    mse = scores_of_rollout["vorticity_mse"]
     assert mse.per_frame.shape == (1, 52)
     assert mse.frames == tuple(range(2, 54))
-    quantities = ("position", "velocity", "vorticity")
-    expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
-    expected |= {
-        f"vorticity_{name}"
-        for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")
-    }
+    expected = set()
+    for quantity in ("position", "velocity", "vorticity"):
+        expected |= {f"{quantity}_mse", f"{quantity}_mae", f"{quantity}_rmse"}
+    for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1"):
+        expected.add(f"vorticity_{name}")
+    for horizon in (1, 5, 10, 20, 50):
+        expected.add(f"mse_avg_{horizon}")
     expected |= {
         "energy_ratio",
         "energy_retention",
         "energy_error",
         "momentum_error",
         "divergence_rms",
-    }
-    expected |= {
         "angular_momentum_error",
         "density_rmse",
         "sliced_w2",
         "sinkhorn_pot",
         "attribute_mse",
+        "mse_avg",
+        "mse_end",
+        "stable_frames",
+        "shape_error",
+        "connectivity",
     }
-    expected |= {"mse_avg", "mse_end", "stable_frames", "shape_error", "connectivity"}
-    expected |= {f"mse_avg_{h}" for h in (1, 5, 10, 20, 50)}
     assert expected <= set(METRICS)
-    residual = {
-        n.removeprefix("vorticity_residual_")
-        for n in METRICS
-        if n.startswith("vorticity_residual_")
-    }
+    prefix = "vorticity_residual_"
+    residual = set()
+    for name in METRICS:
+        if name.startswith(prefix):
+            residual.add(name.removeprefix(prefix))
     assert residual == {
         "mean",
         "std",
@@ -393,22 +425,31 @@ def test_our_metrics_are_registered_as_those_of_others_are(
 
     A single metric of another package behind an entry point is scored like ours.
     """
-    points = [
-        p
-        for p in entry_points(group="lagbench.metrics")
-        if p.value.startswith("lagbench.")
-    ]
-    assert {p.name: p.load() for p in points} == dict(FAMILIES)
-    assert {name: available()[name] for name in METRICS} == dict(METRICS)
+    families = {}
+    for point in entry_points(group="lagbench.metrics"):
+        if point.value.startswith("lagbench."):
+            families[point.name] = point.load()
+    assert families == dict(FAMILIES)
+    all_metrics = available()
+    for name, metric in METRICS.items():
+        assert all_metrics[name] is metric
     with_entry_point(monkeypatch, f"{__name__}:OTHERS")
     assert available()["enstrophy_error"] is OTHERS
     metrics = select(["enstrophy_error"])
     pieces = tally(pairs(), metrics, CONFIG.predicted_frames)
-    assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
+    scores = aggregate(metrics, {0: pieces})
+    assert scores["enstrophy_error"].mean == 1.0
 
 
 @pytest.mark.parametrize(
-    "name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS", "leaving:METRICS"]
+    "name",
+    [
+        "CLASHING",
+        "NO_METRIC",
+        "NUMBER",
+        "ROOTLESS",
+        "leaving:METRICS",
+    ],
 )
 def test_a_bad_entry_point_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
@@ -425,7 +466,8 @@ def test_a_bad_entry_point_is_named(
     with_entry_point(monkeypatch, value)
     with pytest.raises(UsageError) as caught:
         available()
-    assert ":" not in name or caught.value.where == f"entry point others = {name}"
+    if ":" in name:
+        assert caught.value.where == f"entry point others = {name}"
 
 
 def test_selection_brings_what_a_metric_follows_from() -> None:
@@ -433,8 +475,8 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
 
     Neither a statistic nor a source of one, or a target without a value, is a mistake.
     """
-    found = {m.name for m in select(["vorticity_rmse", "energy_ratio"])}
-    assert found == {
+    names = {metric.name for metric in select(["vorticity_rmse", "energy_ratio"])}
+    assert names == {
         "vorticity_mse",
         "vorticity_rmse",
         "energy_predicted",
@@ -448,13 +490,16 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
         {"direction": Direction.TARGET, "perfect": None},
         {"direction": "sideways"},
         {"of": "vorticity_mse"},
-        *({"name": name, "of": ()} for name in ("My metric", "", "skill", "Ω")),
+        {"name": "My metric", "of": ()},
+        {"name": "", "of": ()},
+        {"name": "skill", "of": ()},
+        {"name": "Ω", "of": ()},
     ):
         with pytest.raises(UsageError):
             replace(OTHERS, **changes)
-    assert (
-        replace(OTHERS, direction="higher").direction is Direction.HIGHER
-    )  # as a package may write it
+    # as a package may write it
+    in_words = replace(OTHERS, direction="higher")
+    assert in_words.direction is Direction.HIGHER
 
 
 class Refusing:
@@ -475,13 +520,22 @@ NO_NUMBERS = [
     10**400,
     Refusing(),
 ]
+NO_BOOLEANS = [
+    None,
+    "no",
+    np.array([True, False]),
+]
+
+
+def returning(value: object) -> Callable[[FramePair], Any]:
+    """Return a function of a frame pair that always gives one value."""
+    return lambda pair: value
+
+
 STRANGE: list[tuple[str, Any]] = [
-    *(("statistic", lambda pair, value=value: value) for value in NO_NUMBERS),
+    *(("statistic", returning(value)) for value in NO_NUMBERS),
     ("statistic", lambda pair: sys.exit(0)),  # as one that parses arguments would
-    *(
-        ("defined", lambda pair, told=told: told)
-        for told in (None, "no", np.array([True, False]))
-    ),
+    *(("defined", returning(value)) for value in NO_BOOLEANS),
 ]
 
 
@@ -500,18 +554,19 @@ def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> 
     caught.value.add_note("scenario 3")
     again = pickle.loads(pickle.dumps(caught.value))
     assert again.where == f"{__name__}, enstrophy_error, frame 2, scenario 3"
-    assert all("scenario 3" in str(error) for error in (caught.value, again))
+    assert "scenario 3" in str(again)
+    assert "scenario 3" in str(caught.value)
 
 
 def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
     """As a ufunc or a partial, whose name is told too; what is not defined is NaN."""
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
+    without_module = replace(OTHERS, statistic=bare)
     with pytest.raises(WorkFailedError) as caught:
-        replace(OTHERS, statistic=bare).measure(pairs()[0])
+        without_module.measure(pairs()[0])
     assert caught.value.where == "?, enstrophy_error, frame 2"
-    assert math.isnan(
-        replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0])
-    )
+    undefined = replace(OTHERS, defined=returning(np.bool_(0)))
+    assert math.isnan(undefined.measure(pairs()[0]))
 
 
 @pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
@@ -525,10 +580,15 @@ def test_all_that_a_metric_does_is_told_with_its_name(
         raise left
 
     bad: Any = replace(OTHERS, **{what: fail})
+
+    def measure_and_aggregate() -> None:
+        pieces = tally(pairs(), [bad], CONFIG.predicted_frames)
+        aggregate([bad], {0: pieces})
+
     with pytest.raises((WorkFailedError, KeyError)) as caught:
-        aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
-    told = getattr(caught.value, "where", None) or caught.value.__notes__[0]
-    assert "enstrophy_error" in told
+        measure_and_aggregate()
+    place = getattr(caught.value, "where", None) or caught.value.__notes__[0]
+    assert "enstrophy_error" in place
 
 
 @pytest.mark.parametrize("what", ["statistic", "defined"])
@@ -543,8 +603,9 @@ def test_what_a_metric_raises_keeps_what_it_came_from(what: str) -> None:
         except KeyError:
             return [][0]
 
+    bad = replace(OTHERS, **{what: fail})
     with pytest.raises(IndexError) as caught:
-        replace(OTHERS, **{what: fail}).measure(pairs()[0])
+        bad.measure(pairs()[0])
     assert caught.value.__notes__ == ["in metric enstrophy_error, frame 2"]
     assert isinstance(caught.value.__context__, KeyError)
     assert not caught.value.__suppress_context__
