@@ -59,9 +59,12 @@ def found(bench: BoardBench, *, page: bool = False) -> list[str]:
     )
     for finding in result.findings:
         assert finding.check in CHECKS
-        assert all((finding.what, finding.where, finding.fix))
-        assert str(finding).isprintable() or "\n" in str(finding)
-        assert len(str(finding)) < 2000
+        assert finding.what
+        assert finding.where
+        assert finding.fix
+        message = str(finding)
+        assert message.isprintable() or "\n" in message
+        assert len(message) < 2000
     assert result.exit_code == (1 if result.findings else 0)
     return [finding.check for finding in result.findings]
 
@@ -72,6 +75,15 @@ def test_nothing_is_wrong_with_what_submit_writes(home: Path) -> None:
     result = check_board(bench.folder, registry=bench.registry, page=False)
     assert result.findings == ()
     assert result.entries == 3
+
+
+Damage = Callable[[BoardBench], object]
+Entry = dict[str, Any]
+
+
+def scores_of(bench: BoardBench, name: str) -> Path:
+    """Return a score file."""
+    return bench.folder / SCORES / f"{name}.nc"
 
 
 def halve(path: Path) -> None:
@@ -88,28 +100,26 @@ def link(path: Path, target: Path) -> None:
 
 def copy_of(bench: BoardBench, method: str, other: str, **changes: Any) -> None:
     """Enter a method once more under another id."""
-    held = yaml.safe_load(bench.entry(method).read_text()) | {
-        "method": other,
-        **changes,
-    }
-    bench.entry(other).write_text(yaml.safe_dump(held, sort_keys=False))
-    shutil.copyfile(
-        bench.folder / SCORES / f"{method}.nc", bench.folder / SCORES / f"{other}.nc"
-    )
+    entry = yaml.safe_load(bench.entry(method).read_text())
+    entry["method"] = other
+    entry |= changes
+    text = yaml.safe_dump(entry, sort_keys=False)
+    bench.entry(other).write_text(text)
+    shutil.copyfile(scores_of(bench, method), scores_of(bench, other))
 
 
 def disguised(bench: BoardBench) -> None:
     """Enter the predictions of another once more, with another hash of them
     everywhere.
     """
+    other_hash = "1" * 64
     copy_of(bench, "noisy", "other", name="Something else")
-    with netCDF4.Dataset(bench.folder / SCORES / "other.nc", "r+") as file:
-        file.predictions_sha256 = "1" * 64
+    with netCDF4.Dataset(scores_of(bench, "other"), "r+") as file:
+        file.predictions_sha256 = other_hash
 
-    def change(held: dict[str, Any]) -> None:
-        held["predictions"][0]["sha256"] = held["score"]["files"][0][
-            "predictions_sha256"
-        ] = "1" * 64
+    def change(entry: Entry) -> None:
+        entry["predictions"][0]["sha256"] = other_hash
+        entry["score"]["files"][0]["predictions_sha256"] = other_hash
 
     bench.edit("other", change)
     bench.rehash("other")
@@ -117,47 +127,155 @@ def disguised(bench: BoardBench) -> None:
 
 def verify(bench: BoardBench, method: str) -> None:
     """Write a list of verified entries, with scores that nobody has."""
-    line = {"scores": ["0" * 64], "lagbench": "0.1.0", "date": "2026-01-31"}
-    (bench.folder / "verified.yaml").write_text(
-        yaml.safe_dump({f"{PLACE}/{method}.yaml": line})
-    )
+    line = {
+        "scores": ["0" * 64],
+        "lagbench": "0.1.0",
+        "date": "2026-01-31",
+    }
+    lines = {f"{PLACE}/{method}.yaml": line}
+    (bench.folder / "verified.yaml").write_text(yaml.safe_dump(lines))
 
 
 def superseded(bench: BoardBench, one: str, two: str) -> None:
     """Say that an entry follows another."""
-    bench.edit(one, lambda held: held.update(status="superseded", superseded_by=two))
+
+    def change(entry: Entry) -> None:
+        entry["status"] = "superseded"
+        entry["superseded_by"] = two
+
+    bench.edit(one, change)
 
 
-def put(*place: str | int, **changes: object) -> Callable[[BoardBench], object]:
+def supersede_each_other(bench: BoardBench) -> None:
+    """Say that two entries follow each other."""
+    superseded(bench, "noisy", "damped")
+    superseded(bench, "damped", "noisy")
+
+
+def put(*place: str | int, **changes: object) -> Damage:
     """Return what writes keys into the entry of noisy, at a place of it."""
-    return lambda bench: bench.edit(
-        "noisy", lambda held: reduce(getitem, place, held).update(changes)
-    )
+
+    def change(entry: Entry) -> None:
+        part = reduce(getitem, place, entry)
+        part.update(changes)
+
+    return lambda bench: bench.edit("noisy", change)
 
 
-def text(
-    held: str, path: str = f"{PLACE}/noisy.yaml"
-) -> Callable[[BoardBench], object]:
+def edited(change: Callable[[Entry], object]) -> Damage:
+    """Return what changes the entry of noisy."""
+    return lambda bench: bench.edit("noisy", change)
+
+
+def text(content: str, path: str = f"{PLACE}/noisy.yaml") -> Damage:
     """Return what writes a file of the folder, the entry of noisy unless told
     otherwise.
     """
-    return lambda bench: (bench.folder / path).write_text(held)
+    return lambda bench: (bench.folder / path).write_text(content)
 
 
-DAMAGE: dict[str, Callable[[BoardBench], object]] = {
-    "score: edited score": lambda b: b.edit("noisy", set_mean),
-    "score: edited score by a millionth": lambda b: b.edit(
-        "noisy", lambda h: set_mean(h, 1 - 3e-6)
-    ),
-    "score: metric removed": lambda b: b.edit(
-        "noisy", lambda h: h["score"]["metrics"].pop("mse_avg")
-    ),
-    "score: metric invented": lambda b: b.edit(
-        "noisy",
-        lambda h: h["score"]["metrics"].update(
-            best=dict(h["score"]["metrics"]["mse_avg"])
-        ),
-    ),
+def scaled(statistic: str, factor: float, *, whole: bool = True) -> Damage:
+    """Return what multiplies a statistic of noisy."""
+    change = scale(statistic, factor)
+    return lambda bench: reform(bench, change, whole=whole)
+
+
+def worsen_by_a_millionth(entry: Entry) -> None:
+    """Change the mean of the ranking metric a little."""
+    set_mean(entry, 1 - 3e-6)
+
+
+def remove_metric(entry: Entry) -> None:
+    """Take a metric away."""
+    del entry["score"]["metrics"]["mse_avg"]
+
+
+def invent_metric(entry: Entry) -> None:
+    """Add a metric that nobody knows."""
+    metrics = entry["score"]["metrics"]
+    metrics["best"] = dict(metrics["mse_avg"])
+
+
+def move_to_unknown_split(bench: BoardBench) -> None:
+    """Say that an entry is of a split that nobody knows."""
+    folder = bench.folder / "submissions/cavty/tiny"
+    folder.mkdir(parents=True)
+    put(split="cavty")(bench)
+
+
+def link_predictions(bench: BoardBench) -> None:
+    """Name a link as predictions."""
+    (bench.folder / "x.nc").symlink_to(bench.entry("noisy"))
+    put("predictions", 0, path="x.nc")(bench)
+
+
+def halve_and_rehash(bench: BoardBench) -> None:
+    """Halve a statistic and forge the hash."""
+    halve(scores_of(bench, "damped_3"))
+    bench.rehash("damped")
+
+
+def take_scores_of_another(bench: BoardBench) -> None:
+    """Put another method's score file in the place of an entry's own."""
+    shutil.copyfile(scores_of(bench, "damped_0"), bench.folder / NOISY)
+    bench.rehash("noisy")
+
+
+def cut_scores_short(bench: BoardBench) -> None:
+    """Cut the end of a score file off and forge the hash."""
+    path = bench.folder / NOISY
+    size = path.stat().st_size
+    os.truncate(path, size - 999)
+    bench.rehash("noisy")
+
+
+def copy_scores(bench: BoardBench) -> None:
+    """Leave a score file that no entry has."""
+    shutil.copyfile(bench.folder / NOISY, scores_of(bench, "other"))
+
+
+def write_large_scores(bench: BoardBench) -> None:
+    """Make a score file larger than one may be."""
+    content = bytes(1_000_001)
+    (bench.folder / NOISY).write_bytes(content)
+
+
+def link_folder(bench: BoardBench) -> None:
+    """Put a link where a folder of a split would be."""
+    folder = bench.folder / "submissions" / "fluid"
+    folder.symlink_to("/etc", target_is_directory=True)
+
+
+def add_folder(bench: BoardBench) -> None:
+    """Add a folder that is none of the leaderboard's."""
+    folder = bench.folder / "more"
+    folder.mkdir()
+    (folder / "a.yaml").touch()
+
+
+def copy_floor(bench: BoardBench) -> None:
+    """Add scores of a reference predictor that nobody knows."""
+    unknown = bench.folder / "floors/cavity/tiny/ceiling.nc"
+    shutil.copyfile(bench.folder / PREDICTOR, unknown)
+
+
+def copy_floor_to_another_split(bench: BoardBench) -> None:
+    """Put the scores of a reference predictor under another split."""
+    folder = bench.folder / "floors/fluid/tiny"
+    folder.mkdir(parents=True)
+    shutil.copy(bench.folder / PREDICTOR, folder)
+
+
+def move_entry(path: str) -> Damage:
+    """Return what moves the entry of noisy elsewhere in the folder."""
+    return lambda bench: bench.entry("noisy").rename(bench.folder / path)
+
+
+DAMAGE: dict[str, Damage] = {
+    "score: edited score": edited(set_mean),
+    "score: edited score by a millionth": edited(worsen_by_a_millionth),
+    "score: metric removed": edited(remove_metric),
+    "score: metric invented": edited(invent_metric),
     "score: data set edited": put("score", dataset_sha256="0" * 64),
     "schema: unknown key": put(lisence="MIT"),
     "schema: scorer named": put("score", scored_by="me"),
@@ -170,64 +288,34 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "date: date to come": put(date="2999-01-01"),
     "name: look-alike of an entry": put(name="D\u0430MPED"),
     "name: look-alike of a floor": put(name="Persistence"),
-    "split: unknown split": lambda b: (
-        (b.folder / "submissions/cavty/tiny").mkdir(parents=True),
-        put(split="cavty")(b),
-    ),
+    "split: unknown split": move_to_unknown_split,
     "version score_file score: old data set": put("dataset", sha256="0" * 64),
     "lifecycle: superseded by nothing": lambda b: superseded(b, "noisy", "none"),
     "lifecycle: superseded by itself": lambda b: superseded(b, "noisy", "noisy"),
-    "lifecycle: superseded in a circle": lambda b: (
-        superseded(b, "noisy", "damped"),
-        superseded(b, "damped", "noisy"),
-    ),
+    "lifecycle: superseded in a circle": supersede_each_other,
     "nothing: notes edited": put(notes="new"),
     "predictions: predictions that are not there": put(
         "predictions", 0, path="predictions/x.nc"
     ),
-    "predictions folder: predictions behind a link": lambda b: (
-        (b.folder / "x.nc").symlink_to(b.entry("noisy")),
-        put("predictions", 0, path="x.nc")(b),
-    ),
+    "predictions folder: predictions behind a link": link_predictions,
     "verified: verified without an entry": lambda b: verify(b, "nobody"),
     "verified: verified with other scores": lambda b: verify(b, "noisy"),
     "verified: list that is none": text("- a\n", "verified.yaml"),
     # what may happen to files
     "score_file: edited score file": lambda b: halve(b.folder / NOISY),
-    "score: edited score file, hash forged": lambda b: (
-        halve(b.folder / SCORES / "damped_3.nc"),
-        b.rehash("damped"),
-    ),
-    "score_file score twin: score file of another method": lambda b: (
-        shutil.copyfile(b.folder / SCORES / "damped_0.nc", b.folder / NOISY),
-        b.rehash("noisy"),
-    ),
-    "score_file: score file cut short": lambda b: (
-        os.truncate(b.folder / NOISY, (b.folder / NOISY).stat().st_size - 999),
-        b.rehash("noisy"),
-    ),
-    "missing: missing score file": lambda b: (
-        b.folder / SCORES / "damped_3.nc"
-    ).unlink(),
-    "stray: stray score file": lambda b: shutil.copyfile(
-        b.folder / NOISY, b.folder / SCORES / "other.nc"
-    ),
+    "score: edited score file, hash forged": halve_and_rehash,
+    "score_file score twin: score file of another method": take_scores_of_another,
+    "score_file: score file cut short": cut_scores_short,
+    "missing: missing score file": lambda b: scores_of(b, "damped_3").unlink(),
+    "stray: stray score file": copy_scores,
     "stray: missing entry": lambda b: b.entry("noisy").unlink(),
-    "oversize: oversize score file": lambda b: (b.folder / NOISY).write_bytes(
-        bytes(1_000_001)
-    ),
+    "oversize: oversize score file": write_large_scores,
     "folder missing: score file that is a link": lambda b: link(
-        b.folder / NOISY, b.folder / SCORES / "damped_0.nc"
+        b.folder / NOISY, scores_of(b, "damped_0")
     ),
-    "values: negative square": lambda b: reform(
-        b, scale("position_mse", -1.0), whole=False
-    ),
-    "values: correlation above one": lambda b: reform(
-        b, scale("vorticity_pearson", 2.0)
-    ),
-    "values: no error where there is one": lambda b: reform(
-        b, scale("vorticity_mse", 0.0)
-    ),
+    "values: negative square": scaled("position_mse", -1.0, whole=False),
+    "values: correlation above one": scaled("vorticity_pearson", 2.0),
+    "values: no error where there is one": scaled("vorticity_mse", 0.0),
     "twin: the same predictions again": lambda b: copy_of(
         b, "noisy", "other", name="Something else"
     ),
@@ -235,33 +323,21 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "folder: entry that is a link": lambda b: link(
         b.entry("noisy"), Path("/etc/passwd")
     ),
-    "folder: folder that is a link": lambda b: (
-        b.folder / "submissions" / "fluid"
-    ).symlink_to("/etc", target_is_directory=True),
+    "folder: folder that is a link": link_folder,
     "folder: other files": text("import os", f"{PLACE}/evil.py"),
     "folder: other files beside the page": text("alert(1)", "index.js"),
-    "folder: folder of its own": lambda b: (
-        (b.folder / "more").mkdir(),
-        (b.folder / "more/a.yaml").touch(),
-    ),
+    "folder: folder of its own": add_folder,
     "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to(
         "/etc/passwd"
     ),
     "folder: name that a log would obey": text("a: 1", f"{PLACE}/a\n::warning::x.yaml"),
-    "folder stray: entry at another depth": lambda b: b.entry("noisy").rename(
-        b.folder / "submissions/noisy.yaml"
-    ),
+    "folder stray: entry at another depth": move_entry("submissions/noisy.yaml"),
     "readable: entry of 100 MB": lambda b: os.truncate(b.entry("noisy"), 100_000_000),
     "readable: YAML with aliases": text("a: &a [x]\nb: *a\n"),
-    "place: place": lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"),
-    "floor: unknown floor": lambda b: shutil.copyfile(
-        b.folder / PREDICTOR, b.folder / "floors/cavity/tiny/ceiling.nc"
-    ),
+    "place: place": move_entry(f"{PLACE}/other.yaml"),
+    "floor: unknown floor": copy_floor,
     "floor: broken floor": text("CDF", PREDICTOR),
-    "floor: floor of another split": lambda b: (
-        (b.folder / "floors/fluid/tiny").mkdir(parents=True),
-        shutil.copy(b.folder / PREDICTOR, b.folder / "floors/fluid/tiny"),
-    ),
+    "floor: floor of another split": copy_floor_to_another_split,
 }
 """What somebody may write into an entry, then what may happen to files: the checks that
 find it, its name.
@@ -270,13 +346,15 @@ find it, its name.
 
 def checks_of(name: str) -> set[str]:
     """Return the checks that find a damage."""
-    return {*name.partition(":")[0].split()} - {"nothing"}
+    checks, _, _ = name.partition(":")
+    return set(checks.split()) - {"nothing"}
 
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damage_is_found(name: str, own: BoardBench) -> None:
     """Each kind of damage is found by its checks and by no others."""
-    DAMAGE[name](own)
+    damage = DAMAGE[name]
+    damage(own)
     assert set(found(own)) == checks_of(name)
 
 
@@ -284,9 +362,19 @@ def test_all_checks_have_damage() -> None:
     """No check is without a test; those that need more than the folder have suites of
     their own.
     """
-    tested = set().union(*map(checks_of, DAMAGE))
-    elsewhere = {"page", "rescored", "base", "measured", "weights", "budget"}
-    elsewhere.update({"season", "shift"})
+    tested = set()
+    for name in DAMAGE:
+        tested |= checks_of(name)
+    elsewhere = {
+        "page",
+        "rescored",
+        "base",
+        "measured",
+        "weights",
+        "budget",
+        "season",
+        "shift",
+    }
     assert not tested & elsewhere
     assert tested | elsewhere == set(CHECKS)
 
@@ -338,19 +426,27 @@ def test_names_that_look_alike(one: str, other: str) -> None:
 
 def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
     """What is not active need not belong to the data set of today."""
-    newer = own.folder.parent / "newer.yaml"
+    newer_file = own.folder.parent / "newer.yaml"
     registry_text = own.data.size.file.read_text()
-    newer.write_text(re.sub(r"version: 2\.\d+\.0", "version: 9.0.0", registry_text))
-    result = check_board(own.folder, registry=load(newer), isolated=False)
-    assert {finding.check for finding in result.findings} == {"version", "floor"}
-    assert len(result.findings) == 2 + len(list((own.folder / "floors").rglob("*.nc")))
-    for path in own.entry("noisy").parent.glob("*.yaml"):
-        held = yaml.safe_load(path.read_text())
-        path.write_text(
-            yaml.safe_dump(held | {"status": "withdrawn", "reason": "old data"})
-        )
-    shutil.rmtree(own.folder / "floors")
-    assert not check_board(own.folder, registry=load(newer), isolated=False).findings
+    newer_text = re.sub(r"version: 2\.\d+\.0", "version: 9.0.0", registry_text)
+    newer_file.write_text(newer_text)
+    newer = load(newer_file)
+    floors = own.folder / "floors"
+    floor_count = len(list(floors.rglob("*.nc")))
+    result = check_board(own.folder, registry=newer, isolated=False)
+    checks = {finding.check for finding in result.findings}
+    assert checks == {"version", "floor"}
+    assert len(result.findings) == 2 + floor_count
+
+    def withdraw(entry: Entry) -> None:
+        entry["status"] = "withdrawn"
+        entry["reason"] = "old data"
+
+    own.edit("noisy", withdraw)
+    own.edit("damped", withdraw)
+    shutil.rmtree(floors)
+    result = check_board(own.folder, registry=newer, isolated=False)
+    assert result.findings == ()
 
 
 def test_a_stale_page_is_found(own: BoardBench) -> None:
@@ -360,23 +456,23 @@ def test_a_stale_page_is_found(own: BoardBench) -> None:
     assert found(own, page=True) == ["page"]
     page = build(own.folder, registry=own.registry).page
     assert found(own, page=True) == []
-    assert build(own.folder, registry=own.registry).written == ()
-    data = page.read_bytes()
-    page.write_bytes(data.replace(b"noisy", b"nOisy", 1))
+    again = build(own.folder, registry=own.registry)
+    assert again.written == ()
+    content = page.read_bytes()
+    page.write_bytes(content.replace(b"noisy", b"nOisy", 1))
     assert found(own, page=True) == ["page"]
     page.unlink()
     page.symlink_to("elsewhere.html")
     assert found(own, page=True) == ["folder"]
     page.unlink()
-    page.write_bytes(data)
-    own.edit("noisy", lambda held: held.update(notes="new"))
+    page.write_bytes(content)
+    put(notes="new")(own)
     with pytest.raises(ChecksFailedError) as caught:
         build(own.folder, check=True, registry=own.registry)
     assert caught.value.where.endswith("leaderboard/index.html")
     assert found(own, page=True) == ["page"]
-    (own.folder / "schema.json").write_text("{}")
-    assert build(own.folder, registry=own.registry).written == (
-        page,
-        own.folder / "schema.json",
-    )
+    schema = own.folder / "schema.json"
+    schema.write_text("{}")
+    result = build(own.folder, registry=own.registry)
+    assert result.written == (page, schema)
     assert found(own, page=True) == []

@@ -52,7 +52,12 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
 
 def checked(bench: BoardBench, **options: Any) -> CheckResult:
     """Check in this process."""
-    return check_board(bench.folder, registry=bench.registry, isolated=False, **options)
+    return check_board(
+        bench.folder,
+        registry=bench.registry,
+        isolated=False,
+        **options,
+    )
 
 
 def findings_of(bench: BoardBench) -> list[str]:
@@ -73,11 +78,8 @@ def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
 
 def verified(bench: BoardBench) -> set[str]:
     """Return the entries that the board calls verified."""
-    return {
-        row.id
-        for row in collect(bench.folder, registry=bench.registry).tabs[0].rows
-        if row.verified
-    }
+    board = collect(bench.folder, registry=bench.registry)
+    return {row.id for row in board.tabs[0].rows if row.verified}
 
 
 def test_scoring_again_confirms_and_is_recorded(
@@ -130,7 +132,13 @@ def test_metrics_of_packages_decide_nothing(
 
 def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
     """One of two seeds confirms its score file, not the entry."""
-    path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
+    path = own.predict(
+        damped,
+        "damped",
+        seed=0,
+        device="cpu",
+        seconds_per_frame=0.25,
+    )
     result = rescored(own, path, recording=True)
     (confirmed,) = result.confirmed
     assert confirmed.score_file.name == "damped_0.nc"
@@ -174,7 +182,8 @@ def test_what_is_said_beside_the_numbers_is_compared(
     with netCDF4.Dataset(own.folder / PREDICTOR, "r+") as file:
         file.set_auto_maskandscale(False)
         scale("position_mse", 2.0)(file)
-    got = [finding.got for finding in rescored(own, predictions).findings]
+    result = rescored(own, predictions)
+    got = [finding.got for finding in result.findings]
     assert got == ["other position_mse", "[]", "{}"]
 
 
@@ -188,20 +197,23 @@ def test_pictures_and_statistics_are_compared(
     def repaint(file: Any) -> None:
         film = file["preview"]["film"]
         film.set_auto_maskandscale(False)
-        brighter = np.clip(film[1].astype(np.int64) + 500, 0, 60_000)
+        predicted = film[1].astype(np.int64)
+        brighter = np.clip(predicted + 500, 0, 60_000)
         film[1] = brighter.astype(np.uint16)
 
     reform(own, repaint)
     (finding,) = rescored(own, predictions).findings
     assert finding.got == "other film pictures"
 
-    with netCDF4.Dataset(own.folder / SCORES / "noisy.nc", "a") as file:
+    path = own.folder / SCORES / "noisy.nc"
+    with netCDF4.Dataset(path, "a") as file:
         names = file.statistics.split()
         names[names.index("velocity_mse")] = "made_up"
         file.statistics = " ".join(names)
     own.rehash("noisy")
     differences = []
-    for finding in rescored(own, predictions).findings:
+    result = rescored(own, predictions)
+    for finding in result.findings:
         if finding.check == "rescored":
             differences.append(str(finding.got))
     assert "velocity_mse" in differences[0]
@@ -217,13 +229,16 @@ def test_broken_predictions_are_opened_in_the_child_only(
     findings remain.
     """
     cut = tmp_path / "cut.nc"
-    cut.write_bytes(predictions.read_bytes()[:-9999])
+    content = predictions.read_bytes()
+    cut.write_bytes(content[:-9999])
     own.edit("damped", set_mean)
     for module in (score, submitting):
         monkeypatch.setattr(module, "open_predictions", pytest.fail)
     result = rescored(own, cut)
-    assert [finding.check for finding in result.findings] == ["score", "rescored"]
-    assert result.findings[1].where == str(cut)
+    first, second = result.findings
+    assert first.check == "score"
+    assert second.check == "rescored"
+    assert second.where == str(cut)
     with pytest.raises(UnreadableFileError):
         own.submit(cut, method="cut")
 
@@ -231,21 +246,20 @@ def test_broken_predictions_are_opened_in_the_child_only(
 def git(folder: Path, *words: str) -> str:
     """Run git as somebody without settings of his own."""
     about = (
-        "-c",
-        "user.name=A",
-        "-c",
-        "user.email=a@example.org",
-        "-c",
-        "init.defaultBranch=main",
+        *("-c", "user.name=A"),
+        *("-c", "user.email=a@example.org"),
+        *("-c", "init.defaultBranch=main"),
     )
     command = ["git", *about, "-C", str(folder), *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    return result.stdout
 
 
 def commit(bench: BoardBench) -> None:
     """Commit all that lies there."""
-    git(bench.folder.parent, "add", "-A")
-    git(bench.folder.parent, "commit", "-q", "-m", "x", "--allow-empty")
+    folder = bench.folder.parent
+    git(folder, "add", "-A")
+    git(folder, "commit", "-q", "-m", "x", "--allow-empty")
 
 
 @pytest.fixture
@@ -263,22 +277,22 @@ def branch(home: Path, tmp_path: Path) -> BoardBench:
 
 def touched(bench: BoardBench, **options: Any) -> dict[str, str]:
     """Return where and got of what the check against main finds."""
-    findings = checked(bench, base="main", **options).findings
-    return {
-        finding.where: finding.got for finding in findings if finding.check == "base"
-    }
+    result = checked(bench, base="main", **options)
+    places = {}
+    for finding in result.findings:
+        if finding.check == "base":
+            places[finding.where] = finding.got
+    return places
 
 
 def new_entry(bench: BoardBench) -> None:
     """Add an entry of one's own."""
-    held = yaml.safe_load(bench.entry("noisy").read_text()) | {
-        "method": "mine",
-        "name": "Mine",
-    }
-    bench.entry("mine").write_text(yaml.safe_dump(held))
-    shutil.copyfile(
-        bench.folder / SCORES / "noisy.nc", bench.folder / SCORES / "mine.nc"
-    )
+    entry = yaml.safe_load(bench.entry("noisy").read_text())
+    entry["method"] = "mine"
+    entry["name"] = "Mine"
+    bench.entry("mine").write_text(yaml.safe_dump(entry))
+    scores = bench.folder / SCORES
+    shutil.copyfile(scores / "noisy.nc", scores / "mine.nc")
 
 
 def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
@@ -290,8 +304,9 @@ def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
     assert touched(branch) == {}
     commit(branch)
     assert touched(branch) == {}
-    git(branch.folder.parent, "branch", "-f", "main", "change")
-    git(branch.folder.parent, "reset", "-q", "--hard", "main~1")
+    folder = branch.folder.parent
+    git(folder, "branch", "-f", "main", "change")
+    git(folder, "reset", "-q", "--hard", "main~1")
     assert touched(branch) == {}
 
 
@@ -300,52 +315,95 @@ DAMPED = f"{SCORES}/damped_3.nc"
 LISTED = "verified.yaml"
 
 
-def said(**keys: str) -> Callable[[BoardBench], object]:
+Change = Callable[[BoardBench], object]
+
+
+def said(**keys: str) -> Change:
     """Return what writes keys into the entry of noisy."""
     return lambda bench: bench.edit("noisy", lambda entry: entry.update(keys))
 
 
-CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
-    "removed": (lambda b: b.entry("noisy").unlink(), NOISY, "removed"),
-    "touched": (said(notes="other"), NOISY, "other notes"),
+def removed(path: str) -> Change:
+    """Return what removes a file of the folder."""
+    return lambda bench: (bench.folder / path).unlink()
+
+
+def written(path: str, content: str) -> Change:
+    """Return what writes a file of the folder."""
+    return lambda bench: (bench.folder / path).write_text(content)
+
+
+def add_seed(bench: BoardBench) -> None:
+    """Add the scores of a seed to another's."""
+    scores = bench.folder / SCORES
+    shutil.copyfile(scores / "noisy.nc", scores / "damped_9.nc")
+
+
+def make_link(bench: BoardBench) -> None:
+    """Put a link in the place of an entry."""
+    path = bench.entry("noisy")
+    path.unlink()
+    path.symlink_to("damped.yaml")
+
+
+CHANGES: dict[str, tuple[Change, str, str]] = {
+    "removed": (
+        removed(NOISY),
+        NOISY,
+        "removed",
+    ),
+    "touched": (
+        said(notes="other"),
+        NOISY,
+        "other notes",
+    ),
     "superseded": (
         said(status="superseded", superseded_by="damped"),
         NOISY,
         "superseded_by None -> 'damped'",
     ),
-    "withdrawn": (said(status="withdrawn"), NOISY, "status None -> 'withdrawn'"),
+    "withdrawn": (
+        said(status="withdrawn"),
+        NOISY,
+        "status None -> 'withdrawn'",
+    ),
     "scores changed": (
-        lambda b: (b.folder / DAMPED).write_bytes(b"x"),
+        written(DAMPED, "x"),
         DAMPED,
         "changed",
     ),
-    "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
+    "scores removed": (
+        removed(DAMPED),
+        DAMPED,
+        "removed",
+    ),
     "a seed added": (
-        lambda b: shutil.copyfile(
-            b.folder / SCORES / "noisy.nc", b.folder / SCORES / "damped_9.nc"
-        ),
-        *(f"{SCORES}/damped_9.nc", "added"),
+        add_seed,
+        f"{SCORES}/damped_9.nc",
+        "added",
     ),
     "made a link": (
-        lambda b: (
-            b.entry("noisy").unlink(),
-            b.entry("noisy").symlink_to("damped.yaml"),
-        ),
-        *(NOISY, "link"),
+        make_link,
+        NOISY,
+        "link",
     ),
     "made a bomb": (
-        lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
+        written(NOISY, "a: &a [x]\nb: *a\n"),
         NOISY,
         "another content",
     ),
     "verified claimed": (
-        lambda b: (b.folder / LISTED).write_text(f"{NOISY}: x\n"),
+        written(LISTED, f"{NOISY}: x\n"),
         LISTED,
         "changed",
     ),
-    "floors changed": (lambda b: (b.folder / PREDICTOR).unlink(), PREDICTOR, "removed"),
+    "floors changed": (
+        removed(PREDICTOR),
+        PREDICTOR,
+        "removed",
+    ),
     "gates claimed": (
-        lambda b: (b.folder / "gates.json").write_text('{"weights": []}'),
+        written("gates.json", '{"weights": []}'),
         "gates.json",
         "added",
     ),
@@ -359,10 +417,12 @@ def test_what_touches_others_is_named(name: str, branch: BoardBench) -> None:
     """
     change, where, got = CHANGES[name]
     change(branch)
-    here = touched(branch)
+    in_working_tree = touched(branch)
     commit(branch)
-    for found in (here, touched(branch)):
-        assert {path: got in text for path, text in found.items()} == {where: True}
+    in_commit = touched(branch)
+    for places in (in_working_tree, in_commit):
+        assert places.keys() == {where}
+        assert got in places[where]
 
 
 def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
@@ -370,12 +430,15 @@ def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
 
     A repository's own settings are strangers' too: no program of theirs is started.
     """
+    trace = tmp_path / "ran"
     for setting in ("core.fsmonitor", "diff.external"):
-        git(branch.folder.parent, "config", setting, f"touch {tmp_path}/ran; false")
-    branch.edit("noisy", lambda entry: entry.update(notes="other"))
+        git(branch.folder.parent, "config", setting, f"touch {trace}; false")
+    change = said(notes="other")
+    change(branch)
     branch.entry("damped").unlink()
-    assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
-    assert not (tmp_path / "ran").exists()
+    places = touched(branch, own=["noisy"])
+    assert places.keys() == {f"{PLACE}/damped.yaml"}
+    assert not trace.exists()
 
 
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
@@ -386,27 +449,31 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     listed = branch.folder / "verified.yaml"
     branch.submit(other)
     own = branch.predict(noisy, "noisy", parameters=5)
-    assert len(rescored(branch, own, other, recording=True).recorded) == 2
+    result = rescored(branch, own, other, recording=True)
+    assert len(result.recorded) == 2
     commit(branch)
     both = listed.read_bytes()
     branch.submit(own, replace=True)
     assert listed.read_bytes() == both  # its scores are those of before
-    assert listed in branch.submit(branch.predict(still, "noisy"), replace=True).files
+    worse = branch.predict(still, "noisy")
+    submission = branch.submit(worse, replace=True)
+    assert listed in submission.files
 
-    def told(*own: str) -> set[tuple[str, str]]:
-        return {
-            (one.check, str(one.where))
-            for one in checked(branch, own=own, base="HEAD").findings
-        }
+    def places_of(*own: str) -> set[tuple[str, str]]:
+        places = set()
+        for finding in checked(branch, own=own, base="HEAD").findings:
+            places.add((finding.check, str(finding.where)))
+        return places
 
-    assert told("noisy") == set()
-    assert ("base", "verified.yaml") in told()
+    list_is_touched = ("base", "verified.yaml")
+    assert places_of("noisy") == set()
+    assert list_is_touched in places_of()
     left = listed.read_text()
     assert "other" in left
     listed.write_text(left.replace("lagbench: ", "lagbench: 9"))
-    assert ("base", "verified.yaml") in told("noisy")
+    assert list_is_touched in places_of("noisy")
     listed.write_bytes(both + b"# all others too\n")
-    assert ("base", "verified.yaml") in told("noisy")
+    assert list_is_touched in places_of("noisy")
 
 
 def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -419,13 +486,18 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
     move = os.replace
 
     def note(source: Path, target: Path) -> None:
-        moved.append(os.path.relpath(target, own.folder))
+        name = os.path.relpath(target, own.folder)
+        moved.append(name)
         move(source, target)
 
+    second = own.predict(still, "new")
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", note)
-        own.submit(own.predict(still, "new"), replace=True, **about)
-    ours = [name for name in moved if "verified" in name and ".submit-" not in name]
+        own.submit(second, replace=True, **about)
+    ours = []
+    for name in moved:
+        if "verified" in name and ".submit-" not in name:
+            ours.append(name)
     assert ours == [
         "scores/cavity/tiny/verified.nc",
         "verified.yaml",
