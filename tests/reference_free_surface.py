@@ -261,7 +261,12 @@ class FreeSurfaceReference:
         return np.where(hits, Float(0), normal), np.where(hits, braked, tangential)
 
     def to_particles(
-        self, stencil: Stencil, u: Floats, v: Floats, density: Floats, jacobian: Floats
+        self,
+        stencil: Stencil,
+        u: Floats,
+        v: Floats,
+        density: Floats,
+        jacobian: Floats,
     ) -> None:
         """Gather velocity, gradient, density and J; move; update the constitutive
         state.

@@ -186,7 +186,10 @@ def test_the_speed_up_needs_the_solver(
     ],
 )
 def test_mistakes_of_train(
-    lagbench: Command, words: tuple[str, ...], code: int, message: str
+    lagbench: Command,
+    words: tuple[str, ...],
+    code: int,
+    message: str,
 ) -> None:
     """Every mistake has its exit code, and a message that says how to mend it."""
     result = lagbench("train", *words)
@@ -258,7 +261,11 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     line = [sys.executable, "-m", *words]
     return subprocess.run(
-        line, capture_output=True, text=True, env=environment, timeout=300
+        line,
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=300,
     )
 
 
@@ -376,7 +383,9 @@ def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("nodes", [1, 2])
 def test_two_processes_make_the_weights_of_one(
-    lagbench: Command, tmp_path: Path, nodes: int
+    lagbench: Command,
+    tmp_path: Path,
+    nodes: int,
 ) -> None:
     """Three windows on each of two gloo processes give the weights of six on one, at
     twice the rate.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import mirror_batch, shift_batch
@@ -54,13 +55,13 @@ def test_the_force_goes_with_the_frames(batch: Batch) -> None:
     force = batch.body_force
     assert force is not None
     assert force.shape == (2, GIVEN + 4, 2, 2)
-    torch.testing.assert_close(force[:, :, 1], -force[:, :, 0])
+    assert_close(force[:, :, 1], -force[:, :, 0])
     given = batch.part(slice(GIVEN))
     assert given.body_force is not None
-    torch.testing.assert_close(given.body_force, force)
+    assert_close(given.body_force, force)
     later = given.followed_by(given.position[:, -1])
     assert later.body_force is not None
-    torch.testing.assert_close(later.body_force, force[:, 1:])
+    assert_close(later.body_force, force[:, 1:])
 
 
 def test_a_users_model_is_given_the_force_of_all_frames(root: Path) -> None:
@@ -90,12 +91,12 @@ def test_images_of_the_force_fit_the_images_of_the_particles(batch: Batch) -> No
     across_x = torch.diag(torch.tensor([-1.0, 1.0])).expand(2, 2, 2)
     image = mirror_batch(batch, across_x, SIZE.bounds)
     assert image.body_force is not None
-    torch.testing.assert_close(image.body_force, -force)
+    assert_close(image.body_force, -force)
 
     across_y = torch.diag(torch.tensor([1.0, -1.0])).expand(2, 2, 2)
     image = mirror_batch(batch, across_y, SIZE.bounds)
     assert image.body_force is not None
-    torch.testing.assert_close(image.body_force, force.flip(2))
+    assert_close(image.body_force, force.flip(2))
 
     swap = torch.tensor([[0.0, 1.0], [1.0, 0.0]]).expand(2, 2, 2)
     with pytest.raises(UsageError) as caught:
@@ -114,7 +115,12 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
     the second; a model that sees it refuses data without it.
     """
     info = read_dataset_info(SPLIT, "tiny", root=root)
-    options = {"cells": 12, "width": 8, "velocities": 2, "bundle": 3}
+    options = {
+        "cells": 12,
+        "width": 8,
+        "velocities": 2,
+        "bundle": 3,
+    }
     model = NeuralMPM.build({**options, "body_force": True}, info)
     given = batch.part(slice(GIVEN))
     state = model.start(given)
@@ -126,12 +132,15 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
     coming = unit * batch.body_force[:, GIVEN : GIVEN + 3]
     for layer, rows in enumerate((slice(0, 6), slice(6, 12))):
         expected = coming[:, :, layer].flatten(1)[..., None, None]
-        torch.testing.assert_close(
-            fields[..., rows], expected.expand(-1, -1, 12, 6), atol=1e-6, rtol=1e-5
+        assert_close(
+            fields[..., rows],
+            expected.expand(-1, -1, 12, 6),
+            atol=1e-6,
+            rtol=1e-5,
         )
     state, _ = model.call(state)
     assert state.body_force is not None
-    torch.testing.assert_close(
+    assert_close(
         state.body_force[:, 0], info.frame_interval**2 * batch.body_force[:, GIVEN + 2]
     )
 

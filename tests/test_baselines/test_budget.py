@@ -26,7 +26,10 @@ from lagbench.submission.budget import MOST_VALIDATIONS, Budget, parse_budget, t
     ],
 )
 def test_equal_compute(
-    size: str, minutes: float, gpu: float, track: str | None
+    size: str,
+    minutes: float,
+    gpu: float,
+    track: str | None,
 ) -> None:
     """At most 15 minutes of processor time at mini, 60 at full, 5 % more allowed, and
     no GPU.
@@ -65,7 +68,11 @@ def test_converged(
     """
     best = min((value for _, value in validations), default=None)
     long = Budget(
-        steps=1000, cpu_hours=5.0, gpu_hours=0.0, best=best, validations=validations
+        steps=1000,
+        cpu_hours=5.0,
+        gpu_hours=0.0,
+        best=best,
+        validations=validations,
     )
     assert track_of("mini", long) == track
 

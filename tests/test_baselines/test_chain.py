@@ -21,7 +21,9 @@ STEPS = 20
 @pytest.mark.slow
 @pytest.mark.parametrize("split", SPLITS)
 def test_a_trained_model_gets_a_skill(
-    split: str, tiny_split: Callable[..., GenerationResult], tmp_path: Path
+    split: str,
+    tiny_split: Callable[..., GenerationResult],
+    tmp_path: Path,
 ) -> None:
     """The recipe of the split trains; its predictions are valid and are scored beside
     the shipped reference predictors.

@@ -263,7 +263,9 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
     ],
 )
 def test_unfit_weights(
-    changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, Any],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Weights that are not finite or belong to another model are refused."""
     install(monkeypatch, drift=Drift)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from simple_models import RADIUS, batch, info, jittered, swirl
+from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import (
     Symmetry,
@@ -125,7 +126,7 @@ def test_a_particle_shows_thirty_numbers() -> None:
     assert features.count == 30
     assert numbers.shape == (1, 30)
     expected = torch.tensor([0.5, 1 / 3, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0])
-    torch.testing.assert_close(numbers[0, :10], expected)
+    assert_close(numbers[0, :10], expected)
     assert numbers[0, 10:14].tolist() == [1.0] * 4
     assert torch.equal(numbers[0, 14:], features.embedding.weight[2])
 
@@ -146,7 +147,7 @@ def test_moving_walls_are_felt_near_them() -> None:
     numbers = features(position, at_rest, material, wall_velocity)
     walls = numbers[:, 30:].reshape(3, 4, 2)
     expected = torch.tensor([[2.0, 1.0], [1.0, 0.5], [0.0, 0.0]])
-    torch.testing.assert_close(walls[:, 3], expected)
+    assert_close(walls[:, 3], expected)
     assert not walls[:, :3].any()
 
     without_walls = features(position, at_rest, material)
@@ -186,7 +187,7 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
     expected = 0.09 * torch.minimum(step[:, None], step) / 5.0
     # The error of a variance from n draws is sqrt(2 / n) of it. With 80,000 draws it
     # is 0.5 %; five of those are allowed.
-    torch.testing.assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
+    assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
     assert abs(float(velocity[:, -1].std()) - 0.3) < 0.003
 
     last = velocity[:, -1] / 0.3
@@ -209,12 +210,10 @@ def test_the_target_makes_up_for_the_noise() -> None:
     velocity = disturbed.diff(dim=1)
     true_velocity = truth.diff(dim=1)
     velocity_noise = noise.diff(dim=1)
-    torch.testing.assert_close(
-        velocity[:, 5:], true_velocity[:, 5:], atol=1e-15, rtol=0
-    )
+    assert_close(velocity[:, 5:], true_velocity[:, 5:], atol=1e-15, rtol=0)
     acceleration = velocity.diff(dim=1)[:, 4]
     expected = true_velocity.diff(dim=1)[:, 4] - velocity_noise[:, 4]
-    torch.testing.assert_close(acceleration, expected, atol=1e-15, rtol=0)
+    assert_close(acceleration, expected, atol=1e-15, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -261,9 +260,7 @@ def test_walls_move_with_the_particles_on_them() -> None:
         velocity = image.position[:, 1] - first
         distance = (first[:, None] - middle_of_walls).norm(dim=2)
         wall = distance.argmin(dim=1)
-        torch.testing.assert_close(
-            image.wall_velocity[0, 0][wall], velocity, atol=1e-6, rtol=0
-        )
+        assert_close(image.wall_velocity[0, 0][wall], velocity, atol=1e-6, rtol=0)
         wall_orders.add(tuple(wall.tolist()))
     assert len(wall_orders) == 8
 
@@ -279,7 +276,7 @@ def test_images_are_per_window_and_leave_the_data_alone() -> None:
 
     expected = original.clone()
     expected[256:, :, 0] = 1.0 - original[256:, :, 0]
-    torch.testing.assert_close(image.position, expected)
+    assert_close(image.position, expected)
 
 
 def test_mixed_precision_does_not_round_images() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from simple_models import (
     batch_of,
@@ -20,6 +21,7 @@ from simple_models import (
     train,
 )
 from torch import Tensor
+from torch.testing import assert_close
 
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.frame_model import FrameNetwork, FrameState, FrameWindow
@@ -58,7 +60,9 @@ def recipe_variant(study: MLPStudy) -> str:
 
 
 @pytest.mark.parametrize(
-    "study", MLP_STUDIES, ids=lambda study: f"{study.table}-{study.row}"
+    "study",
+    MLP_STUDIES,
+    ids=lambda study: f"{study.table}-{study.row}",
 )
 def test_parameters_of_the_thesis(study: MLPStudy) -> None:
     """The recipes of Tables 4.2 to 4.5 have as many parameters as the thesis prints."""
@@ -112,7 +116,7 @@ def test_a_step_is_the_equation(activation: str) -> None:
     frames = SCENARIOS[0][:2]
     expected = transcribe_mlp(model, frames.astype(float), activation)
     path = rolled(model, batch_of([frames]), 1)
-    np.testing.assert_allclose(path[:, 0].numpy(), expected, atol=1e-6)
+    assert_allclose(path[:, 0].numpy(), expected, atol=1e-6)
 
 
 def test_the_loss_is_equation_4_16() -> None:
@@ -137,7 +141,7 @@ def test_windows_side_by_side_do_not_see_each_other() -> None:
     windows = [SCENARIOS[0][:2], SCENARIOS[1][:2]]
     together = rolled(model, batch_of(windows), 5)
     alone = [rolled(model, batch_of([window]), 5) for window in windows]
-    torch.testing.assert_close(together, torch.cat(alone), atol=1e-6, rtol=1e-5)
+    assert_close(together, torch.cat(alone), atol=1e-6, rtol=1e-5)
 
 
 def test_a_rollout_uses_the_last_two_frames() -> None:
@@ -162,7 +166,7 @@ def test_a_change_of_nothing_is_persistence() -> None:
         torch.nn.init.zeros_(parameter)
     window = batch_of([SCENARIOS[0][:2]])
     expected = window.position[:, -1:].expand(-1, 3, -1)
-    torch.testing.assert_close(rolled(model, window, 3), expected)
+    assert_close(rolled(model, window, 3), expected)
 
 
 def test_noise_has_the_deviation_of_the_recipe_and_only_in_training() -> None:
@@ -250,7 +254,7 @@ def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     window = first_window()
     expected = transcribe_step(model, as_float64(window.state[0]))
     state = model.next_state(window)[0].detach().numpy()
-    np.testing.assert_allclose(state, expected, atol=1e-5)
+    assert_allclose(state, expected, atol=1e-5)
 
 
 @BOTH
@@ -260,7 +264,7 @@ def test_the_order_of_particles_means_nothing(kind: type[LSTM]) -> None:
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     shuffled = FrameWindow(window.state[:, :, order], window.material)
     state = model.next_state(window)
-    torch.testing.assert_close(state, model.next_state(shuffled), atol=1e-6, rtol=1e-5)
+    assert_close(state, model.next_state(shuffled), atol=1e-6, rtol=1e-5)
 
 
 @BOTH
@@ -325,7 +329,9 @@ def test_the_density_term_compares_maps() -> None:
 )
 @pytest.mark.parametrize("material", [False, True])
 def test_materials_matter_where_the_recipe_asks_for_them(
-    kind: type[FrameNetwork], options: dict[str, Any], material: bool
+    kind: type[FrameNetwork],
+    options: dict[str, Any],
+    material: bool,
 ) -> None:
     """The material is then a fifth input of the network."""
     frames = SCENARIOS[0][:2]
@@ -344,7 +350,10 @@ def test_materials_matter_where_the_recipe_asks_for_them(
     ],
 )
 def test_it_learns_a_rotation(
-    kind: type[FrameNetwork], options: dict[str, Any], steps: int, share: float
+    kind: type[FrameNetwork],
+    options: dict[str, Any],
+    steps: int,
+    share: float,
 ) -> None:
     """A rollout from a new angle is soon far better than standing still."""
     torch.manual_seed(0)
@@ -380,7 +389,9 @@ def count_numbers(model: torch.nn.Module) -> int:
 @pytest.mark.parametrize("split", SPLITS)
 @pytest.mark.parametrize("name", NETWORKS)
 def test_networks_have_recipes_for_every_split(
-    name: str, split: str, size: str
+    name: str,
+    split: str,
+    size: str,
 ) -> None:
     """They have the thesis's form, and mini at most 4 M numbers."""
     recipe = recipe_for(find(name), split, size)

@@ -65,7 +65,9 @@ def draw_motions(seed: int) -> tuple[Motion, Motion]:
     def as_motion(x: NDArray[np.float64], u: NDArray[np.float64]) -> Motion:
         acceleration = u - last_velocity
         return Motion(
-            torch.from_numpy(x), torch.from_numpy(u), torch.from_numpy(acceleration)
+            torch.from_numpy(x),
+            torch.from_numpy(u),
+            torch.from_numpy(acceleration),
         )
 
     predicted = as_motion(position + error + (0.03, -0.02), velocity + error)
@@ -146,7 +148,10 @@ def transcribe_terms(predicted: Motion, target: Motion, p: int) -> dict[str, flo
     ],
 )
 def test_every_term_equals_its_equation_in_numpy(
-    norm: str, p: int, dtype: torch.dtype, tolerance: float
+    norm: str,
+    p: int,
+    dtype: torch.dtype,
+    tolerance: float,
 ) -> None:
     """All six terms, of two windows."""
     predicted, target = draw_motions(0)
@@ -287,7 +292,13 @@ def test_an_oracle_has_no_loss_after_own_steps() -> None:
             assert float(terms[name]) < 2e-5
 
 
-@pytest.mark.parametrize(("recovery", "error"), [(None, 2.0), (4.0, 2.25)])
+@pytest.mark.parametrize(
+    ("recovery", "error"),
+    [
+        (None, 2.0),
+        (4.0, 2.25),
+    ],
+)
 def test_recovery_asks_for_a_share_of_the_gap(
     recovery: float | None, error: float
 ) -> None:
@@ -409,7 +420,11 @@ def test_rollout_losses_pass_gradients_through_all_steps() -> None:
 
 
 @pytest.mark.parametrize(
-    ("symmetry", "is_forced"), [("square", False), ("mirror", True)]
+    ("symmetry", "is_forced"),
+    [
+        ("square", False),
+        ("mirror", True),
+    ],
 )
 def test_training_leaves_the_batch_alone(symmetry: str, is_forced: bool) -> None:
     """Noise and mirror images change no stored bit."""
@@ -485,7 +500,9 @@ def test_weights_of_terms_can_be_chosen() -> None:
 
 @pytest.mark.parametrize("name", ["gns", "supergat"])
 def test_terms_that_count_start_alive(
-    name: str, generated: GenerationResult, unmeasured: Registry
+    name: str,
+    generated: GenerationResult,
+    unmeasured: Registry,
 ) -> None:
     """Every term of a recipe's loss starts between 0.01 and 1 on generated data."""
     recipe = recipe_for(find(name), "curl-noise", "tiny")
@@ -497,7 +514,10 @@ def test_terms_that_count_start_alive(
     dataset_info = read_dataset_info("curl-noise", "tiny", **location)
     model = find(name).model.build(recipe.model, dataset_info)
     dataset = WindowDataset(
-        "curl-noise", size="tiny", history=model.history, **location
+        "curl-noise",
+        size="tiny",
+        history=model.history,
+        **location,
     )
     windows = collate([dataset[index] for index in range(0, len(dataset), 4)])
     with torch.no_grad():

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from simple_models import info, rolled
 from torch import Tensor, nn
+from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import (
     Symmetry,
@@ -124,7 +125,7 @@ def test_constant_fields_stay_constant(name: str, cells: int) -> None:
     stencil = grid.stencil(place, layer)
     ones = torch.ones(1, 1, *grid.shape)
     gathered = grid.gather(stencil, ones)
-    torch.testing.assert_close(gathered, torch.ones(200, 1))
+    assert_close(gathered, torch.ones(200, 1))
 
     # Two particles a cell along each axis: B-splines sum to a constant over them.
     axes = []
@@ -147,7 +148,7 @@ def test_constant_fields_stay_constant(name: str, cells: int) -> None:
             density = density.index_select(number, inner)
     assert density.numel()
     expected = torch.full_like(density, 2.0**box.dimension)
-    torch.testing.assert_close(density, expected)
+    assert_close(density, expected)
 
 
 @pytest.mark.parametrize("name", ["square", "cube"])
@@ -188,7 +189,7 @@ def test_gather_is_the_adjoint_of_spread(name: str) -> None:
         gradients += torch.autograd.grad(product, place)
     of_spread, of_gather = products
     assert of_spread == pytest.approx(of_gather, rel=1e-9)
-    torch.testing.assert_close(*gradients)
+    assert_close(*gradients)
 
 
 @pytest.mark.parametrize("name", ["square", "oblong", "cube"])
@@ -209,7 +210,7 @@ def test_a_shift_by_a_cell_shifts_the_fields(name: str) -> None:
     shift = np.array(steps) * grid.cell.numpy()
     moved = density(place + shift)
     expected = density(place).roll(steps, axes)
-    torch.testing.assert_close(moved, expected, rtol=0, atol=2e-5)
+    assert_close(moved, expected, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["square", "oblong", "cube", "channel"])
@@ -260,14 +261,20 @@ def test_images_of_the_cube_are_a_group() -> None:
     assert len(distinct) == 48
     products = torch.einsum("aij,bjk->abik", images, images).flatten(0, 1)
     assert torch.equal(products.unique(dim=0), distinct)
-    torch.testing.assert_close(images[0], torch.eye(3))
+    assert_close(images[0], torch.eye(3))
     mirrors = mirror_matrices(Symmetry.MIRROR, 3)
     up = torch.tensor([0.0, 1.0, 0.0])
     assert len(mirrors) == 4
     assert torch.equal(mirrors[:, 1], up.expand(4, 3))
 
 
-@pytest.mark.parametrize(("name", "number"), [("cube", 19), ("room", 30)])
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("cube", 19),
+        ("room", 30),
+    ],
+)
 def test_the_mirror_average_has_the_symmetry_of_the_cube(
     name: str, number: int
 ) -> None:
@@ -318,13 +325,13 @@ def test_windows_are_shifted_along_periodic_axes_only() -> None:
     moved = shift_batch(both, box, torch.Generator().manual_seed(0))
     way = box.displacement(both.position, moved.position)
     assert moved.origin is not None
-    torch.testing.assert_close(moved.origin, moved.position[:, 0])
+    assert_close(moved.origin, moved.position[:, 0])
     assert float(way[..., 1].abs().max()) == 0.0
     first = way[:300, :, 0]
     second = way[300:, :, 0]
     for ways in (first, second):
         shift = ways[:1, :1].expand_as(ways)
-        torch.testing.assert_close(ways, shift, rtol=0, atol=1e-6)
+        assert_close(ways, shift, rtol=0, atol=1e-6)
     difference = first[0, 0] - second[0, 0]
     assert abs(float(difference)) > 1e-3
 

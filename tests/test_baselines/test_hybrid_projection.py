@@ -69,7 +69,9 @@ def moving_lid(frames: int) -> NDArray[np.float64]:
 
 
 def batch_of(
-    path: NDArray[np.float64], walls: NDArray[np.float64], viscosity: float | None
+    path: NDArray[np.float64],
+    walls: NDArray[np.float64],
+    viscosity: float | None,
 ) -> Batch:
     """Return one window of liquid."""
     window = TensorWindow(
@@ -130,7 +132,12 @@ def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
 
 def test_a_fit_finds_a_damping_that_the_data_show() -> None:
     """A vortex that fades faster than its viscosity says gets a greater one."""
-    options = {"resolution": 1.0, "frames": 10, "evaluations": 30, "numerical": False}
+    options = {
+        "resolution": 1.0,
+        "frames": 10,
+        "evaluations": 30,
+        "numerical": False,
+    }
     model = HybridProjection.build(options, cavity_info())
     path = turning(20, decay=0.06)
     window = batch_of(path, np.zeros((20, 4, 2)), 1e-3)

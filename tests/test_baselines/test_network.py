@@ -11,6 +11,7 @@ import pytest
 import torch
 from simple_models import OPERATORS, graph
 from torch import Tensor, nn
+from torch.testing import assert_close
 
 from lagbench.baselines import network as layers
 from lagbench.baselines.network import (
@@ -42,7 +43,10 @@ def network(operator: type[Operator], **options: Any) -> EncodeProcessDecode:
 
 
 def apply_to_concatenation(
-    layer: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor
+    layer: EdgeMLP,
+    edge: Tensor,
+    node: Tensor,
+    edge_index: Tensor,
 ) -> Tensor:
     """Return the MLP of the concatenation [edge, receiver, sender]."""
     sender, receiver = edge_index
@@ -65,7 +69,10 @@ def test_products_per_node_give_the_mlp_of_the_concatenation() -> None:
     node, edge_index, edge = graph(200, 1600, node=128, edge=128)
     update = layer(edge, node, edge_index)
     expected = apply_to_concatenation(
-        layer.double(), edge.double(), node.double(), edge_index
+        layer.double(),
+        edge.double(),
+        node.double(),
+        edge_index,
     )
     assert largest_relative_error(update, expected) < 6e-7
 
@@ -78,7 +85,9 @@ def test_products_per_node_give_the_mlp_of_the_concatenation() -> None:
     ],
 )
 def test_recomputed_hidden_layers_give_the_same_gradients(
-    monkeypatch: pytest.MonkeyPatch, mixed: bool, tolerance: float
+    monkeypatch: pytest.MonkeyPatch,
+    mixed: bool,
+    tolerance: float,
 ) -> None:
     """They give the same values too, as hidden layers that stay in memory."""
     torch.manual_seed(0)
@@ -186,13 +195,11 @@ def test_a_layer_is_the_interaction_network_node_by_node() -> None:
     new_node, new_edge, _ = layer(node, inputs.edge_index, edge)
 
     message = apply_to_concatenation(layer.message, edge, node, inputs.edge_index)
-    torch.testing.assert_close(new_edge, edge + message, rtol=1e-10, atol=1e-10)
+    assert_close(new_edge, edge + message, rtol=1e-10, atol=1e-10)
     for i in range(6):
         total = message[receiver == i].sum(dim=0)
         update = layer.update(torch.cat([node[i], total]))
-        torch.testing.assert_close(
-            new_node[i], node[i] + update, rtol=1e-10, atol=1e-10
-        )
+        assert_close(new_node[i], node[i] + update, rtol=1e-10, atol=1e-10)
 
 
 @EVERY
@@ -276,7 +283,7 @@ def test_windows_side_by_side(operator: type[Operator]) -> None:
     first_prediction, _ = model(*first)
     second_prediction, _ = model(*second)
     expected = torch.cat([first_prediction, second_prediction])
-    torch.testing.assert_close(together, expected, rtol=1e-5, atol=1e-5)
+    assert_close(together, expected, rtol=1e-5, atol=1e-5)
 
 
 @EVERY
@@ -383,4 +390,4 @@ def test_compiled_layers_give_the_same_gradients(operator: type[Operator]) -> No
     for edges in (500, 731):
         expected = compute_output_and_gradients(plain, edges)
         values = compute_output_and_gradients(compiled, edges)
-        torch.testing.assert_close(values, expected, rtol=1e-4, atol=1e-5)
+        assert_close(values, expected, rtol=1e-4, atol=1e-5)

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from pydantic import ValidationError
 from simple_models import batch, info, jittered, rolled, swirl
 from torch import Tensor, nn
+from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import Symmetry, mirror_batch, mirror_matrices
 from lagbench.baselines.baseline import Batch
@@ -60,7 +62,9 @@ def liquid(*windows: NDArray[np.float64]) -> Batch:
 
 
 def move_straight(
-    position: NDArray[np.float64], velocity: NDArray[np.float64], frames: int = 3
+    position: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    frames: int = 3,
 ) -> NDArray[np.float64]:
     """Return frames of particles at constant velocity, shape [frame, particle, 2]."""
     time = np.arange(frames)[:, None, None]
@@ -68,7 +72,9 @@ def move_straight(
 
 
 def drift(
-    speed: tuple[float, float], frames: int, seed: int = 0
+    speed: tuple[float, float],
+    frames: int,
+    seed: int = 0,
 ) -> NDArray[np.float64]:
     """Return a cloud that moves as one, shape [frame, particle, 2]."""
     cloud = jittered(seed, low=0.35, high=0.65)
@@ -90,7 +96,7 @@ def test_untrained_models_keep_every_velocity() -> None:
     predicted = rolled(model, batch(window), 20).diff(dim=1)
     last_velocity = torch.from_numpy(window[1] - window[0]).float()
     expected = last_velocity[:, None].expand(-1, 19, -1)
-    torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-6)
+    assert_close(predicted, expected, rtol=0, atol=1e-6)
 
 
 def test_smoothing_keeps_the_energy_of_a_uniform_flow() -> None:
@@ -98,7 +104,7 @@ def test_smoothing_keeps_the_energy_of_a_uniform_flow() -> None:
     path = rolled(surrogate(smoothing=0.2), window, 40)
     velocity = path.diff(dim=1).double()
     energy = velocity.square().sum(dim=2).mean(dim=0)
-    np.testing.assert_allclose(energy.numpy(), 2e-5, rtol=2e-3)
+    assert_allclose(energy.numpy(), 2e-5, rtol=2e-3)
 
 
 def test_smoothing_damps_what_the_grid_does_not_see() -> None:
@@ -146,9 +152,7 @@ def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     _, frames = model.call(model.start(window))
     first_position, _ = frames[0]
     second_position, second_velocity = frames[1]
-    torch.testing.assert_close(
-        second_position - first_position, second_velocity, rtol=0, atol=2e-7
-    )
+    assert_close(second_position - first_position, second_velocity, rtol=0, atol=2e-7)
 
 
 @pytest.mark.parametrize("conserve", [False, True])
@@ -159,7 +163,7 @@ def test_windows_side_by_side_do_not_see_each_other(conserve: bool) -> None:
 
     together = rolled(model, batch(*windows, walls=True), 5)
     alone = [rolled(model, batch(window, walls=True), 5) for window in windows]
-    torch.testing.assert_close(together, torch.cat(alone), rtol=0, atol=1e-6)
+    assert_close(together, torch.cat(alone), rtol=0, atol=1e-6)
 
 
 def test_training_unrolls_the_rollout() -> None:
@@ -215,7 +219,13 @@ def test_recovery_asks_for_the_way_back(speed: float) -> None:
     assert loss == pytest.approx(expected, rel=1e-2)
 
 
-@pytest.mark.parametrize("projected", [{}, PROJECTED])
+@pytest.mark.parametrize(
+    "projected",
+    [
+        {},
+        PROJECTED,
+    ],
+)
 def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> None:
     """Two materials push each other apart, and their mean goes on and falls."""
     model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True, **projected)
@@ -235,7 +245,7 @@ def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> 
         ]
     )
     mean = velocity.mean(dim=0).numpy()
-    np.testing.assert_allclose(mean, expected, rtol=0, atol=2e-7)
+    assert_allclose(mean, expected, rtol=0, atol=2e-7)
 
     even_mean = velocity[::2].mean(dim=0)
     odd_mean = velocity[1::2].mean(dim=0)
@@ -332,7 +342,7 @@ def test_the_mirror_average_in_half_precision() -> None:
     window = batch(swirl(0, 3))
     with torch.autocast("cpu", torch.bfloat16):
         rounded = rolled(model, window, 4)
-    torch.testing.assert_close(rounded, rolled(model, window, 4), rtol=0, atol=1e-4)
+    assert_close(rounded, rolled(model, window, 4), rtol=0, atol=1e-4)
 
 
 def test_without_symmetry_there_is_no_mirror_average() -> None:
@@ -470,7 +480,7 @@ def test_a_known_network_has_a_known_rollout() -> None:
         ]
     )
     expected = velocity_shares.cumsum()[:, None] * np.array([4e-3, -2e-3])
-    np.testing.assert_allclose((path - last).numpy(), expected, rtol=1e-3)
+    assert_allclose((path - last).numpy(), expected, rtol=1e-3)
 
 
 def test_images_roll_out_as_images() -> None:
@@ -486,7 +496,7 @@ def test_images_roll_out_as_images() -> None:
         image = mirror_batch(window, matrix[None], info().bounds)
         expected = (path - 0.5) @ matrix.T + 0.5
         image_path = rolled(model, image, 5)
-        torch.testing.assert_close(image_path, expected, rtol=0, atol=1e-5)
+        assert_close(image_path, expected, rtol=0, atol=1e-5)
 
 
 def test_each_frame_is_driven_by_its_own_walls() -> None:
@@ -629,7 +639,9 @@ def both_grids(*cells: int) -> dict[str, object]:
     ],
 )
 def test_grids_that_stand_first_in_both_models_keep_their_weights(
-    earlier: dict[str, object], later: dict[str, object], shared_count: int
+    earlier: dict[str, object],
+    later: dict[str, object],
+    shared_count: int,
 ) -> None:
     """The other grids start as in a new model; grids left out are dropped."""
     before = surrogate(awake=0.1, **earlier)
@@ -661,4 +673,4 @@ def test_grids_that_stand_first_in_both_models_keep_their_weights(
         if is_per_grid and name in earlier_weights:
             shared = expected[:shared_count]
             expected = torch.cat([shared, new_value[shared_count:]])
-        torch.testing.assert_close(value, expected, rtol=0, atol=0)
+        assert_close(value, expected, rtol=0, atol=0)

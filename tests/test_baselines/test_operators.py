@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from simple_models import OPERATORS, Graph, graph
 from torch_geometric.nn import PointNetConv
@@ -209,7 +210,9 @@ Equation = Callable[[Weights, Array, int, Neighbours], Array]
     ],
 )
 def test_an_operator_is_its_published_equation(
-    operator: type[Operator], equation: Equation, loop: bool
+    operator: type[Operator],
+    equation: Equation,
+    loop: bool,
 ) -> None:
     """The equation sums over neighbours one by one."""
     inputs = small_graph()
@@ -221,7 +224,7 @@ def test_an_operator_is_its_published_equation(
         near = neighbours(inputs, receiver, loop=loop)
         expected.append(equation(weights, x, receiver, near))
     update = compute_update(layer, inputs)
-    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_pointnet_is_that_of_pyg() -> None:
@@ -262,7 +265,7 @@ def test_the_order_of_nodes_and_edges_means_nothing(operator: type[Operator]) ->
     )
     update = compute_update(layer, shuffled)
     expected = compute_update(layer, inputs)[node_order]
-    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("operator", OPERATORS)
@@ -383,6 +386,8 @@ def test_supergat_can_be_copied_after_training() -> None:
     layer(inputs.node.double(), inputs.edge_index, inputs.edge, generator=seeded(0))
     copied = copy.deepcopy(layer)
     for parameter, copied_parameter in zip(
-        layer.parameters(), copied.parameters(), strict=True
+        layer.parameters(),
+        copied.parameters(),
+        strict=True,
     ):
         assert torch.equal(parameter, copied_parameter)

@@ -46,7 +46,12 @@ Predict = Callable[..., PredictionResult]
 
 
 RECIPE = {"name": "curl-noise/tiny", "training": {"seed": 3}}
-UNFINISHED = {"state": "running", "step": 9, "steps": 70, "recipe": RECIPE}
+UNFINISHED = {
+    "state": "running",
+    "step": 9,
+    "steps": 70,
+    "recipe": RECIPE,
+}
 """Log of a training that goes on, with the weights of the fixture."""
 
 
@@ -161,7 +166,9 @@ def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> No
 
 
 def test_the_file_is_valid(
-    run: Predict, generated: GenerationResult, unmeasured: Registry
+    run: Predict,
+    generated: GenerationResult,
+    unmeasured: Registry,
 ) -> None:
     result = run()
     report = examine(result.path, root=generated.root, registry=unmeasured)
@@ -224,7 +231,11 @@ def test_the_search_that_is_timed_is_the_models(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where matter has collapsed, it searches the neighbours that the model hears."""
-    options = {"latent": 4, "layers": 1, "neighbours": 3}
+    options = {
+        "latent": 4,
+        "layers": 1,
+        "neighbours": 3,
+    }
     model = find("gns").model.build(options, tiny_info)
     weights = tmp_path / "weights.pt"
     checkpoint = Checkpoint(
@@ -260,7 +271,10 @@ def test_the_search_that_is_timed_is_the_models(
     ],
 )
 def test_frozen_frames_are_not_timed(
-    run: Predict, monkeypatch: pytest.MonkeyPatch, batch: int, seconds: float
+    run: Predict,
+    monkeypatch: pytest.MonkeyPatch,
+    batch: int,
+    seconds: float,
 ) -> None:
     """With a second per step, 4 of 20 frames before a burst cost 4 s.
 
@@ -441,7 +455,11 @@ def test_a_model_of_any_size_predicts_another_size(
         "validations": [[9, 0.2]],
     }
     result = run(
-        "scaled", start=0.5, info=mini_info, size="tiny", training={"budget": budget}
+        "scaled",
+        start=0.5,
+        info=mini_info,
+        size="tiny",
+        training={"budget": budget},
     )
     assert result.size == "tiny"
     assert result.trained_size == "mini"
@@ -459,7 +477,9 @@ def test_a_model_of_any_size_predicts_another_size(
 
 
 def test_sizes_that_do_not_fit_are_refused(
-    run: Predict, tiny_info: DatasetInfo, mini_info: DatasetInfo
+    run: Predict,
+    tiny_info: DatasetInfo,
+    mini_info: DatasetInfo,
 ) -> None:
     """A model of one size, another frame interval, an unknown size, another version."""
     with pytest.raises(UsageError):
@@ -505,7 +525,9 @@ def test_options_of_a_model_may_change(run: Predict) -> None:
     "setting", ["training.steps=3", "model.explode=1", "model.count=2"]
 )
 def test_options_that_need_other_weights_do_not_change(
-    run: Predict, monkeypatch: pytest.MonkeyPatch, setting: str
+    run: Predict,
+    monkeypatch: pytest.MonkeyPatch,
+    setting: str,
 ) -> None:
     """Nor do those of the training and unknown ones."""
     install(monkeypatch, several=Several)
@@ -568,7 +590,10 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
     ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"],
 )
 def test_only_predictions_are_replaced(
-    run: Predict, tmp_path: Path, name: str, generated: GenerationResult
+    run: Predict,
+    tmp_path: Path,
+    name: str,
+    generated: GenerationResult,
 ) -> None:
     """No weights, no training log, no folder, and no scenario of the same format.
 
@@ -630,7 +655,9 @@ def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     "state", ["running", "interrupted", "failed", "finished", "stopped early"]
 )
 def test_weights_of_an_unfinished_training_are_a_warning(
-    run: Predict, tmp_path: Path, state: str
+    run: Predict,
+    tmp_path: Path,
+    state: str,
 ) -> None:
     """The training log says how far it came.
 
@@ -661,7 +688,9 @@ def test_weights_of_an_unfinished_training_are_a_warning(
     ids=["no JSON", "deep", "wrong types", "another training", "too long"],
 )
 def test_logs_that_are_not_of_these_weights_are_passed_over(
-    run: Predict, tmp_path: Path, content: bytes
+    run: Predict,
+    tmp_path: Path,
+    content: bytes,
 ) -> None:
     """Predictions come without a warning."""
     (tmp_path / "training.json").write_bytes(content)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simple_models import info, jittered
 from torch import Tensor
+from torch.testing import assert_close
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.baselines.projection import (
@@ -70,7 +71,7 @@ def test_rigid_motion_is_left_as_it_is(angle: float) -> None:
     first = body(0)
     moved = rotate(first, angle) + torch.tensor([0.1, -0.2])
     matched = match_shape(first).match(moved)
-    torch.testing.assert_close(matched, moved, rtol=0, atol=1e-9)
+    assert_close(matched, moved, rtol=0, atol=1e-9)
 
 
 def in_space(position: Tensor) -> NDArray[np.float64]:
@@ -102,7 +103,9 @@ def test_clusters_turn_as_scipy_says() -> None:
         x_centre = np.average(x, axis=0, weights=cluster_weight)
         y_centre = np.average(y, axis=0, weights=cluster_weight)
         best, _ = Rotation.align_vectors(
-            y - y_centre, x - x_centre, weights=cluster_weight
+            y - y_centre,
+            x - x_centre,
+            weights=cluster_weight,
         )
         angle = best.as_rotvec()[2]  # in the plane: no other axis
         in_plane = Rotation.from_rotvec([0.0, 0.0, angle])
@@ -123,7 +126,7 @@ def test_shape_matching_keeps_both_momenta_and_restores_the_shape() -> None:
     correction = matched - position
 
     total = correction.sum(dim=0)
-    torch.testing.assert_close(total, torch.zeros(2).double(), rtol=0, atol=1e-9)
+    assert_close(total, torch.zeros(2).double(), rtol=0, atol=1e-9)
     x, y = position.T
     spin = (x * correction[:, 1] - y * correction[:, 0]).sum()
     assert abs(float(spin)) < 1e-9
@@ -142,11 +145,17 @@ def test_a_lone_particle_has_finite_gradients() -> None:
     position = torch.tensor([[0.3, 0.4]], dtype=torch.float64, requires_grad=True)
     matched = match_shape(first).match(position)
     matched.sum().backward()
-    torch.testing.assert_close(matched, position)
+    assert_close(matched, position)
     assert bool(position.grad.isfinite().all())
 
 
-@pytest.mark.parametrize("sides", [(0.875, 0.875), (0.875, 0.31)])
+@pytest.mark.parametrize(
+    "sides",
+    [
+        (0.875, 0.875),
+        (0.875, 0.31),
+    ],
+)
 @pytest.mark.parametrize("cells", [6, 7])
 def test_a_full_box_is_evenly_dense(cells: int, sides: tuple[float, float]) -> None:
     """That includes the walls, where splines lie partly outside.
@@ -168,13 +177,20 @@ def test_a_full_box_is_evenly_dense(cells: int, sides: tuple[float, float]) -> N
     projection = DensityProjection.build(grid, lattice, sample, 1)
     stencil = grid.stencil(lattice, sample)
     density, mass = projection.relative_density(stencil)
-    torch.testing.assert_close(density, torch.ones_like(density), rtol=4e-3, atol=0)
+    assert_close(density, torch.ones_like(density), rtol=4e-3, atol=0)
     assert float(mass.sum()) == pytest.approx(150**2)
     particles_per_cell = (150 * grid.spacing) ** 2 / (width * height)
     assert float(projection.greatest) == pytest.approx(particles_per_cell, rel=4e-3)
 
 
-@pytest.mark.parametrize("shift", [(-0.22, -0.22), (-0.22, 0.0), (0.0, -0.22)])
+@pytest.mark.parametrize(
+    "shift",
+    [
+        (-0.22, -0.22),
+        (-0.22, 0.0),
+        (0.0, -0.22),
+    ],
+)
 def test_the_density_projection_parts_bodies_in_one_place(
     shift: tuple[float, float],
 ) -> None:
@@ -198,7 +214,7 @@ def test_the_density_projection_parts_bodies_in_one_place(
         position = projection.correct(position, FULL_STEP, limit)
 
     centre = in_one_place.mean(dim=0)
-    torch.testing.assert_close(position.mean(dim=0), centre, rtol=0, atol=1e-9)
+    assert_close(position.mean(dim=0), centre, rtol=0, atol=1e-9)
     assert greatest_density[0] > 1.6
     assert greatest_density[-1] < 1.15
 
@@ -243,7 +259,7 @@ def test_each_material_goes_its_share_of_the_way_to_its_shape() -> None:
         matching = ShapeMatching.build(grid, first[members], sample[members], 1)
         now = position[members]
         expected = now + share * (matching.match(now) - now)
-        torch.testing.assert_close(projected[members], expected, rtol=0, atol=1e-6)
+        assert_close(projected[members], expected, rtol=0, atol=1e-6)
 
 
 def test_each_material_has_its_own_density_limit() -> None:
@@ -258,7 +274,7 @@ def test_each_material_has_its_own_density_limit() -> None:
     density = start.densities[0]
     limit = torch.where(material == 1, 1.2, 1.0)
     expected = density.correct(pressed, FULL_STEP, limit)
-    torch.testing.assert_close(model(start, pressed), expected, rtol=0, atol=1e-7)
+    assert_close(model(start, pressed), expected, rtol=0, atol=1e-7)
     one_limit = density.correct(pressed, FULL_STEP, torch.ones_like(limit))
     assert not torch.allclose(expected, one_limit)
 
@@ -276,7 +292,7 @@ def test_windows_side_by_side_do_not_see_each_other() -> None:
         own_first = first[members]
         start = model.start(own_first, material[members], one_window(own_first), 1)
         alone = model(start, position[members])
-        torch.testing.assert_close(together[members], alone, rtol=0, atol=1e-6)
+        assert_close(together[members], alone, rtol=0, atol=1e-6)
 
 
 def test_only_jelly_and_rope_come_back_to_their_shape() -> None:

@@ -23,7 +23,11 @@ Search = Callable[..., Tensor]
 
 
 def search_by_torch(
-    position: Tensor, radius: float, sample: Tensor | None, *, self_edges: bool
+    position: Tensor,
+    radius: float,
+    sample: Tensor | None,
+    *,
+    self_edges: bool,
 ) -> Tensor:
     """Search by the operations that a GPU runs."""
     if sample is None:
@@ -36,12 +40,17 @@ def search_by_torch(
 
 
 BOTH = pytest.mark.parametrize(
-    "search", [radius_graph, search_by_torch], ids=["numpy", "torch"]
+    "search",
+    [radius_graph, search_by_torch],
+    ids=["numpy", "torch"],
 )
 
 
 def brute_force(
-    x: Floats, radius: float, sample: Any = None, self_edges: bool = False
+    x: Floats,
+    radius: float,
+    sample: Any = None,
+    self_edges: bool = False,
 ) -> NDArray[np.int64]:
     """Compare every pair; return [sender, receiver] by receiver, then by sender."""
     with np.errstate(invalid="ignore", over="ignore"):
@@ -200,7 +209,9 @@ def test_diverged_particles_have_no_wrong_edge(search: Search) -> None:
 )
 @settings(max_examples=60, deadline=None)
 def test_any_lattice_points(
-    search: Search, cells: NDArray[np.int8], steps: int
+    search: Search,
+    cells: NDArray[np.int8],
+    steps: int,
 ) -> None:
     """Points of a lattice, many together, and radii that are multiples of its step."""
     x = (cells / 16).astype(np.float32)
@@ -242,7 +253,10 @@ def test_positions_may_have_gradients_and_any_precision() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused(
-    position: Tensor, radius: float, sample: Tensor | None, words: str
+    position: Tensor,
+    radius: float,
+    sample: Tensor | None,
+    words: str,
 ) -> None:
     """Wrong shapes, a radius that is none and windows out of order are errors."""
     with pytest.raises(UsageError, match=words):

@@ -176,7 +176,12 @@ def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
     assert plain.training.epochs is None
     assert plain.training.batch == 4
     long = recipe_for(
-        entry, "cavity", "tiny", variant="long", settings=["training.batch=9"], seed=5
+        entry,
+        "cavity",
+        "tiny",
+        variant="long",
+        settings=["training.batch=9"],
+        seed=5,
     )
     assert plain.model["start"] == 0.5
     assert long.model["start"] == 2.0
@@ -351,7 +356,9 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
     ],
 )
 def test_mistakes_in_settings(
-    entry: CatalogueEntry, setting: str, message: str
+    entry: CatalogueEntry,
+    setting: str,
+    message: str,
 ) -> None:
     """A wrong setting is a usage error that names key and remedy."""
     with pytest.raises(UsageError, match=message):
@@ -417,7 +424,10 @@ def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_in_files(
-    entry: CatalogueEntry, tmp_path: Path, text: str, message: str
+    entry: CatalogueEntry,
+    tmp_path: Path,
+    text: str,
+    message: str,
 ) -> None:
     """A file that is none of recipes is unreadable, and the message says where."""
     path = tmp_path / "wrong.yaml"
@@ -431,7 +441,9 @@ def test_schedules_equal_torch() -> None:
     weight = torch.nn.Parameter(torch.zeros(1))
     optimizer = torch.optim.SGD([weight], lr=1.0)
     cosine = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimizer, T_max=50, eta_min=0.01
+        optimizer,
+        T_max=50,
+        eta_min=0.01,
     )
     ours = Schedule(kind="cosine", floor=0.01)
     decay = Schedule(kind="exponential", factor=0.1, every=20)
@@ -442,7 +454,9 @@ def test_schedules_equal_torch() -> None:
             rel_tol=1e-9,
         )
         assert math.isclose(
-            decay.factor_at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12
+            decay.factor_at(step, steps=50),
+            0.1 ** (step / 20),
+            rel_tol=1e-12,
         )
         optimizer.step()
         cosine.step()

@@ -20,6 +20,7 @@ from simple_models import (
     swirl,
 )
 from torch import Tensor
+from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.operators.gns import GNS
@@ -62,7 +63,7 @@ def test_untrained_models_of_accelerations_keep_velocities() -> None:
     velocity = window.position[:, -1] - window.position[:, -2]
     straight = window.position[:, -1:] + time * velocity[:, None]
     path = rolled(network(), window, 3)
-    torch.testing.assert_close(path, straight, rtol=0.0, atol=3e-7)
+    assert_close(path, straight, rtol=0.0, atol=3e-7)
 
 
 def test_untrained_models_of_velocities_stand_still() -> None:
@@ -90,7 +91,7 @@ def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
     first_step = path[:, 0] - window.position[:, -1]
     assert float(first_step.abs().max()) > 1e-4
     expected = path + torch.from_numpy(shift).float()
-    torch.testing.assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
+    assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
 
 
 def mirror_model(model: Any, axis: int) -> Any:
@@ -146,7 +147,7 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     expected = rolled(model, window, 3)
     expected[..., axis] = 1.0 - expected[..., axis]
     path = rolled(mirror_model(model, axis), image, 3)
-    torch.testing.assert_close(path, expected, rtol=0.0, atol=1e-6)
+    assert_close(path, expected, rtol=0.0, atol=1e-6)
 
     # The weights matter: the model itself does not give the mirror image.
     unmirrored_path = rolled(model, image, 3)
@@ -159,7 +160,7 @@ def test_windows_side_by_side_do_not_see_each_other() -> None:
     windows = [swirl(0, 6), swirl(1, 6)]
     together = rolled(model, batch(*windows), 3)
     alone = [rolled(model, batch(window), 3) for window in windows]
-    torch.testing.assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-6)
+    assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-6)
 
 
 def test_two_frames_are_enough_to_start_from() -> None:
@@ -221,8 +222,8 @@ def test_wall_velocities_become_velocities_per_frame() -> None:
     window.wall_velocity[1] *= 3.0
     wall_velocity = network(wall_velocity=True).start(window).wall_velocity
     expected = torch.arange(1.0, 9.0).reshape(4, 2) / 200
-    torch.testing.assert_close(wall_velocity[0, 0], expected)
-    torch.testing.assert_close(wall_velocity[1], 3.0 * wall_velocity[0])
+    assert_close(wall_velocity[0, 0], expected)
+    assert_close(wall_velocity[1], 3.0 * wall_velocity[0])
 
 
 def test_models_without_wall_velocity_have_none() -> None:
@@ -407,7 +408,7 @@ def test_half_precision_changes_the_loss_by_rounding_only() -> None:
             half = model(window, seeded())
     for name, value in exact.items():
         assert half[name].dtype == torch.float32
-        torch.testing.assert_close(half[name], value, rtol=0.02, atol=0.0)
+        assert_close(half[name], value, rtol=0.02, atol=0.0)
 
 
 def test_scales_are_no_weights() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import (
@@ -63,7 +64,11 @@ def test_edges_are_the_pairs_within_the_radius(name: str, most: int | None) -> N
         near.sort(key=lambda j: distances[j])
         expected |= {(j, i) for j in near[:most]}
     edges = radius_graph(
-        torch.from_numpy(position), radius, torch.from_numpy(sample), most=most, box=box
+        torch.from_numpy(position),
+        radius,
+        torch.from_numpy(sample),
+        most=most,
+        box=box,
     )
     assert set(map(tuple, edges.T.tolist())) == expected
     assert edges.shape[1] == len(expected)
@@ -72,7 +77,7 @@ def test_edges_are_the_pairs_within_the_radius(name: str, most: int | None) -> N
 def test_periodic_axes_have_no_walls() -> None:
     position = torch.tensor([[0.1, 0.1, 0.3]])
     distance = wall_distance(position, BOXES["cube"].bounds, 0.5, (True, False, False))
-    torch.testing.assert_close(distance, torch.tensor([[1.0, 1.0, 0.2, 1.0, 0.6, 1.0]]))
+    assert_close(distance, torch.tensor([[1.0, 1.0, 0.2, 1.0, 0.6, 1.0]]))
 
 
 @pytest.mark.parametrize("symmetry", [Symmetry.MIRROR, Symmetry.SQUARE])
@@ -81,11 +86,11 @@ def test_images_of_the_cube_keep_distances_and_walls(symmetry: Symmetry) -> None
     generator = torch.Generator().manual_seed(0)
     matrix = draw_mirror_matrices(symmetry, 40, generator, dimension=3)
     identity = torch.eye(3).expand(40, 3, 3)
-    torch.testing.assert_close(matrix @ matrix.transpose(1, 2), identity)
+    assert_close(matrix @ matrix.transpose(1, 2), identity)
     images = {tuple(row.flatten().tolist()) for row in matrix}
     assert len(images) == 4 if symmetry is Symmetry.MIRROR else len(images) > 20
     if symmetry is Symmetry.MIRROR:
-        torch.testing.assert_close(matrix[:, 1], identity[:, 1])
+        assert_close(matrix[:, 1], identity[:, 1])
 
     position = torch.rand(40, 2, 3, generator=generator)
     walls = torch.zeros(40, 2, 6, 3)
@@ -101,14 +106,14 @@ def test_images_of_the_cube_keep_distances_and_walls(symmetry: Symmetry) -> None
     image = mirror_batch(batch, matrix, BOXES["cube"].bounds)
     step = (position[:, 1] - position[:, 0]).norm(dim=1)
     image_step = (image.position[:, 1] - image.position[:, 0]).norm(dim=1)
-    torch.testing.assert_close(image_step, step)
+    assert_close(image_step, step)
     assert image.wall_velocity is not None
     for number in range(40):
         top = matrix[number] @ torch.tensor([0.0, 1.0, 0.0])
         axis = int(top.abs().argmax())
         wall = 2 * axis + int(top[axis] > 0.0)
         velocity = matrix[number] @ torch.tensor([1.0, 0.0, 0.0])
-        torch.testing.assert_close(image.wall_velocity[number, 0, wall], velocity)
+        assert_close(image.wall_velocity[number, 0, wall], velocity)
 
 
 def drifting(count: int, pace: float = 1.0) -> NDArray[np.float32]:
@@ -147,7 +152,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     ],
 )
 def test_a_training_and_its_predictions_go_through_the_ends(
-    made: LocalSplit, tmp_path: Path, baseline: str, settings: tuple[str, ...]
+    made: LocalSplit,
+    tmp_path: Path,
+    baseline: str,
+    settings: tuple[str, ...],
 ) -> None:
     """Untrained, both models keep the velocity: here that is the truth."""
     run = tmp_path / "run"
@@ -180,7 +188,9 @@ def test_a_training_and_its_predictions_go_through_the_ends(
     ],
 )
 def test_networks_of_whole_frames_train_on_equal_scenarios(
-    tmp_path: Path, baseline: str, settings: tuple[str, ...]
+    tmp_path: Path,
+    baseline: str,
+    settings: tuple[str, ...],
 ) -> None:
     """Their weights belong to places of a frame; positions stay in the period."""
     paths = []
@@ -219,7 +229,9 @@ def test_networks_of_whole_frames_train_on_equal_scenarios(
 
 @pytest.mark.parametrize("baseline", ["var"])
 def test_other_models_say_that_they_know_no_such_box(
-    made: LocalSplit, tmp_path: Path, baseline: str
+    made: LocalSplit,
+    tmp_path: Path,
+    baseline: str,
 ) -> None:
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(RECIPE)

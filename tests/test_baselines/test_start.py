@@ -76,13 +76,20 @@ def run(
 ) -> Run:
     """Train on tiny curl-noise data."""
     return trainer(
-        generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift, any=AnySize
+        generated.root,
+        unmeasured,
+        tmp_path,
+        monkeypatch,
+        drift=Drift,
+        any=AnySize,
     )
 
 
 @pytest.fixture
 def stored(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
 ) -> Callable[..., Path]:
     """Store weights of a made-up training; ``info`` change those of the data."""
 
@@ -187,7 +194,9 @@ def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) 
 
 
 def test_what_came_before_is_told(
-    run: Run, stored: Callable[..., Path], tmp_path: Path
+    run: Run,
+    stored: Callable[..., Path],
+    tmp_path: Path,
 ) -> None:
     """Hours are with those of the start, other figures are not; words and record name
     the weights.

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from simple_models import batch, info, jittered
 from torch import Tensor
 
@@ -52,9 +53,9 @@ def test_affine_motion_has_the_strain_of_its_matrix(
     (xx, xy), (_, yy) = 0.5 * (f @ f.T - np.eye(2))
     expected = np.tanh(np.array([xx, xy, yy]) / UNIT)
     everywhere = np.tile(expected, (len(first), 1))
-    np.testing.assert_allclose(strain.numpy(), everywhere, rtol=0, atol=0.05)
+    assert_allclose(strain.numpy(), everywhere, rtol=0, atol=0.05)
     mean = strain.mean(dim=0).numpy()
-    np.testing.assert_allclose(mean, expected, rtol=0, atol=0.02)
+    assert_allclose(mean, expected, rtol=0, atol=0.02)
 
 
 def test_strain_under_autocast_has_the_same_bits() -> None:

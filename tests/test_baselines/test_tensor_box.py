@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 from lagbench.data.box import Box
 from lagbench.tensors import TensorBox
@@ -28,7 +29,7 @@ def test_ways_are_those_of_the_box_of_arrays(box: Box) -> None:
     end = draw_points(box, 1)
     way = TensorBox(box).displacement(start, end).numpy()
     expected = box.displacement(start.numpy(), end.numpy())
-    np.testing.assert_allclose(way, expected, atol=1e-6)
+    assert_allclose(way, expected, atol=1e-6)
 
 
 @EVERY_BOX
@@ -37,7 +38,7 @@ def test_points_inside_are_those_of_the_box_of_arrays(box: Box) -> None:
     inside = TensorBox(box).inside(points).numpy()
     assert box.contains(inside, tolerance=1e-6).all()
     gap = box.displacement(box.inside(points.numpy()), inside)
-    np.testing.assert_allclose(gap, 0.0, atol=1e-6)
+    assert_allclose(gap, 0.0, atol=1e-6)
 
 
 def test_between_walls_the_bits_are_those_of_a_clamp_and_a_difference() -> None:

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.testing import assert_close
 
 from lagbench.baselines import torch_grid
 from lagbench.baselines.particle_grid import ParticleGrid
@@ -25,7 +27,10 @@ FIELD_NAMES = ("weight", "velocity", "density", "vorticity", "divergence")
 
 
 def draw_particles(
-    *shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0
+    *shape: int,
+    seed: int = 0,
+    low: float = 0.0,
+    high: float = 1.0,
 ) -> tuple[Any, Any]:
     """Return positions and velocities of shape [..., 2] in float64."""
     rng = np.random.default_rng(seed)
@@ -60,7 +65,9 @@ def compute_fields(
 
 
 def compare_fields(
-    fields: torch_grid.Fields, expected: reference.Fields, tolerance: float
+    fields: torch_grid.Fields,
+    expected: reference.Fields,
+    tolerance: float,
 ) -> None:
     """Compare every field with the scorer's.
 
@@ -73,7 +80,7 @@ def compare_fields(
         field = getattr(fields, name).numpy()
         truth = np.nan_to_num(getattr(expected, name))
         scale = np.abs(truth).max()
-        np.testing.assert_allclose(field, truth, rtol=0, atol=tolerance * scale)
+        assert_allclose(field, truth, rtol=0, atol=tolerance * scale)
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
@@ -85,7 +92,9 @@ def compare_fields(
     ],
 )
 def test_fields_are_those_of_the_scorer(
-    grid: Grid, dtype: torch.dtype, tolerance: float
+    grid: Grid,
+    dtype: torch.dtype,
+    tolerance: float,
 ) -> None:
     """Some of the particles lie at the walls and beyond them."""
     position, velocity = draw_particles(2, 3, 500, low=-0.02, high=1.02)
@@ -130,12 +139,8 @@ def test_windows_side_by_side_are_as_alone() -> None:
     for window, end in enumerate(np.cumsum(counts)):
         members = slice(end - counts[window], end)
         alone = reference.fields(position[members], velocity[members], grid, full=full)
-        np.testing.assert_allclose(
-            fields.velocity[window].numpy(), alone.velocity, atol=1e-15
-        )
-        np.testing.assert_allclose(
-            fields.weight[window].numpy(), alone.weight, atol=1e-12
-        )
+        assert_allclose(fields.velocity[window].numpy(), alone.velocity, atol=1e-15)
+        assert_allclose(fields.weight[window].numpy(), alone.weight, atol=1e-12)
 
     # The number of windows follows from the samples.
     sums = torch_grid.transfer(position_tensor, velocity_tensor, grid, sample=sample)
@@ -192,13 +197,13 @@ def test_weight_and_momentum_are_conserved() -> None:
 
     sums = torch_grid.transfer(position, velocity, Grid(8))
     mass = sums.weight.sum()
-    torch.testing.assert_close(mass, torch.tensor(30.0, dtype=torch.float64))
+    assert_close(mass, torch.tensor(30.0, dtype=torch.float64))
 
     total = mass + sums.momentum.sum()
     position_gradient, velocity_gradient = torch.autograd.grad(
         total, (position, velocity)
     )
-    torch.testing.assert_close(velocity_gradient, torch.ones_like(velocity))
+    assert_close(velocity_gradient, torch.ones_like(velocity))
     assert float(position_gradient.abs().max()) < 1e-12
 
 
@@ -218,7 +223,7 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
     position.requires_grad_()
     velocity.requires_grad_()
     fields = compute_fields(position, velocity, grid, full=2.0)
-    torch.testing.assert_close(fields.velocity, expected.velocity)
+    assert_close(fields.velocity, expected.velocity)
 
     loss = fields.vorticity.square().sum() + fields.density.square().sum()
     loss.backward()
@@ -258,7 +263,10 @@ OBLONG_BOX = ((0.1, 0.9), (0.2, 0.5))
 
 
 def draw_cloud(
-    particles: int, seed: int = 0, low: float = 0.0625, high: float = 0.9375
+    particles: int,
+    seed: int = 0,
+    low: float = 0.0625,
+    high: float = 0.9375,
 ) -> Tensor:
     """Return random places in a square box, some of them on its walls and corners."""
     rng = np.random.default_rng(seed)
@@ -290,7 +298,7 @@ def test_weights_are_a_partition_of_unity(
     stencil = grid.stencil(place, one_window(500))
 
     assert float(stencil.weight.min()) >= 0.0
-    torch.testing.assert_close(stencil.weight.sum(dim=1), torch.ones(500))
+    assert_close(stencil.weight.sum(dim=1), torch.ones(500))
     assert int(stencil.node.min()) >= 0
     assert int(stencil.node.max()) < grid.shape[0] * grid.shape[1]
     sums = grid.spread(stencil, torch.ones(500, 1), 1)
@@ -301,7 +309,7 @@ def test_weights_are_a_partition_of_unity(
     plane = 2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y
     gathered = grid.gather(stencil, plane[None, None])[:, 0]
     expected = 2.0 + 3.0 * x - 5.0 * y
-    torch.testing.assert_close(gathered, expected, rtol=0, atol=1e-5)
+    assert_close(gathered, expected, rtol=0, atol=1e-5)
 
 
 def test_spread_is_the_scorers_transfer() -> None:
@@ -319,8 +327,8 @@ def test_spread_is_the_scorers_transfer() -> None:
     momentum = inner[1:].permute(1, 2, 0)
 
     expected = transfer(place.numpy(), velocity.numpy(), Grid(16))
-    np.testing.assert_allclose(weight, expected.weight, atol=2e-5)
-    np.testing.assert_allclose(momentum, expected.momentum, atol=2e-5)
+    assert_allclose(weight, expected.weight, atol=2e-5)
+    assert_allclose(momentum, expected.momentum, atol=2e-5)
 
 
 def test_gather_is_the_adjoint_of_spread() -> None:
@@ -343,7 +351,7 @@ def test_gather_is_the_adjoint_of_spread() -> None:
     first = layer == 0
     first_stencil = grid.stencil(place[first], layer[first])
     alone = grid.spread(first_stencil, value[first], 1)
-    torch.testing.assert_close(spread[:1], alone)
+    assert_close(spread[:1], alone)
 
 
 def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
@@ -367,7 +375,9 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     slopes = []
     for node in range(9):
         (slope,) = torch.autograd.grad(
-            weight[:, node].sum(), variable, retain_graph=True
+            weight[:, node].sum(),
+            variable,
+            retain_graph=True,
         )
         slopes.append(slope)
 
@@ -377,14 +387,14 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     columns, rows = grid.shape
     expected = torch.zeros(2 * columns * rows, 3, 2)
     expected.index_add_(0, stencil.node, pull.flatten(0, 1))
-    torch.testing.assert_close(force, expected, rtol=0, atol=2e-5)
+    assert_close(force, expected, rtol=0, atol=2e-5)
 
     nodes = torch.cartesian_prod(grid.axis_x, grid.axis_y).repeat(2, 1)
     x, y = nodes.T[..., None]
     moment = (x * force[..., 1] - y * force[..., 0]).sum(0)
     total = force.sum(dim=0)
-    torch.testing.assert_close(total, torch.zeros(3, 2), rtol=0, atol=1e-4)
-    torch.testing.assert_close(moment, torch.zeros(3), rtol=0, atol=1e-4)
+    assert_close(total, torch.zeros(3, 2), rtol=0, atol=1e-4)
+    assert_close(moment, torch.zeros(3), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("swap", [False, True])
@@ -415,7 +425,7 @@ def test_the_image_of_a_transfer_is_the_transfer_of_the_image(
     expected = spread_mass(place).flip(mirrored_axes)
     if swap:
         expected = expected.T
-    torch.testing.assert_close(spread_mass(image), expected, rtol=0, atol=1e-4)
+    assert_close(spread_mass(image), expected, rtol=0, atol=1e-4)
 
 
 def test_walls_lie_between_two_rows_of_nodes() -> None:
@@ -426,7 +436,7 @@ def test_walls_lie_between_two_rows_of_nodes() -> None:
         assert int(beside.sum()) == 2 * grid.shape[wall // 2]
         nearest = distance[wall][beside.bool()].abs()
         half_cell = torch.full_like(nearest, grid.spacing / 2)
-        torch.testing.assert_close(nearest, half_cell)
+        assert_close(nearest, half_cell)
 
 
 def test_positions_without_a_number_gather_no_number() -> None:

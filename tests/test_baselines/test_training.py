@@ -48,7 +48,12 @@ def run(
 ) -> Run:
     """Train on tiny curl-noise data."""
     return trainer(
-        generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift, wrong=Wrong
+        generated.root,
+        unmeasured,
+        tmp_path,
+        monkeypatch,
+        drift=Drift,
+        wrong=Wrong,
     )
 
 
@@ -75,7 +80,9 @@ class Wrong(Drift):
     ],
 )
 def test_a_loss_that_nothing_is_learned_from(
-    run: Run, monkeypatch: pytest.MonkeyPatch, loss: Any
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    loss: Any,
 ) -> None:
     """No dict, no gradient, several numbers, no tensor, no term."""
     monkeypatch.setattr(Wrong, "loss", staticmethod(loss))
@@ -177,7 +184,10 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
     ],
 )
 def test_a_resumed_training_equals_an_uninterrupted_one(
-    run: Run, baseline: str, settings: list[str], tmp_path: Path
+    run: Run,
+    baseline: str,
+    settings: list[str],
+    tmp_path: Path,
 ) -> None:
     """Interrupted twice and resumed, it ends with the same bits."""
     all_settings = ["steps=7", "validate_every=3", "schedule=cosine", *settings]
@@ -207,7 +217,10 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     ],
 )
 def test_a_finished_training_is_not_repeated(
-    run: Run, baseline: str, settings: list[str], steps: int
+    run: Run,
+    baseline: str,
+    settings: list[str],
+    steps: int,
 ) -> None:
     """The same command again changes nothing."""
     first = run(baseline, *settings)
@@ -250,9 +263,18 @@ def test_training_draws_nothing_from_the_callers_generators(run: Run) -> None:
     assert seed_and_draw(train_between=True) == expected
 
 
-@pytest.mark.parametrize("command", [("drift", "steps=2"), ("var",)])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("drift", "steps=2"),
+        ("var",),
+    ],
+)
 def test_a_changed_value_of_train_stops_the_training(
-    run: Run, generated: GenerationResult, tmp_path: Path, command: tuple[str, ...]
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
+    command: tuple[str, ...],
 ) -> None:
     """It is noticed before the first step, although the file states its old hash."""
     shutil.copytree(generated.root, tmp_path / "data")
@@ -314,7 +336,9 @@ def test_a_training_that_stopped_early_is_over(run: Run) -> None:
     ],
 )
 def test_options_that_a_model_cannot_use_are_refused(
-    run: Run, baseline: str, setting: str
+    run: Run,
+    baseline: str,
+    setting: str,
 ) -> None:
     """Layers to compile, steps to average over, links to predict: before it trains."""
     with pytest.raises(UsageError) as caught:
@@ -407,7 +431,11 @@ BATCH = 5
 
 
 def draw_batches(
-    data: WindowDataset, *, first: int = 0, share: float = 0.0, **ranks: int
+    data: WindowDataset,
+    *,
+    first: int = 0,
+    share: float = 0.0,
+    **ranks: int,
 ) -> list[list[int]]:
     """Return the windows of all steps from the first on."""
     sampler = WindowSampler(data, seed=1, **ranks)
@@ -438,7 +466,9 @@ def data(generated: GenerationResult, unmeasured: Registry) -> WindowDataset:
     ],
 )
 def test_batches_are_the_same_from_any_step(
-    data: WindowDataset, ranks: dict[str, int], share: float
+    data: WindowDataset,
+    ranks: dict[str, int],
+    share: float,
 ) -> None:
     batches = draw_batches(data, share=share, **ranks)
     assert {len(batch) for batch in batches} == {BATCH}
@@ -492,7 +522,10 @@ def test_a_share_of_the_windows_are_openings(data: WindowDataset, ranks: int) ->
     ],
 )
 def test_weights_without_a_checkpoint_are_not_replaced(
-    run: Run, steps: int, resume: bool, words: str
+    run: Run,
+    steps: int,
+    resume: bool,
+    words: str,
 ) -> None:
     """The error says whether that training is finished."""
     first = run("drift", "steps=1")
@@ -562,7 +595,9 @@ def test_gravity_allows_no_square_of_images(split: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_symmetry_of_the_box_is_allowed(
-    split: str, symmetry: str, tmp_path: Path
+    split: str,
+    symmetry: str,
+    tmp_path: Path,
 ) -> None:
     """The training then looks for its data, which are not there."""
     settings = (f"model.symmetry={symmetry}",)
@@ -596,7 +631,11 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
     ],
 )
 def test_out_of_memory(
-    run: Run, monkeypatch: pytest.MonkeyPatch, baseline: str, setting: str, lower: str
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    baseline: str,
+    setting: str,
+    lower: str,
 ) -> None:
     """The message says which option to lower.
 

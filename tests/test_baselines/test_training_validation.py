@@ -42,7 +42,10 @@ def run(
 
 
 def validated_on_test(
-    weights: Path, registry: Registry, root: Path, split: str
+    weights: Path,
+    registry: Registry,
+    root: Path,
+    split: str,
 ) -> float:
     """Return what validation says of stored weights when the test subset stands in for
     valid.
@@ -66,14 +69,20 @@ def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
         threads=1,
     )
     card = score(
-        weights.with_name("predictions.nc"), root=root, registry=registry, write=False
+        weights.with_name("predictions.nc"),
+        root=root,
+        registry=registry,
+        write=False,
     )
     return card.scores["submission"][name].mean
 
 
 @pytest.mark.parametrize("baseline", ["gns", "mlp"])
 def test_digits_of_the_scorer_in_a_full_box(
-    run: Run, generated: GenerationResult, unmeasured: Registry, baseline: str
+    run: Run,
+    generated: GenerationResult,
+    unmeasured: Registry,
+    baseline: str,
 ) -> None:
     """On the same scenarios validation and score card have the same vorticity NRMSE, to
     the digit.
@@ -85,7 +94,9 @@ def test_digits_of_the_scorer_in_a_full_box(
 
 
 def test_digits_of_the_scorer_on_the_free_surface(
-    run: Run, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
+    run: Run,
+    unmeasured: Registry,
+    tiny_split: Callable[..., GenerationResult],
 ) -> None:
     """The same for the distance of clouds, although rollouts end where the truth
     rests.
@@ -185,7 +196,9 @@ def test_long_records_are_thinned(run: Run) -> None:
 
 
 def test_fewer_frames_for_tests(
-    run: Run, generated: GenerationResult, unmeasured: Registry
+    run: Run,
+    generated: GenerationResult,
+    unmeasured: Registry,
 ) -> None:
     """`validation_frames` shortens the rollouts, and the metric is that of the shorter
     task.
@@ -193,7 +206,9 @@ def test_fewer_frames_for_tests(
     settings = ("steps=1", "validation_frames=4")
     result = run("drift", *settings)
     task = load_scored_task(
-        unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid"
+        unmeasured.size("curl-noise", "tiny"),
+        generated.root,
+        subset="valid",
     )
     short = replace(task, config=replace(task.config, horizon=4))
     model = Drift.build(

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from simple_models import batch_of, info_of, rolled, rotations, share_of_persistence
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
@@ -101,7 +102,9 @@ def test_coefficients_are_those_of_statsmodels(lags: int, spread: float) -> None
     ],
 )
 def test_the_solution_is_that_of_lapack(
-    frames: int, spread: float, tolerance: float
+    frames: int,
+    spread: float,
+    tolerance: float,
 ) -> None:
     """At condition 5e5 the plain normal equations miss the tolerance.
 
@@ -165,7 +168,10 @@ def test_values_that_are_not_finite_are_refused() -> None:
 
 
 def noisy_orbits(
-    scenarios: int, *, frames: int = 60, particles: int = 6
+    scenarios: int,
+    *,
+    frames: int = 60,
+    particles: int = 6,
 ) -> list[Floats]:
     """Return particles on noisy orbits of changing speed: not exactly linear."""
     rng = np.random.default_rng(5)
@@ -222,7 +228,7 @@ def test_lags_count_from_the_latest_frame() -> None:
     before, last = states[-2:]
     regressors = np.concatenate([[1.0], last, before])
     expected = regressors @ model.coefficients.numpy()
-    np.testing.assert_allclose(next_state, expected, atol=1e-5)
+    assert_allclose(next_state, expected, atol=1e-5)
 
 
 def test_a_model_of_two_lags_starts_from_two_frames() -> None:
@@ -281,7 +287,7 @@ def test_a_heavy_ridge_leaves_persistence() -> None:
     for positions in scenarios:
         changes.append(np.diff(positions[1:].astype(float), axis=0))
     mean_change = np.concatenate(changes).mean(axis=0)
-    np.testing.assert_allclose(step.numpy(), mean_change, atol=1e-6)
+    assert_allclose(step.numpy(), mean_change, atol=1e-6)
 
 
 def test_stable_holds_where_plain_diverges() -> None:
@@ -304,12 +310,14 @@ def test_principal_directions_are_those_of_the_svd() -> None:
     """Leading eigenvalues and the subspace of a decaying spectrum equal LAPACK's."""
     x = series(400, 60, spread=1e-4).astype(float)
     directions, eigenvalues = principal_directions(
-        lambda: np.array_split(x, 3), 60, rank=10
+        lambda: np.array_split(x, 3),
+        60,
+        rank=10,
     )
     _, singular_values, right = np.linalg.svd(x)
-    np.testing.assert_allclose(eigenvalues, singular_values[:10] ** 2, rtol=1e-9)
+    assert_allclose(eigenvalues, singular_values[:10] ** 2, rtol=1e-9)
     overlap = np.abs(directions.T @ right[:10].T)
-    np.testing.assert_allclose(overlap, np.eye(10), atol=1e-6)
+    assert_allclose(overlap, np.eye(10), atol=1e-6)
 
 
 def test_a_forecast_grows_by_its_eigenvalue() -> None:
@@ -328,7 +336,7 @@ def test_a_forecast_grows_by_its_eigenvalue() -> None:
     truth = np.zeros((30, 2), np.float32)
     errors, growth = var_protocol.forecast_errors(coefficients, last, truth)
     frames = np.arange(1, 31)
-    np.testing.assert_allclose(errors, 4.0**frames / 2)
+    assert_allclose(errors, 4.0**frames / 2)
     assert growth == pytest.approx(2.0)
 
     long_truth = np.zeros((600, 2), np.float32)

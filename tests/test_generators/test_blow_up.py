@@ -74,7 +74,10 @@ def first_bad(size: Size, scenarios: tuple[int, ...]) -> tuple[int, int]:
 
 
 def failure(
-    size: Size, scenarios: tuple[int, ...], root: Path, device: Device = Device.CPU
+    size: Size,
+    scenarios: tuple[int, ...],
+    root: Path,
+    device: Device = Device.CPU,
 ) -> WorkFailedError:
     """Return the error that simulating some scenarios ends with."""
     with pytest.raises(WorkFailedError) as caught:
@@ -125,7 +128,9 @@ def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> 
 
 
 def test_a_good_run_loads_its_states_once(
-    unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nothing is replayed where nothing fails."""
     size = unmeasured.size(SPLIT, SIZE)
@@ -144,7 +149,9 @@ def test_a_good_run_loads_its_states_once(
 
 
 def test_a_perturbed_run_is_replayed_with_its_perturbation(
-    copied: Callable[[], Path], unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+    copied: Callable[[], Path],
+    unmeasured: Registry,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A perturbation that is not a number breaks the run, in the replay as well, one
     substep later.
@@ -166,7 +173,9 @@ def test_a_perturbed_run_is_replayed_with_its_perturbation(
 
 
 def test_a_failure_that_does_not_repeat_keeps_its_range(
-    stiff: Size, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stiff: Size,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where the replay passes (a bit that flipped), the range of the first report is
     all there is.
@@ -190,7 +199,9 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
 
 
 def test_a_failed_scenario_leaves_what_was_there(
-    copied: Callable[[], Path], stiff_registry: Registry, tmp_path: Path
+    copied: Callable[[], Path],
+    stiff_registry: Registry,
+    tmp_path: Path,
 ) -> None:
     """Neither file nor manifest of it; files of an earlier generation and their
     manifest stay.

@@ -86,7 +86,9 @@ def test_the_flow_is_that_of_a_staggered_grid() -> None:
     cell = (np.arange(SIZE.grid) + 0.5) / SIZE.grid
     centres = np.stack(np.meshgrid(cell, cell, cell, indexing="ij"), axis=-1)
     truth = grid.at_particles(
-        field, centres.reshape(-1, 3), wall_velocity=state.walls_towards(frames)
+        field,
+        centres.reshape(-1, 3),
+        wall_velocity=state.walls_towards(frames),
     ).reshape(velocity.shape)
     inner = (slice(1, -1),) * 3
     error = np.sqrt(np.mean((velocity - truth)[inner] ** 2))

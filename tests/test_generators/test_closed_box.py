@@ -18,6 +18,7 @@ from box_scenarios import (
     parameters,
     scenario,
 )
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
@@ -27,11 +28,15 @@ from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
 def with_velocity(
-    state: InitialState, velocity: NDArray[np.float64], affine: NDArray[np.float64]
+    state: InitialState,
+    velocity: NDArray[np.float64],
+    affine: NDArray[np.float64],
 ) -> InitialState:
     """Return a state with other velocities, rounded as states must be."""
     return dataclasses.replace(
-        state, velocity=quantise(velocity), affine=quantise(affine)
+        state,
+        velocity=quantise(velocity),
+        affine=quantise(affine),
     )
 
 
@@ -60,9 +65,9 @@ def test_a_regular_lattice_stays_at_rest() -> None:
     """
     state = scenario(NO_SLIP, jitter=0.0)
     result = after(NO_SLIP, [state], 400)
-    np.testing.assert_allclose(result["position"][0], state.position, rtol=0, atol=2e-5)
+    assert_allclose(result["position"][0], state.position, rtol=0, atol=2e-5)
     assert np.abs(result["velocity"]).max() < 2e-5
-    np.testing.assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
+    assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
 
 
 def test_transfers_conserve_momentum() -> None:
@@ -80,14 +85,18 @@ def test_transfers_conserve_momentum() -> None:
     moved = result["velocity"][0].astype(np.float64)
     assert np.abs(moved - state.velocity).max() > 0.05
     tolerance = 1e-6 * np.abs(state.velocity).sum()
-    np.testing.assert_allclose(moved.sum(axis=0), before, rtol=0, atol=tolerance)
+    assert_allclose(moved.sum(axis=0), before, rtol=0, atol=tolerance)
 
 
 def test_a_vortex_decays_as_navier_stokes_says() -> None:
     """The free-slip vortex sin kx cos ky is a solution with amplitude exp(-2 nu k^2
     t).
     """
-    exact = {"velocity_relaxation": 0.0, "density_coupling": 0.002, "shift": 0.002}
+    exact = {
+        "velocity_relaxation": 0.0,
+        "density_coupling": 0.002,
+        "shift": 0.002,
+    }
     constants = parameters(particles=4900, grid=32, dt=2e-3, no_slip=False, **exact)
     state = scenario(constants, seed=2, viscosity=5e-3)
     shape, gradient = cells_of_vortex(constants, state)
@@ -151,7 +160,9 @@ def test_jacobian_stays_near_one() -> None:
 
 
 @pytest.mark.parametrize(
-    "constants", [NO_SLIP, FREE_SLIP], ids=["no slip", "free slip"]
+    "constants",
+    [NO_SLIP, FREE_SLIP],
+    ids=["no slip", "free slip"],
 )
 @pytest.mark.parametrize(
     ("turn", "walls_from"),
@@ -164,7 +175,9 @@ def test_jacobian_stays_near_one() -> None:
     ids=["turned", "flipped"],
 )
 def test_no_direction_is_special(
-    constants: ClosedBoxParameters, turn: list[list[float]], walls_from: tuple[int, ...]
+    constants: ClosedBoxParameters,
+    turn: list[list[float]],
+    walls_from: tuple[int, ...],
 ) -> None:
     """A turned or mirrored box, its moving walls included, evolves into the turned or
     mirrored result.
@@ -189,8 +202,8 @@ def test_no_direction_is_special(
     image = change(dataclasses.replace(state, position=position, velocity=velocity))
     turned_position = turned["position"][0]
     turned_velocity = turned["velocity"][0]
-    np.testing.assert_allclose(turned_position, image.position, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(turned_velocity, image.velocity, rtol=0, atol=5e-5)
+    assert_allclose(turned_position, image.position, rtol=0, atol=1e-5)
+    assert_allclose(turned_velocity, image.velocity, rtol=0, atol=5e-5)
 
 
 def test_displaced_particles_stay_in_the_box() -> None:
@@ -219,11 +232,15 @@ def test_sums_hold_every_particle_in_one_place() -> None:
     )
     state = with_velocity(state, speed * everywhere, 0.0 * state.affine)
     nodes = after(INERT, [state], 1)["grid_velocity"][0]
-    np.testing.assert_allclose(nodes[19:22, 19:22], speed, rtol=1e-6)
+    assert_allclose(nodes[19:22, 19:22], speed, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("device", "scenarios"), [(Device.CPU, 1), (Device.PARALLEL, 2)]
+    ("device", "scenarios"),
+    [
+        (Device.CPU, 1),
+        (Device.PARALLEL, 2),
+    ],
 )
 def test_a_blow_up_is_an_error(device: Device, scenarios: int) -> None:
     """A substep beyond the viscous limit ends in an error that says where, when and

@@ -37,7 +37,10 @@ def _assert_sound(result: ExperimentResult) -> None:
     ),
 )
 def test_cavity_agrees_with_ghia(
-    reynolds: float, substeps: int, u_bound: float, v_bound: float
+    reynolds: float,
+    substeps: int,
+    u_bound: float,
+    v_bound: float,
 ) -> None:
     """RMSE of u and v on the centre lines against Ghia, Ghia & Shin 1982, on 40 x 40
     cells.

@@ -63,7 +63,9 @@ def test_numpy_gives_the_same_bits(
         for name, values in theirs.items():
             assert values.dtype == np.float32
             np.testing.assert_array_equal(
-                snapshot(solver)[name][0], values, err_msg=name
+                snapshot(solver)[name][0],
+                values,
+                err_msg=name,
             )
     low, high = box(constants)
     gaps = [
@@ -88,5 +90,8 @@ def test_averaging_changes_no_bit() -> None:
         frames.append(averaged.grid_velocity().astype(np.float64))
     np.testing.assert_equal(snapshot(averaged), plain)
     np.testing.assert_allclose(
-        averaged.mean_grid_velocity(), np.mean(frames, axis=0), rtol=0, atol=1e-15
+        averaged.mean_grid_velocity(),
+        np.mean(frames, axis=0),
+        rtol=0,
+        atol=1e-15,
     )

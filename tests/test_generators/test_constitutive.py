@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import pytest
 import taichi as ti
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.linalg import polar
 
@@ -43,7 +44,11 @@ def evaluate_scalars(z: Array, exponential: Array, hardening: Array) -> Nothing:
 
 @ti.kernel
 def evaluate(
-    f: Array, turn: Array, stress: Array, elastic: Array, ratio: Array
+    f: Array,
+    turn: Array,
+    stress: Array,
+    elastic: Array,
+    ratio: Array,
 ) -> Nothing:
     """Evaluate rotation, corotated stress and plastic return for every gradient."""
     for i in range(f.shape[0]):
@@ -132,7 +137,7 @@ def test_rotation_is_the_polar_factor() -> None:
     rotations = [polar(m.astype(np.float64))[0] for m in f]
     expected = np.array(rotations)[:, :, 0]
     turn, *_ = models(f)
-    np.testing.assert_allclose(turn, expected, atol=2e-6)
+    assert_allclose(turn, expected, atol=2e-6)
     # A gradient without a direction (all zero, or a pure reflection) gives R = I.
     zero = np.zeros((2, 2))
     reflection = np.diag([1.0, -1.0])
@@ -152,7 +157,7 @@ def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
             shift[entry] = step
             rise = energy(m + shift) - energy(m - shift)
             gradient[entry] = rise / (2.0 * step)
-        np.testing.assert_allclose(tau, gradient @ m.T, atol=1e-4)
+        assert_allclose(tau, gradient @ m.T, atol=1e-4)
 
 
 def test_corotated_stress_ignores_rotation_before_and_follows_rotation_after() -> None:
@@ -162,8 +167,8 @@ def test_corotated_stress_ignores_rotation_before_and_follows_rotation_after() -
     _, stress, *_ = models(f)
     _, turned_after, *_ = models(q @ f)
     _, turned_before, *_ = models(f @ q)
-    np.testing.assert_allclose(turned_after, q @ stress @ q.T, atol=3e-4)
-    np.testing.assert_allclose(turned_before, stress, atol=3e-4)
+    assert_allclose(turned_after, q @ stress @ q.T, atol=3e-4)
+    assert_allclose(turned_before, stress, atol=3e-4)
 
 
 def test_small_strain_is_hookes_law() -> None:
@@ -171,7 +176,7 @@ def test_small_strain_is_hookes_law() -> None:
     strain = np.array([[2.0, 0.5], [0.5, -1.0]]) * 1e-3
     hooke = 2.0 * MU * strain + LAMBDA * np.trace(strain) * np.eye(2)
     _, stress, *_ = models([np.eye(2) + strain])
-    np.testing.assert_allclose(stress[0], hooke, rtol=5e-3, atol=2e-4)
+    assert_allclose(stress[0], hooke, rtol=5e-3, atol=2e-4)
 
 
 def test_plastic_return_clamps_numpys_singular_values() -> None:
@@ -182,8 +187,8 @@ def test_plastic_return_clamps_numpys_singular_values() -> None:
     clamped = np.clip(sigma, LOW, HIGH)
     expected = u @ (clamped[:, :, None] * vt)
     expected_ratio = sigma.prod(1) / clamped.prod(1)
-    np.testing.assert_allclose(elastic, expected, atol=2e-5)
-    np.testing.assert_allclose(ratio, expected_ratio, rtol=2e-5)
+    assert_allclose(elastic, expected, atol=2e-5)
+    assert_allclose(ratio, expected_ratio, rtol=2e-5)
     assert np.isclose(ratio, 1.0).mean() < 0.5
 
 
@@ -193,8 +198,8 @@ def test_plastic_return_leaves_elastic_states_alone() -> None:
     deviation = 2.0 * rng.random((COUNT, 2, 2)) - 1.0
     f = (np.eye(2) + 1e-3 * deviation).astype(np.float32)
     *_, elastic, ratio = models(f)
-    np.testing.assert_allclose(elastic, f, atol=3e-7)
-    np.testing.assert_allclose(ratio, 1.0, atol=5e-7)
+    assert_allclose(elastic, f, atol=3e-7)
+    assert_allclose(ratio, 1.0, atol=5e-7)
 
 
 def test_inverted_snow_stays_finite() -> None:

@@ -140,10 +140,14 @@ def test_log_uniform_follows_its_law() -> None:
 
 
 @given(
-    st.floats(0.0, 1.0, exclude_max=True), st.floats(1e-3, 10.0), st.floats(1.0, 1e4)
+    st.floats(0.0, 1.0, exclude_max=True),
+    st.floats(1e-3, 10.0),
+    st.floats(1.0, 1e4),
 )
 def test_log_uniform_agrees_with_extended_precision(
-    u: float, low: float, ratio: float
+    u: float,
+    low: float,
+    ratio: float,
 ) -> None:
     """It is the 80-bit result of low (high/low)^u to one unit in the last place."""
     least = np.longdouble(low)

@@ -44,7 +44,11 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
     states = [
         scenario(constants, seed=4, speed=0.4, walls=(left, right, bottom, top)),
         scenario(
-            constants, seed=5, speed=0.4, walls=(0.0, 0.0, 0.0, top), viscosity=3e-3
+            constants,
+            seed=5,
+            speed=0.4,
+            walls=(0.0, 0.0, 0.0, top),
+            viscosity=3e-3,
         ),
     ]
     together = after(constants, states, 450, device=Device.PARALLEL, threads=threads)
@@ -61,7 +65,9 @@ def test_threads_lose_no_contribution() -> None:
     everywhere = np.ones_like(state.position)
     crowd = [
         dataclasses.replace(
-            state, position=0.5 * everywhere, velocity=0.25 * everywhere
+            state,
+            position=0.5 * everywhere,
+            velocity=0.25 * everywhere,
         )
     ]
     threaded = after(INERT, crowd, 100, device=Device.PARALLEL, threads=2)
@@ -96,7 +102,9 @@ def test_the_order_of_particles_does_not_matter(device: Device) -> None:
         )
         for name in ("position", "velocity", "jacobian"):
             np.testing.assert_array_equal(
-                straight[name][0][order], mixed[name][copy], err_msg=name
+                straight[name][0][order],
+                mixed[name][copy],
+                err_msg=name,
             )
 
 
@@ -135,7 +143,10 @@ def test_taichi_is_imported_late_and_quietly() -> None:
         "assert 'taichi' in sys.modules\n"
     )
     result = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert result.stdout == ""
 
@@ -200,7 +211,11 @@ names = [name for name in os.environ if name.startswith("TI_")]
 print(sorted(name for name in names if "VERSION" not in name))
 """
 
-HOSTILE = {"TI_ARCH": "vulkan", "TI_OPT_LEVEL": "0", "TI_ADVANCED_OPTIMIZATION": "0"}
+HOSTILE = {
+    "TI_ARCH": "vulkan",
+    "TI_OPT_LEVEL": "0",
+    "TI_ADVANCED_OPTIMIZATION": "0",
+}
 HOSTILE |= {"TI_DEBUG": "1", "TI_DEFAULT_FP": "64"}
 
 
@@ -211,7 +226,12 @@ def started(**variables: str) -> list[str]:
     } | variables
     command = [sys.executable, "-c", START]
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=60, check=True, env=own
+        command,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=own,
     )
     return done.stdout.splitlines()
 

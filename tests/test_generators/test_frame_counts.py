@@ -19,7 +19,10 @@ def _share_left(size: Size, scenario: int) -> float:
     frame.
     """
     job = SimulationJob(
-        size=size, scenarios=(scenario,), root=Path("unused"), device=Device.CPU
+        size=size,
+        scenarios=(scenario,),
+        root=Path("unused"),
+        device=Device.CPU,
     )
     batch = ScenarioBatch(job, lambda _: None, frames=[300])
     energy = [

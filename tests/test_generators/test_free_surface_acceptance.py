@@ -317,7 +317,13 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", [Rectangle(0.22, 0.22), Disc(0.125)])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Rectangle(0.22, 0.22),
+        Disc(0.125),
+    ],
+)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
     """Dropped by 0.45, 25 to 85 % of the snow is compacted and neighbours are torn
@@ -378,7 +384,11 @@ def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("material", "young"), [(Material.ROPE, 150.0), (Material.JELLY, 90.0)]
+    ("material", "young"),
+    [
+        (Material.ROPE, 150.0),
+        (Material.JELLY, 90.0),
+    ],
 )
 def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
     """A free bar swings lengthwise at sqrt(E / (rho (1 - nu^2))) / 2L to 2 %."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenario_draws import draw
 
@@ -46,8 +47,8 @@ def test_noise_repeats_itself_with_exact_derivatives(dimension: int) -> None:
     exact = at(points)
     gradient = slopes(lambda x: at(x).value, points)
     hessian = slopes(lambda x: at(x).gradient, points)
-    np.testing.assert_allclose(exact.gradient, gradient, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(exact.hessian, hessian, rtol=0, atol=1e-2)
+    assert_allclose(exact.gradient, gradient, rtol=0, atol=1e-5)
+    assert_allclose(exact.hessian, hessian, rtol=0, atol=1e-2)
 
 
 def test_a_vortex_ring_is_a_flow_without_divergence() -> None:
@@ -61,7 +62,10 @@ def test_a_vortex_ring_is_a_flow_without_divergence() -> None:
     def at(position: Array) -> Flow:
         return periodic_noise.curl(
             curl_noise_3d.ring_potential(
-                position, centre=centre, normal=normal, radius=0.4
+                position,
+                centre=centre,
+                normal=normal,
+                radius=0.4,
             )
         )
 
@@ -70,12 +74,12 @@ def test_a_vortex_ring_is_a_flow_without_divergence() -> None:
     )
     flow = at(points)
     # curl(n x r) = 2 n
-    np.testing.assert_allclose(flow.velocity[0], 2.0 * normal, rtol=0, atol=1e-12)
+    assert_allclose(flow.velocity[0], 2.0 * normal, rtol=0, atol=1e-12)
     assert not flow.velocity[1].any()
     trace = np.trace(flow.affine, axis1=1, axis2=2)
-    np.testing.assert_allclose(trace, 0.0, rtol=0, atol=1e-12)
+    assert_allclose(trace, 0.0, rtol=0, atol=1e-12)
     numeric = slopes(lambda x: at(x).velocity, points)
-    np.testing.assert_allclose(flow.affine, numeric, rtol=0, atol=1e-4)
+    assert_allclose(flow.affine, numeric, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("split", PERIODIC)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
 from lagbench.generators import curl_noise, draws, noise
@@ -47,7 +48,9 @@ def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
 
 
 def psi_by_hand(
-    position: NDArray[np.float64], lattice: NDArray[np.float64], scale: float
+    position: NDArray[np.float64],
+    lattice: NDArray[np.float64],
+    scale: float,
 ) -> float:
     """The windowed stream function at one point, from its definition."""
     frequency = len(lattice) - 1
@@ -76,7 +79,9 @@ def stream(position: NDArray[np.float64], lattice: NDArray[np.float64]) -> noise
 
 @given(st.lists(NUMBERS, min_size=1, max_size=6), NUMBERS, NUMBERS)
 def test_jets_differentiate_polynomials(
-    coefficients: list[float], x: float, y: float
+    coefficients: list[float],
+    x: float,
+    y: float,
 ) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
     jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
@@ -102,12 +107,12 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     lattice = lattice_of(3)
     node = np.array(list(np.ndindex(4, 4)), dtype=np.float64)
     field = noise.noise(*noise.coordinates(node), lattice)
-    np.testing.assert_allclose(field.value, 0.0, atol=1e-15)
+    assert_allclose(field.value, 0.0, atol=1e-15)
     slope = np.stack([field.x, field.y], -1)
-    np.testing.assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
+    assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
     length = np.hypot(*large.T)
-    np.testing.assert_allclose(length, 1.0, rtol=3e-16)
+    assert_allclose(length, 1.0, rtol=3e-16)
     assert len(np.unique(large, axis=0)) == 14 * 14
 
 
@@ -129,9 +134,9 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
     position = np.stack([t, np.zeros(4)], axis=1)
     along_x, _ = noise.coordinates(position)
     ramp = noise.ramp(along_x)
-    np.testing.assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
-    np.testing.assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(ramp.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
+    assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
+    assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
+    assert_allclose(ramp.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
 
 
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
@@ -149,7 +154,7 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
             above = psi_by_hand(point + offset, lattice, 0.01)
             below = psi_by_hand(point - offset, lattice, 0.01)
             slopes.append((above - below) / (2 * step))
-        np.testing.assert_allclose(term, slopes, atol=2e-9 * frequency)
+        assert_allclose(term, slopes, atol=2e-9 * frequency)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
@@ -166,8 +171,8 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
         before = stream(position - offset, lattice)
         slope_x = (after.x - before.x) / (2 * step)
         slope_y = (after.y - before.y) / (2 * step)
-        np.testing.assert_allclose(along_x, slope_x, atol=tolerance)
-        np.testing.assert_allclose(along_y, slope_y, atol=tolerance)
+        assert_allclose(along_x, slope_x, atol=tolerance)
+        assert_allclose(along_y, slope_y, atol=tolerance)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])

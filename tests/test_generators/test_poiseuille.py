@@ -30,7 +30,10 @@ def mini_solver() -> FullBox:
 
 
 def without_eddies(
-    force: Array, *, viscosity: float, velocity: Array | None = None
+    force: Array,
+    *,
+    viscosity: float,
+    velocity: Array | None = None,
 ) -> InitialState:
     """Return a drawn scenario whose flow is parallel.
 
@@ -97,7 +100,9 @@ def test_a_steady_force_drives_the_parabola() -> None:
     velocity = np.zeros((len(start), 2))
     velocity[:, 0] = 0.7 * parabola(start, acceleration, viscosity)
     state = without_eddies(
-        np.full(2, acceleration), viscosity=viscosity, velocity=velocity
+        np.full(2, acceleration),
+        viscosity=viscosity,
+        velocity=velocity,
     )
     solver = mini_solver()
     solver.load([state])

@@ -61,7 +61,9 @@ def run(root: Path, registry: Path, *options: str) -> int:
 
 
 def test_what_is_recorded_is_what_was_measured(
-    generated: GenerationResult, registry: Path, unmeasured_path: Path
+    generated: GenerationResult,
+    registry: Path,
+    unmeasured_path: Path,
 ) -> None:
     """Hashes, statistics and the mean limit come back; what was written by hand is
     untouched.
@@ -85,7 +87,9 @@ def test_what_is_recorded_is_what_was_measured(
 
 
 def test_statistics_are_computed_anew(
-    copied: Callable[[], Path], registry: Path, generated: GenerationResult
+    copied: Callable[[], Path],
+    registry: Path,
+    generated: GenerationResult,
 ) -> None:
     """What the manifest says about train is not taken on trust."""
     root = copied()
@@ -119,7 +123,11 @@ def test_recording_again_changes_no_byte(
     ]
     places = ["--root", str(generated.root), "--registry", str(registry)]
     done = subprocess.run(
-        [*command, *places], capture_output=True, text=True, check=True, timeout=60
+        [*command, *places],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     assert done.stdout == f"{SPLIT} {SIZE}: {generated.dataset_sha256}\n"
     assert run(generated.root, registry) == 0
@@ -133,7 +141,11 @@ def test_numbers_are_floats_in_any_yaml(generated: GenerationResult) -> None:
     hashes are strings.
     """
     values = measured_values(manifest_of(generated.root))
-    digits = {0: "1234567890123456", 1: "12345e6789012345", 2: "0" * 16}
+    digits = {
+        0: "1234567890123456",
+        1: "12345e6789012345",
+        2: "0" * 16,
+    }
     text = render(
         {SPLIT: {SIZE: values.model_copy(update={"scenario_sha256": digits})}}
     )
@@ -153,7 +165,9 @@ def test_numbers_are_floats_in_any_yaml(generated: GenerationResult) -> None:
 
 
 def test_changed_bits_need_another_version(
-    generated: GenerationResult, registry: Path, capsys: pytest.CaptureFixture[str]
+    generated: GenerationResult,
+    registry: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A hash of the same MAJOR that differs is refused, by the registry and by the
     list, unless allowed.

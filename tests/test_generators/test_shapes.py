@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scenario_draws import neighbours
 
 from lagbench.errors import WorkFailedError
@@ -47,15 +48,15 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
     inside = grid[shape.distance(grid) <= 0.0]
     assert len(inside) * cell**2 == pytest.approx(shape.area, rel=5e-3)
     low = np.negative(shape.reach)
-    np.testing.assert_allclose(inside.max(axis=0), shape.reach, atol=cell)
-    np.testing.assert_allclose(inside.min(axis=0), low, atol=cell)
+    assert_allclose(inside.max(axis=0), shape.reach, atol=cell)
+    assert_allclose(inside.min(axis=0), low, atol=cell)
 
     rng = np.random.Generator(np.random.PCG64(1))
     probes = rng.random((300, 2)) * 1.6 - 0.8
     distance = shape.distance(probes)
     is_outside = distance > 0.0
     gaps, _ = neighbours(probes[is_outside], 1, among=inside)
-    np.testing.assert_allclose(distance[is_outside], gaps[:, 0], atol=1.5 * cell)
+    assert_allclose(distance[is_outside], gaps[:, 0], atol=1.5 * cell)
 
 
 def test_shapes_by_hand() -> None:
@@ -96,8 +97,8 @@ def test_sample_points_have_the_centre_and_spread_of_the_body() -> None:
     moments, axes = np.linalg.eigh(covariance)
     expected = [0.05**2 / 12, 0.65**2 / 12]
     assert moments == pytest.approx(expected, rel=0.03)
-    np.testing.assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
-    np.testing.assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
+    assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
+    assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
     # Two scenarios spread different points in the same body.
     body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
     first = shapes.sample_points(source(0), body, 50)

@@ -133,7 +133,11 @@ def test_bits_do_not_depend_on_vector_instructions() -> None:
     ]
     assert found, "this machine has no vector instructions to do without"
     result = subprocess.run(
-        command, env=plain, capture_output=True, text=True, check=True
+        command,
+        env=plain,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert result.stdout.split() == [digest(state_of(s, z, 3)) for s, z in EVERY]
 

@@ -146,7 +146,13 @@ def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
             assert len(np.unique(knot_speeds)) == len(knots)
 
 
-@pytest.mark.parametrize(("size", "expected"), [("full", 9), ("mini", 6)])
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ("full", 9),
+        ("mini", 6),
+    ],
+)
 def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
     """There the lid rests, then keeps a speed, at the latest in the last given frame;
     train has all walls.

@@ -52,7 +52,11 @@ def other_value(name: str, value: float) -> float:
     """Return another value of a parameter with which bodies can still be drawn."""
     # A gap shows by another verdict on a placement only; a J of liquid below 1 is
     # refused.
-    special = {"gap": 0.1, "gap_cells": 2, "jacobian_max": 1.1}
+    special = {
+        "gap": 0.1,
+        "gap_cells": 2,
+        "jacobian_max": 1.1,
+    }
     if name in special:
         return special[name]
     if isinstance(value, int):
@@ -96,7 +100,10 @@ def test_no_number_in_the_source_decides_bits(module: ModuleType) -> None:
 
 @pytest.mark.parametrize(
     ("split", "kind", "expected"),
-    [("fluid", "family", FAMILIES), ("multimaterial", "pair", PAIRS)],
+    [
+        ("fluid", "family", FAMILIES),
+        ("multimaterial", "pair", PAIRS),
+    ],
 )
 def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None:
     """The id modulo 4 or 6, in the order of Table 4.8, whose 0 and 26 are a rectangle

@@ -7,6 +7,7 @@ import pytest
 import taichi as ti
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from lagbench.generators import backend, transfer
@@ -69,18 +70,18 @@ def test_weights_are_the_quadratic_b_spline() -> None:
     spline = basis(distance)
     expected = spline[:, :, None, 0] * spline[:, None, :, 1]
     weight = rows[:, :, :3]
-    np.testing.assert_allclose(weight, expected, rtol=0, atol=2e-6)
+    assert_allclose(weight, expected, rtol=0, atol=2e-6)
     total = weight.sum(axis=(1, 2))
-    np.testing.assert_allclose(total, 1.0, rtol=0, atol=1e-6)
+    assert_allclose(total, 1.0, rtol=0, atol=1e-6)
     for axis in range(2):
         along = weight.sum(axis=2 - axis)
         offset = distance[:, :, axis]
         first_moment = (along * offset).sum(axis=1)
         second_moment = (along * offset**2).sum(axis=1)
-        np.testing.assert_allclose(first_moment, 0.0, rtol=0, atol=4e-6)
-        np.testing.assert_allclose(second_moment, 0.25, rtol=0, atol=4e-6)
+        assert_allclose(first_moment, 0.0, rtol=0, atol=4e-6)
+        assert_allclose(second_moment, 0.25, rtol=0, atol=4e-6)
         stated_offset = rows[:, axis + 1, 3]
-        np.testing.assert_allclose(stated_offset, -offset[:, 1], rtol=0, atol=1e-6)
+        assert_allclose(stated_offset, -offset[:, 1], rtol=0, atol=1e-6)
 
 
 def test_fixed_point_is_numpys_rint() -> None:

@@ -168,7 +168,11 @@ def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
     ],
 )
 def test_plan_scales_the_full_size(
-    case: Case, grid: int, low: float, particles: int, dt: float
+    case: Case,
+    grid: int,
+    low: float,
+    particles: int,
+    dt: float,
 ) -> None:
     """The box stays within half a cell, dt shrinks with dx, particles per cell stay."""
     reynolds = 400.0 if case is Case.CAVITY else None
@@ -230,7 +234,9 @@ def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
     ],
 )
 def test_plan_refuses_what_cannot_work(
-    case: Case, settings: dict[str, Any], words: str
+    case: Case,
+    settings: dict[str, Any],
+    words: str,
 ) -> None:
     """Every refusal is a usage error that says what is wrong and what was expected."""
     with pytest.raises(UsageError, match=words) as caught:
@@ -345,7 +351,10 @@ def test_validate_curl_noise(tmp_path: Path) -> None:
     ],
 )
 def test_validate_refuses_bad_options(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    words: str,
 ) -> None:
     """Exit code 2, the reason on stderr without a traceback, no file written."""
     assert __main__.main([*_arguments(tmp_path), *options]) == 2

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from box_scenarios import compiled
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from score_bench import ScoreBench, straight
@@ -151,7 +152,9 @@ FULL_BOX = (
     ],
 )
 def test_a_size_has_the_predictors_of_its_kind_of_box(
-    split: str, size: str, names: str
+    split: str,
+    size: str,
+    names: str,
 ) -> None:
     """A user's own split goes by its kind of box; without gravity nothing falls."""
     if split == "own":
@@ -202,7 +205,7 @@ def test_ballistic_flight_is_a_parabola() -> None:
     path[..., 0] += distance[:, None]
     path[..., 1] += height[:, None]
     positions = predicted("ballistic", given("fluid", path[:n]))
-    np.testing.assert_allclose(positions, path[n:], atol=2e-6)
+    assert_allclose(positions, path[n:], atol=2e-6)
 
 
 def test_a_frozen_rotation_stays_a_rotation() -> None:
@@ -223,12 +226,12 @@ def test_a_frozen_rotation_stays_a_rotation() -> None:
     last = positions[-1][is_inner] - centre
     first_radius = np.hypot(*first.T)
     last_radius = np.hypot(*last.T)
-    np.testing.assert_allclose(last_radius, first_radius, rtol=2e-3)
+    assert_allclose(last_radius, first_radius, rtol=2e-3)
     first_angle = np.arctan2(first[:, 1], first[:, 0])
     last_angle = np.arctan2(last[:, 1], last[:, 0])
     expected_turn = scenario.size.task.horizon * angle
     deviation = last_angle - first_angle - expected_turn
-    np.testing.assert_allclose(np.cos(deviation), 1.0, atol=1e-3)
+    assert_allclose(np.cos(deviation), 1.0, atol=1e-3)
 
 
 def test_decay_of_an_exponential() -> None:
@@ -270,7 +273,7 @@ def test_the_mirrored_field_meets_the_wall(wall_speed: float) -> None:
     x = np.linspace(0.3, 0.7, 20)
     at_wall = np.stack([x, np.full(20, high)], axis=1)
     expected_velocity = np.tile(expected, (20, 1))
-    np.testing.assert_allclose(field(at_wall), expected_velocity, atol=1e-12)
+    assert_allclose(field(at_wall), expected_velocity, atol=1e-12)
 
 
 def test_the_field_is_linear_and_has_no_holes() -> None:
@@ -279,11 +282,11 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
     gradient = np.array([[0.1, -0.3], [0.2, 0.05]])
     field = linear_field(points, points @ gradient)
     inside = scattered(50, 0.3, 0.7, seed=1)
-    np.testing.assert_allclose(field(inside), inside @ gradient, atol=1e-12)
+    assert_allclose(field(inside), inside @ gradient, atol=1e-12)
     outside = np.array([[5.0, 5.0]])
     square_distance = np.sum((points - outside) ** 2, axis=1)
     nearest = points[np.argmin(square_distance)]
-    np.testing.assert_allclose(field(outside)[0], nearest @ gradient)
+    assert_allclose(field(outside)[0], nearest @ gradient)
 
 
 @pytest.fixture(autouse=True)
@@ -308,7 +311,7 @@ def test_a_scenario_of_train_is_its_own_analog(bench: ScoreBench) -> None:
     analog, mirror = find_analog(scenario)
     assert analog == number
     assert mirror.axes == ()
-    np.testing.assert_allclose(predicted("analog", scenario), future, atol=1e-5)
+    assert_allclose(predicted("analog", scenario), future, atol=1e-5)
 
 
 def test_a_test_scenario_gets_the_motion_of_one_of_train(bench: ScoreBench) -> None:
@@ -507,7 +510,7 @@ def test_the_coarse_solver_moves_all_particles() -> None:
         assert position.shape == block.shape
         mean_fall = np.mean(block - position, axis=0)
         expected = [0.0, fall_unit * k * (k + 1)]
-        np.testing.assert_allclose(mean_fall, expected, atol=1e-3)
+        assert_allclose(mean_fall, expected, atol=1e-3)
 
 
 def test_an_analog_needs_all_of_train(
@@ -536,7 +539,9 @@ def test_an_analog_needs_all_of_train(
 
 
 @pytest.mark.parametrize(
-    "path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem
+    "path",
+    sorted(FOLDER.glob("*.json")),
+    ids=lambda path: path.stem,
 )
 def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
     """Hash, references, scenarios and ranking metric are those of the file's size."""
@@ -562,7 +567,15 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
     assert best_reference(naive_scores) is not None
 
 
-@pytest.mark.parametrize("axes", [(), (0,), (1,), (0, 1)])
+@pytest.mark.parametrize(
+    "axes",
+    [
+        (),
+        (0,),
+        (1,),
+        (0, 1),
+    ],
+)
 def test_a_mirror_image_of_a_mirror_image_is_the_scenario(
     axes: tuple[int, ...],
 ) -> None:
@@ -572,7 +585,7 @@ def test_a_mirror_image_of_a_mirror_image_is_the_scenario(
     points = scattered(30, 0.1, 0.9)
     image = mirror.positions(points)
     assert box.contains(image).all()
-    np.testing.assert_allclose(mirror.positions(image), points, atol=1e-15)
+    assert_allclose(mirror.positions(image), points, atol=1e-15)
 
     walls = np.random.default_rng(1).normal(size=(5, 4, 2))
     wall_image = mirror.walls(walls)
@@ -597,7 +610,7 @@ def test_the_mirror_image_of_a_scenario_of_train_is_found_and_predicted(
     assert analog == number
     assert reversal.axes == (0,)
     expected = mirror.positions(future)
-    np.testing.assert_allclose(predicted("analog", image), expected, atol=1e-5)
+    assert_allclose(predicted("analog", image), expected, atol=1e-5)
 
 
 def test_two_bodies_touch_when_they_are_a_radius_apart() -> None:

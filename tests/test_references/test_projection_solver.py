@@ -35,7 +35,12 @@ def exact_paths(start: np.ndarray, frames: int) -> np.ndarray:
         return cell_flow(time, state.reshape(-1, 2)).ravel()
 
     solution = solve_ivp(
-        rate, (0.0, times[-1]), start.ravel(), t_eval=times, rtol=1e-9, atol=1e-11
+        rate,
+        (0.0, times[-1]),
+        start.ravel(),
+        t_eval=times,
+        rtol=1e-9,
+        atol=1e-11,
     )
     return np.moveaxis(solution.y, 1, 0).reshape(frames, -1, 2)
 

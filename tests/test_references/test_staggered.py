@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.fft import dct, fft
 
 from lagbench.data.box import Box
@@ -60,7 +61,11 @@ def largest_error(result: Velocity, truth: Velocity) -> float:
 
 
 def cubic_grid(
-    cells: int, *, side: float = 1.0, periodic: bool = False, dimension: int = 2
+    cells: int,
+    *,
+    side: float = 1.0,
+    periodic: bool = False,
+    dimension: int = 2,
 ) -> StaggeredGrid:
     """Return a grid whose axes are alike; fluid slides along its walls."""
     bounds = [(0.0, side)] * dimension
@@ -80,7 +85,10 @@ def taylor_green_error(cells: int, *, periodic: bool, drift: float = 0.0) -> flo
     viscosity = 0.01
     duration = 0.5
     end = grid.advance(
-        start, duration=duration, viscosity=viscosity, wall_velocity=NO_WALLS
+        start,
+        duration=duration,
+        viscosity=viscosity,
+        wall_velocity=NO_WALLS,
     )
     left = np.exp(-2.0 * viscosity * WAVE**2 * duration)
 
@@ -114,7 +122,10 @@ def test_a_beltrami_flow_decays_in_three_dimensions() -> None:
         grid = cubic_grid(cells, side=side, periodic=True, dimension=3)
         start = faces(grid, abc_flow)
         end = grid.advance(
-            start, duration=0.5, viscosity=0.1, wall_velocity=np.zeros((6, 3))
+            start,
+            duration=0.5,
+            viscosity=0.1,
+            wall_velocity=np.zeros((6, 3)),
         )
         truth = [np.exp(-0.05) * values for values in start]
         errors.append(largest_error(end, truth))
@@ -166,8 +177,8 @@ def test_a_driven_channel_comes_to_poiseuille_flow() -> None:
     offset = 0.1 * spacing**2 / (8.0 * viscosity)
     profile = 0.1 * y * (0.5 - y) / (2.0 * viscosity)
     columns = np.tile(profile + offset, (4, 1))
-    np.testing.assert_allclose(flow[0], columns, rtol=1e-6)
-    np.testing.assert_allclose(flow[1], 0.0, atol=1e-12)
+    assert_allclose(flow[0], columns, rtol=1e-6)
+    assert_allclose(flow[1], 0.0, atol=1e-12)
 
 
 def lid_driven(*, cells: int, solid: bool) -> Velocity:
@@ -204,7 +215,7 @@ def test_the_cavity_agrees_with_ghia() -> None:
     flow = lid_driven(cells=cells, solid=False)
     centre = (np.arange(cells) + 0.5) / cells
     profile = np.interp(height, centre, flow[0][cells // 2])
-    np.testing.assert_allclose(profile, u, atol=0.012)
+    assert_allclose(profile, u, atol=0.012)
 
 
 def test_a_thin_periodic_box_is_the_flat_cavity() -> None:
@@ -212,10 +223,8 @@ def test_a_thin_periodic_box_is_the_flat_cavity() -> None:
     solid = lid_driven(cells=10, solid=True)
     for component in range(2):
         for layer in range(2):
-            np.testing.assert_allclose(
-                solid[component][..., layer], flat[component], atol=1e-12
-            )
-    np.testing.assert_allclose(solid[2], 0.0, atol=1e-12)
+            assert_allclose(solid[component][..., layer], flat[component], atol=1e-12)
+    assert_allclose(solid[2], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("bounds", [[(0.0, 1.0)] * 2, [(0.0, 1.0)] * 3])
@@ -245,19 +254,17 @@ def test_modes_are_those_of_scipy_s_transforms() -> None:
     values = rng.normal(size=9)
     cosines, _ = poisson_modes(9, periodic=False)
     expected = dct(values, norm="ortho")
-    np.testing.assert_allclose(cosines @ values, expected)
+    assert_allclose(cosines @ values, expected)
 
     waves, rates = poisson_modes(9, periodic=True)
     power = (waves @ values) ** 2
     wave_power = power[1:].reshape(4, 2).sum(1)
     spectrum = np.abs(fft(values)) ** 2 / 9
-    np.testing.assert_allclose(wave_power, 2.0 * spectrum[1:5])
+    assert_allclose(wave_power, 2.0 * spectrum[1:5])
 
     neighbours = np.roll(values, 1) + np.roll(values, -1)
     second_difference = neighbours - 2.0 * values
-    np.testing.assert_allclose(
-        waves @ second_difference, -rates * (waves @ values), atol=1e-12
-    )
+    assert_allclose(waves @ second_difference, -rates * (waves @ values), atol=1e-12)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -271,13 +278,13 @@ def test_a_linear_field_is_read_and_written_exactly(dimension: int) -> None:
     walls = np.zeros((2 * dimension, dimension))
     velocity = grid.at_particles(field, points, wall_velocity=walls)
     expected = 0.3 + points @ slope
-    np.testing.assert_allclose(velocity, expected, atol=1e-12)
+    assert_allclose(velocity, expected, atol=1e-12)
 
     values = rng.normal(size=(4,) * dimension)
     axes = [np.arange(4.0)] * dimension
     corner = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     at_nodes = interpolate(values, corner.reshape(-1, dimension))
-    np.testing.assert_allclose(at_nodes, values.ravel(), atol=1e-14)
+    assert_allclose(at_nodes, values.ravel(), atol=1e-14)
 
 
 @pytest.mark.parametrize("periodic", [True, False])
@@ -287,11 +294,16 @@ def test_particles_give_back_the_flow_that_they_were_given(periodic: bool) -> No
     rng = np.random.default_rng(3)
     position = rng.uniform(0.0, side, (3000, 2))
     field = grid.from_particles(
-        position, taylor_green(position), wall_velocity=NO_WALLS
+        position,
+        taylor_green(position),
+        wall_velocity=NO_WALLS,
     )
     assert largest_error(field, faces(grid, taylor_green)) < 0.05
     without = grid.from_particles(
-        position, taylor_green(position), wall_velocity=NO_WALLS, corrections=0
+        position,
+        taylor_green(position),
+        wall_velocity=NO_WALLS,
+        corrections=0,
     )
     truth = faces(grid, taylor_green)
     assert largest_error(field, truth) < largest_error(without, truth)
@@ -311,9 +323,13 @@ def test_carried_particles_stay_on_their_streamlines() -> None:
     start = stream(position)
     for _ in range(100):
         position = grid.carry(
-            position, before=field, after=field, duration=0.005, wall_velocity=NO_WALLS
+            position,
+            before=field,
+            after=field,
+            duration=0.005,
+            wall_velocity=NO_WALLS,
         )
-    np.testing.assert_allclose(stream(position), start, atol=0.01)
+    assert_allclose(stream(position), start, atol=0.01)
 
 
 def test_gaps_are_filled_from_their_edges() -> None:
@@ -334,7 +350,7 @@ def test_gaps_are_filled_from_their_edges() -> None:
         [3.0, 5.0, 7.0],
     ]
     filled = fill_gaps(weight * values, weight)
-    np.testing.assert_allclose(filled, expected)
+    assert_allclose(filled, expected)
     nothing = np.zeros_like(weight)
     np.testing.assert_array_equal(fill_gaps(nothing, nothing), 0.0)
 
@@ -349,6 +365,6 @@ def test_layers_are_driven_apart() -> None:
         wall_velocity=np.zeros((4, 2)),
         force=[[0.2, 0.0], [-0.2, 0.0]],
     )
-    np.testing.assert_allclose(u[:, :4], 0.1, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(u[:, 4:], -0.1, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(v, 0.0, rtol=0, atol=1e-12)
+    assert_allclose(u[:, :4], 0.1, rtol=0, atol=1e-12)
+    assert_allclose(u[:, 4:], -0.1, rtol=0, atol=1e-12)
+    assert_allclose(v, 0.0, rtol=0, atol=1e-12)
