@@ -18,8 +18,11 @@ from lagbench.generators.split import FreeSurfaceParameters, InitialState, Mater
 
 Float = np.float32
 Floats = NDArray[np.float32]
+Nodes = NDArray[np.int32]
+Sums = NDArray[np.int64]
 Components = tuple[Floats, Floats, Floats, Floats]
 
+ZERO = Float(0.0)
 ONE = Float(1.0)
 TWO = Float(2.0)
 HALF = Float(0.5)
@@ -28,22 +31,27 @@ WEIGHT_SCALE = 2.0**50
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
     """Lame's constants in float64."""
-    mu = young / (2 * (1 + poisson))
-    la = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    lateral = 1 + poisson
+    compression = 1 - 2 * poisson
+    mu = young / (2 * lateral)
+    la = young * poisson / (lateral * compression)
     return mu, la
 
 
-def fixed(value: Floats, scale: float) -> NDArray[np.int64]:
+def fixed(value: Floats, scale: float) -> Sums:
     """Round to the nearest multiple of 1/scale, ties to even, as an integer."""
-    return np.rint(value.astype(np.float64) * scale).astype(np.int64)
+    exact = value.astype(np.float64) * scale
+    return np.rint(exact).astype(np.int64)
 
 
 def exp(z: Floats) -> Floats:
     """Degree-6 Taylor polynomial of z/16, squared four times."""
     t = z * Float(1 / 16)
     tt = t * t
-    high = (Float(1 / 24) + t * Float(1 / 120)) + tt * Float(1 / 720)
-    e = (ONE + t) + tt * ((HALF + t * Float(1 / 6)) + tt * high)
+    fourth = Float(1 / 24) + t * Float(1 / 120)
+    high = fourth + tt * Float(1 / 720)
+    second = HALF + t * Float(1 / 6)
+    e = (ONE + t) + tt * (second + tt * high)
     for _ in range(4):
         e = e * e
     return e.astype(Float)
@@ -69,8 +77,10 @@ class PolarParts:
         turns = q > Float(1e-6)
         inverse = ONE / np.where(turns, q, ONE)
         cos = np.where(turns, e * inverse, ONE)
-        sin = np.where(turns, g * inverse, Float(0))
-        return cls(q, cos, sin, HALF * (a - d), HALF * (c + b))
+        sin = np.where(turns, g * inverse, ZERO)
+        h = HALF * (a - d)
+        k = HALF * (c + b)
+        return cls(q, cos, sin, h, k)
 
 
 @dataclass
@@ -96,14 +106,15 @@ class Stencil:
         low = HALF * (outer * outer)
         mid = Float(0.75) - middle * middle
         high = HALF * (inner * inner)
-        return cls(base, d, (low, mid, high))
+        weights = (low, mid, high)
+        return cls(base, d, weights)
 
-    def nodes(
-        self,
-    ) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
+    def nodes(self) -> Iterator[tuple[Nodes, Nodes, Floats, Floats, Floats]]:
         """Yield node i, node k, weight and offsets x, y [cells] of the nine nodes."""
         for i, k in np.ndindex(3, 3):
-            weight = self.weights[i][:, 0] * self.weights[k][:, 1]
+            along_x = self.weights[i][:, 0]
+            along_y = self.weights[k][:, 1]
+            weight = along_x * along_y
             offset_x = Float(i) - self.distance[:, 0]
             offset_y = Float(k) - self.distance[:, 1]
             node_i = self.base[:, 0] + i
@@ -114,7 +125,11 @@ class Stencil:
 class FreeSurfaceReference:
     """One scenario of the free-surface solver."""
 
-    def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
+    def __init__(
+        self,
+        parameters: FreeSurfaceParameters,
+        state: InitialState,
+    ) -> None:
         """Start from a state; constants are computed in float64, then rounded once."""
         p = parameters
         self.p = parameters
@@ -122,7 +137,8 @@ class FreeSurfaceReference:
         self.position = state.position.astype(Float)  # [length], shape [particle, 2]
         self.velocity = state.velocity.astype(Float)  # [length/s], shape [particle, 2]
         # C [1/s] and F [1], components (xx, xy, yx, yy) of shape [particle]
-        self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))
+        components = state.affine.reshape(count, 4).T
+        self.affine: Components = tuple(components.astype(Float))
         ones = np.ones(count, Float)
         zeros = np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
@@ -136,23 +152,30 @@ class FreeSurfaceReference:
             Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
         }
         constants = [moduli[Material(m)] for m in state.material]
-        self.mu, self.la = np.array(constants, Float).T
+        mu, la = np.array(constants, Float).T
+        self.mu = mu
+        self.la = la
         damping = np.where(self.snow, 0.0, p.elastic_damping)
         kinematic = np.where(self.liquid, p.liquid_viscosity, damping)
-        self.viscosity = (p.density * kinematic).astype(Float)
+        viscosity = p.density * kinematic
+        self.viscosity = viscosity.astype(Float)
         self.friction = Float(state.friction)
-        self.node_share = Float(state.area / count * p.grid**2)
+        share = state.area / count * p.grid**2
+        self.node_share = Float(share)
         # Velocities up to 64 cells per substep, in 62 bits less those of the particle
         # count.
-        bits = min(50, 62 - (count - 1).bit_length())
-        speed_bits = int(np.ceil(np.log2(64 / (p.grid * p.dt))))
+        count_bits = (count - 1).bit_length()
+        bits = min(50, 62 - count_bits)
+        greatest_speed = 64 / (p.grid * p.dt)
+        speed_bits = int(np.ceil(np.log2(greatest_speed)))
         self.velocity_scale = 2.0 ** (bits - speed_bits)
 
     def advance(self, substeps: int) -> None:
         """Run substeps."""
         for _ in range(substeps):
             stencil = Stencil.at(self.position, self.p.grid)
-            nodes = self.grid_update(self.to_grid(stencil))
+            sums = self.to_grid(stencil)
+            nodes = self.grid_update(sums)
             self.to_particles(stencil, *nodes)
 
     def stress(self) -> tuple[Floats, Floats, Floats]:
@@ -170,21 +193,27 @@ class FreeSurfaceReference:
         square = f.h * f.h + f.k * f.k
         jacobian = f.q * f.q - square
         volumetric = la * (jacobian - ONE) * jacobian
-        mean = TWO * mu * (f.q * (f.q - ONE) + square) + volumetric
+        isotropic = f.q * (f.q - ONE) + square
+        mean = TWO * mu * isotropic + volumetric
         stretch = TWO * mu * (TWO * f.q - ONE)
-        normal = stretch * (f.cos * f.h - f.sin * f.k)
-        xy = stretch * (f.cos * f.k + f.sin * f.h)
+        along = f.cos * f.h - f.sin * f.k
+        across = f.cos * f.k + f.sin * f.h
+        normal = stretch * along
+        xy = stretch * across
         xx = mean + normal
         yy = mean - normal
         pressure = Float(p.liquid_modulus) * (self.ratio - ONE)
         cxx, cxy, cyx, cyy = self.affine
+        elastic_xx = np.where(self.liquid, pressure, xx)
+        elastic_xy = np.where(self.liquid, ZERO, xy)
+        elastic_yy = np.where(self.liquid, pressure, yy)
         return (
-            np.where(self.liquid, pressure, xx) + TWO * self.viscosity * cxx,
-            np.where(self.liquid, Float(0), xy) + self.viscosity * (cxy + cyx),
-            np.where(self.liquid, pressure, yy) + TWO * self.viscosity * cyy,
+            elastic_xx + TWO * self.viscosity * cxx,
+            elastic_xy + self.viscosity * (cxy + cyx),
+            elastic_yy + TWO * self.viscosity * cyy,
         )
 
-    def to_grid(self, stencil: Stencil) -> NDArray[np.int64]:
+    def to_grid(self, stencil: Stencil) -> Sums:
         """Sum weighted velocity (x, y), weights and weighted J at the nodes.
 
         The shape is [4, node, node]. All particles of a scenario weigh the same, so
@@ -192,31 +221,35 @@ class FreeSurfaceReference:
         """
         nodes = self.p.grid + 1
         dx = Float(1 / self.p.grid)
-        sums = np.zeros((4, nodes, nodes), np.int64)
+        sums = np.zeros((4, nodes, nodes), dtype=np.int64)
         xx, xy, yy = self.stress()
         cxx, cxy, cyx, cyy = self.affine
         s = Float(4 * self.p.dt * self.p.grid / self.p.density)
-        slopes_x = cxx * dx - s * xx, cyx * dx - s * xy
-        slopes_y = cxy * dx - s * xy, cyy * dx - s * yy
+        slopes_x = (cxx * dx - s * xx, cyx * dx - s * xy)
+        slopes_y = (cxy * dx - s * xy, cyy * dx - s * yy)
         x, y = (stencil.distance - ONE).T
         jacobian = np.where(self.liquid, self.ratio, ONE)
         for component in range(2):
             a = slopes_x[component]
             b = slopes_y[component]
-            centre = self.velocity[:, component] - x * a - y * b
-            pairs = zip(np.ndindex(3, 3), stencil.nodes(), strict=True)
-            for (i, k), (node_i, node_k, w, _, _) in pairs:
-                value = w * ((centre + Float(i - 1) * a) + Float(k - 1) * b)
-                rounded = fixed(value, self.velocity_scale)
+            centre = self.velocity[:, component] - x * a
+            centre = centre - y * b
+            steps = np.ndindex(3, 3)
+            for (i, k), node in zip(steps, stencil.nodes(), strict=True):
+                node_i, node_k, w, _, _ = node
+                velocity = centre + Float(i - 1) * a
+                velocity = velocity + Float(k - 1) * b
+                rounded = fixed(w * velocity, self.velocity_scale)
                 np.add.at(sums[component], (node_i, node_k), rounded)
         for node_i, node_k, w, _, _ in stencil.nodes():
-            np.add.at(sums[2], (node_i, node_k), fixed(w, WEIGHT_SCALE))
-            np.add.at(sums[3], (node_i, node_k), fixed(w * jacobian, WEIGHT_SCALE))
+            node = (node_i, node_k)
+            weight = fixed(w, WEIGHT_SCALE)
+            weighted_jacobian = fixed(w * jacobian, WEIGHT_SCALE)
+            np.add.at(sums[2], node, weight)
+            np.add.at(sums[3], node, weighted_jacobian)
         return sums
 
-    def grid_update(
-        self, sums: NDArray[np.int64]
-    ) -> tuple[Floats, Floats, Floats, Floats]:
+    def grid_update(self, sums: Sums) -> Components:
         """Return nodal velocity (x, y), density and J after gravity and walls."""
         low = self.p.wall
         high = self.p.grid - self.p.wall
@@ -227,24 +260,39 @@ class FreeSurfaceReference:
         n = n / Float(WEIGHT_SCALE)
         mj = mj / Float(WEIGHT_SCALE)
         n = np.where(filled, n, ONE)
-        u = np.where(filled, px / n, Float(0))
-        v = np.where(filled, py / n - Float(self.p.gravity * self.p.dt), Float(0))
+        fall = Float(self.p.gravity * self.p.dt)
+        u = np.where(filled, px / n, ZERO)
+        v = np.where(filled, py / n - fall, ZERO)
         index = np.arange(self.p.grid + 1)
         below = index <= low
         above = index >= high
-        u, v = self.wall_contact(u, v, below[:, None], above[:, None])
-        v, u = self.wall_contact(v, u, below[None, :], above[None, :])
+        left = below[:, None]
+        right = above[:, None]
+        bottom = below[None, :]
+        top = above[None, :]
+        u, v = self.wall_contact(u, v, left, right)
+        v, u = self.wall_contact(v, u, bottom, top)
         mirrored = sums[2].copy()
         for count in (mirrored, mirrored.T):
-            for wall, inside, outside in (
-                (low, low + 1, low - 1),
-                (high, high - 1, high + 1),
-            ):
-                count[wall] *= 2
-                count[inside] += count[outside]
-                count[outside] = count[inside]
-        density = mirrored.astype(Float) / Float(WEIGHT_SCALE) * self.node_share
-        return u, v, density, np.where(filled, mj / n, ONE)
+            self.mirror_counts(count, wall=low, inside=low + 1, outside=low - 1)
+            self.mirror_counts(count, wall=high, inside=high - 1, outside=high + 1)
+        counts = mirrored.astype(Float) / Float(WEIGHT_SCALE)
+        density = counts * self.node_share
+        jacobian = np.where(filled, mj / n, ONE)
+        return u, v, density, jacobian
+
+    def mirror_counts(
+        self,
+        count: Sums,
+        *,
+        wall: int,
+        inside: int,
+        outside: int,
+    ) -> None:
+        """Add what lies behind a wall to what lies before it, and mirror that."""
+        count[wall] *= 2
+        count[inside] += count[outside]
+        count[outside] = count[inside]
 
     def wall_contact(
         self,
@@ -254,11 +302,16 @@ class FreeSurfaceReference:
         above: NDArray[np.bool_],
     ) -> tuple[Floats, Floats]:
         """Remove the outward normal velocity; friction brakes the tangential one."""
-        hits = (below & (normal < 0)) | (above & (normal > 0))
-        sliding = np.maximum(np.abs(tangential), Float(1e-9))
+        hits_low = below & (normal < 0)
+        hits_high = above & (normal > 0)
+        hits = hits_low | hits_high
+        speed = np.abs(tangential)
+        sliding = np.maximum(speed, Float(1e-9))
         loss = self.friction * np.abs(normal) / sliding
-        braked = tangential * np.maximum(Float(0), ONE - loss)
-        return np.where(hits, Float(0), normal), np.where(hits, braked, tangential)
+        braked = tangential * np.maximum(ZERO, ONE - loss)
+        new_normal = np.where(hits, ZERO, normal)
+        new_tangential = np.where(hits, braked, tangential)
+        return new_normal, new_tangential
 
     def to_particles(
         self,
@@ -285,21 +338,32 @@ class FreeSurfaceReference:
             r = r + w * density[i, k]
             smooth = smooth + w * jacobian[i, k]
         scale = Float(4 * self.p.grid)
-        self.affine = (scale * cxx, scale * cxy, scale * cyx, scale * cyy)
+        self.affine = (
+            scale * cxx,
+            scale * cxy,
+            scale * cyx,
+            scale * cyy,
+        )
         self.velocity = np.stack([vx, vy], 1)
         dx = 1 / self.p.grid
-        low = Float((self.p.wall + 1e-3) * dx)
-        high = Float((self.p.grid - self.p.wall - 1e-3) * dx)
-        moved = self.position + Float(self.p.dt) * self.velocity
-        self.position = np.clip(moved, low, high)
+        first_cell = self.p.wall
+        last_cell = self.p.grid - self.p.wall
+        low = Float((first_cell + 1e-3) * dx)
+        high = Float((last_cell - 1e-3) * dx)
+        step = Float(self.p.dt) * self.velocity
+        self.position = np.clip(self.position + step, low, high)
         # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J);
         # limits.
         p = self.p
         old = self.ratio
-        j = old + Float(p.dt) * (self.affine[0] + self.affine[3]) * old
+        divergence = self.affine[0] + self.affine[3]
+        j = old + Float(p.dt) * divergence * old
         j = j + Float(p.jacobian_relaxation) * (smooth - old)
-        j = j + Float(p.density_coupling) * (ONE / np.maximum(r, ONE) - j)
-        j = np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max))
+        volume = ONE / np.maximum(r, ONE)
+        j = j + Float(p.density_coupling) * (volume - j)
+        least = Float(p.jacobian_min)
+        most = Float(p.jacobian_max)
+        j = np.clip(j, least, most)
         self.ratio = np.where(self.liquid, j, old)
         self.deform()
 
@@ -323,7 +387,8 @@ class FreeSurfaceReference:
         second = np.clip(f.q - r, low, high)
         sheared = r > Float(1e-12)
         divisor = np.where(sheared, r, ONE)
-        shrink = np.where(sheared, HALF * (first - second) / divisor, Float(0))
+        half_shear = HALF * (first - second)
+        shrink = np.where(sheared, half_shear / divisor, ZERO)
         mean = HALF * (first + second)
         e = mean * f.cos
         g = mean * f.sin
@@ -332,14 +397,21 @@ class FreeSurfaceReference:
         least_stretch = Float(0.1)
         trial_first = np.maximum(f.q + r, least_stretch)
         trial_second = np.maximum(f.q - r, least_stretch)
-        factor = trial_first * trial_second / (first * second)
+        trial_product = trial_first * trial_second
+        factor = trial_product / (first * second)
         plastic_min = Float(self.p.snow_jp_min)
         plastic_max = Float(self.p.snow_jp_max)
         plastic = np.clip(self.ratio * factor, plastic_min, plastic_max)
         self.ratio = np.where(self.snow, plastic, self.ratio)
-        elastic = (e + h, k - g, k + g, e - h)
+        elastic = (
+            e + h,
+            k - g,
+            k + g,
+            e - h,
+        )
         components = []
-        for old, yielded, new in zip(self.deformation, elastic, trial, strict=True):
-            solid = np.where(self.snow, yielded, new)
-            components.append(np.where(self.liquid, old, solid))
+        for number, old in enumerate(self.deformation):
+            solid = np.where(self.snow, elastic[number], trial[number])
+            component = np.where(self.liquid, old, solid)
+            components.append(component)
         self.deformation = tuple(components)  # type: ignore[assignment]

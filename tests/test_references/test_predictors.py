@@ -82,8 +82,8 @@ def given(
     frame_count = described.task.input_frames + described.task.horizon
     walls = np.zeros((frame_count, 4, 2))
     walls[:, :] = changes.pop("wall", 0.0)
-    (left, right), (bottom, top) = described.bounds
-    box_area = (right - left) * (top - bottom)
+    x_bounds, y_bounds = described.bounds
+    box_area = np.ptp(x_bounds) * np.ptp(y_bounds)
     liquid = np.zeros(position.shape[1], np.int8)
     return Given(
         size=described,
@@ -98,27 +98,32 @@ def given(
 
 def scattered(count: int, low: float, high: float, seed: int = 0) -> Floats:
     """Return points of a square, shape [point, 2]."""
-    share = np.random.default_rng(seed).random((count, 2))
+    rng = np.random.default_rng(seed)
+    share = rng.random((count, 2))
     return np.asarray(low + (high - low) * share)
 
 
 def lattice(side: int) -> Floats:
     """Return the corners of side x side unit squares, shape [point, 2]."""
     axis = np.arange(side, dtype=float)
-    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    columns, rows = np.meshgrid(axis, axis)
+    return np.stack([columns, rows], axis=-1).reshape(-1, 2)
 
 
 def predicted(name: str, scenario: Given) -> NDArray[np.float32]:
     """Return what a predictor predicts, shape [frame, particle, 2]."""
-    return np.array(list(REFERENCES[name].predict(scenario)))
+    positions = REFERENCES[name].predict(scenario)
+    return np.array(list(positions))
 
 
 def own_split(size: Size, *, placement: str) -> Size:
     """Return a split of a user: without generator, gravity or recorded scores."""
     parameters = dict(size.parameters)
     parameters.pop("gravity", None)
-    grid = size.task.score_grid.model_copy(update={"placement": placement})
-    task = size.task.model_copy(update={"score_grid": grid})
+    grid_changes = {"placement": placement}
+    grid = size.task.score_grid.model_copy(update=grid_changes)
+    task_changes = {"score_grid": grid}
+    task = size.task.model_copy(update=task_changes)
     changes = {
         "split": "own",
         "name": "full",
@@ -158,14 +163,17 @@ def test_a_size_has_the_predictors_of_its_kind_of_box(
 ) -> None:
     """A user's own split goes by its kind of box; without gravity nothing falls."""
     if split == "own":
-        tier = own_split(load().size("fluid", "mini"), placement=size)
+        fluid = load().size("fluid", "mini")
+        tier = own_split(fluid, placement=size)
         assert shipped(tier) is None
     else:
         tier = load().size(split, size)
-    assert " ".join(predictor.name for predictor in references_of(tier)) == names
+    tier_names = [predictor.name for predictor in references_of(tier)]
+    assert " ".join(tier_names) == names
     for times in (2, 4):
         coarse = coarser(tier, times)
-        assert coarse is None or coarse.grid * times == tier.grid
+        if coarse is not None:
+            assert coarse.grid * times == tier.grid
 
 
 def test_every_predictor_says_what_it_is() -> None:
@@ -174,7 +182,10 @@ def test_every_predictor_says_what_it_is() -> None:
         assert predictor.name == name
         assert predictor.title
         assert predictor.definition.endswith(".")
-    solvers = {name for name in REFERENCES if "projection" in name or "solver" in name}
+    solvers = set()
+    for name in REFERENCES:
+        if "projection" in name or "solver" in name:
+            solvers.add(name)
     assert frozenset(REFERENCES) - NAIVE == solvers
 
 
@@ -182,21 +193,27 @@ def test_every_predictor_says_what_it_is() -> None:
 def test_extrapolations_stay_inside_the_walls(name: str) -> None:
     """Fast particles stop at the walls; positions are float32, one per frame."""
     start = scattered(300, 0.2, 0.8)
-    scenario = given("fluid", np.stack([start, start + 0.05]))
+    frames = np.stack([start, start + 0.05])
+    scenario = given("fluid", frames)
     positions = predicted(name, scenario)
     (left, right), (bottom, top) = scenario.size.bounds
+    horizon = scenario.size.task.horizon
+    x = positions[..., 0]
+    y = positions[..., 1]
     assert positions.dtype == np.float32
-    assert positions.shape == (scenario.size.task.horizon, 300, 2)
-    assert positions[..., 0].max() <= np.float32(right)
-    assert positions[..., 1].max() <= np.float32(top)
-    assert positions.min() >= np.float32(min(left, bottom))
+    assert positions.shape == (horizon, 300, 2)
+    assert x.max() <= np.float32(right)
+    assert y.max() <= np.float32(top)
+    least = min(left, bottom)
+    assert positions.min() >= np.float32(least)
 
 
 def test_ballistic_flight_is_a_parabola() -> None:
     """Frames of y = y0 + v t - g t^2 / 2 continue on the same parabola."""
     size = load().size("fluid", "tiny")
     n = size.task.input_frames
-    time = np.arange(n + size.task.horizon) * size.frame_interval
+    frame_count = n + size.task.horizon
+    time = np.arange(frame_count) * size.frame_interval
     fall = 0.5 * size.value("gravity") * time**2
     start = scattered(50, 0.4, 0.6)
     path = np.repeat(start[None], len(time), axis=0)
@@ -204,7 +221,8 @@ def test_ballistic_flight_is_a_parabola() -> None:
     height = 0.8 * time - fall
     path[..., 0] += distance[:, None]
     path[..., 1] += height[:, None]
-    positions = predicted("ballistic", given("fluid", path[:n]))
+    scenario = given("fluid", path[:n])
+    positions = predicted("ballistic", scenario)
     assert_allclose(positions, path[n:], atol=2e-6)
 
 
@@ -215,20 +233,26 @@ def test_a_frozen_rotation_stays_a_rotation() -> None:
     cos = math.cos(angle)
     sin = math.sin(angle)
     offset = scattered(4000, -0.4, 0.4)
-    rotation = np.array([[cos, -sin], [sin, cos]])
+    rotation = np.array(
+        [
+            [cos, -sin],
+            [sin, cos],
+        ]
+    )
     before = centre + offset @ rotation
-    frames = np.stack([before] * 5 + [centre + offset])
+    last = centre + offset
+    frames = np.stack([before] * 5 + [last])
     scenario = given("cavity", frames, wall=1e-9)
     positions = predicted("frozen-field", scenario)
 
     is_inner = np.hypot(*offset.T) < 0.25
-    first = offset[is_inner]
-    last = positions[-1][is_inner] - centre
-    first_radius = np.hypot(*first.T)
-    last_radius = np.hypot(*last.T)
+    first_x, first_y = offset[is_inner].T
+    last_x, last_y = (positions[-1][is_inner] - centre).T
+    first_radius = np.hypot(first_x, first_y)
+    last_radius = np.hypot(last_x, last_y)
     assert_allclose(last_radius, first_radius, rtol=2e-3)
-    first_angle = np.arctan2(first[:, 1], first[:, 0])
-    last_angle = np.arctan2(last[:, 1], last[:, 0])
+    first_angle = np.arctan2(first_y, first_x)
+    last_angle = np.arctan2(last_y, last_x)
     expected_turn = scenario.size.task.horizon * angle
     deviation = last_angle - first_angle - expected_turn
     assert_allclose(np.cos(deviation), 1.0, atol=1e-3)
@@ -241,8 +265,10 @@ def test_decay_of_an_exponential() -> None:
     """
     step = scattered(20, -0.01, 0.01)
     frame = np.arange(6)[:, None, None]
-    shrinking = np.cumsum(step * 0.9**frame, axis=0)
-    growing = np.cumsum(step * 1.1**frame, axis=0)
+    shrinking_steps = step * 0.9**frame
+    growing_steps = step * 1.1**frame
+    shrinking = np.cumsum(shrinking_steps, axis=0)
+    growing = np.cumsum(growing_steps, axis=0)
     at_rest = np.repeat(step[None], 6, axis=0)
     assert decay(shrinking, UNIT_SQUARE) == pytest.approx(0.9)
     assert decay(growing, UNIT_SQUARE) == 1.0
@@ -257,7 +283,8 @@ def test_the_mirrored_field_meets_the_wall(wall_speed: float) -> None:
     """
     wall = np.zeros((4, 2))
     wall[3, 0] = wall_speed
-    scenario = given("cavity", np.zeros((6, 1, 2)), wall=wall)
+    at_centre = np.zeros((6, 1, 2))
+    scenario = given("cavity", at_centre, wall=wall)
     low, high = scenario.size.bounds[0]
     points = scattered(3000, low, high)
     depth = high - points[:, 1]
@@ -268,10 +295,12 @@ def test_the_mirrored_field_meets_the_wall(wall_speed: float) -> None:
         tangential = np.full_like(depth, 0.01)
         expected = (0.01, 0.0)
     velocity = np.stack([tangential, 0.2 * depth], axis=1)
-    field = linear_field(*with_wall_images(scenario, points, velocity, wall))
+    images = with_wall_images(scenario, points, velocity, wall)
+    field = linear_field(*images)
 
     x = np.linspace(0.3, 0.7, 20)
-    at_wall = np.stack([x, np.full(20, high)], axis=1)
+    y = np.full(20, high)
+    at_wall = np.stack([x, y], axis=1)
     expected_velocity = np.tile(expected, (20, 1))
     assert_allclose(field(at_wall), expected_velocity, atol=1e-12)
 
@@ -279,14 +308,22 @@ def test_the_mirrored_field_meets_the_wall(wall_speed: float) -> None:
 def test_the_field_is_linear_and_has_no_holes() -> None:
     """A linear field is exact between the points; outside the nearest point answers."""
     points = scattered(200, 0.0, 1.0)
-    gradient = np.array([[0.1, -0.3], [0.2, 0.05]])
+    gradient = np.array(
+        [
+            [0.1, -0.3],
+            [0.2, 0.05],
+        ]
+    )
     field = linear_field(points, points @ gradient)
     inside = scattered(50, 0.3, 0.7, seed=1)
-    assert_allclose(field(inside), inside @ gradient, atol=1e-12)
+    expected = inside @ gradient
+    assert_allclose(field(inside), expected, atol=1e-12)
     outside = np.array([[5.0, 5.0]])
-    square_distance = np.sum((points - outside) ** 2, axis=1)
+    difference = points - outside
+    square_distance = np.sum(difference**2, axis=1)
     nearest = points[np.argmin(square_distance)]
-    assert_allclose(field(outside)[0], nearest @ gradient)
+    nearest_velocity = field(outside)[0]
+    assert_allclose(nearest_velocity, nearest @ gradient)
 
 
 @pytest.fixture(autouse=True)
@@ -296,12 +333,24 @@ def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lagbench.generators.solver.build", compiled)
 
 
-def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:
+def opened(
+    root: Path,
+    size: Size,
+    scenario: int,
+) -> tuple[Given, NDArray[np.float32]]:
     """Return what a scenario of a generated data set gives, and its future."""
     n = size.task.input_frames
+    frame_count = n + size.task.horizon
     with read_scenario(size.path(root, scenario)) as file:
-        future = file.read("position", slice(n, n + size.task.horizon))
+        future = file.read("position", slice(n, frame_count))
         return given_in(file, size, root), future
+
+
+def open_first(root: Path, size: Size, subset: str) -> Given:
+    """Return what the first scenario of a subset gives."""
+    number = size.subsets[subset][0]
+    scenario, _ = opened(root, size, number)
+    return scenario
 
 
 def test_a_scenario_of_train_is_its_own_analog(bench: ScoreBench) -> None:
@@ -311,7 +360,8 @@ def test_a_scenario_of_train_is_its_own_analog(bench: ScoreBench) -> None:
     analog, mirror = find_analog(scenario)
     assert analog == number
     assert mirror.axes == ()
-    assert_allclose(predicted("analog", scenario), future, atol=1e-5)
+    positions = predicted("analog", scenario)
+    assert_allclose(positions, future, atol=1e-5)
 
 
 def test_a_test_scenario_gets_the_motion_of_one_of_train(bench: ScoreBench) -> None:
@@ -322,8 +372,8 @@ def test_a_test_scenario_gets_the_motion_of_one_of_train(bench: ScoreBench) -> N
     assert analog in bench.size.subsets["train"]
     positions = predicted("analog", scenario)
     assert positions.shape == future.shape
-    first_step = positions[0] - scenario.last
-    assert np.abs(first_step).max() < 0.1
+    first_step = np.abs(positions[0] - scenario.last)
+    assert first_step.max() < 0.1
 
 
 def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None:
@@ -332,21 +382,25 @@ def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None
     On the mean over directions 0.1 along x has half its square, and the cloud half of
     its variances' sum.
     """
-    number = bench.size.subsets["test"][0]
-    scenario, _ = opened(bench.root, bench.size, number)
+    scenario = open_first(bench.root, bench.size, "test")
     start = describe_start(scenario)
 
     def move(x: float, y: float) -> InitialCloud:
         shift = np.array([x, y]) @ DIRECTIONS[2]
-        clouds = {kind: cloud + shift for kind, cloud in start.clouds.items()}
+        clouds = {}
+        for material, cloud in start.clouds.items():
+            clouds[material] = cloud + shift
         return replace(start, clouds=clouds)
 
     near = distance(start, move(0.1, 0.0))
-    elsewhere = distance(move(0.3, -0.2), move(0.4, -0.2))
+    first = move(0.3, -0.2)
+    second = move(0.4, -0.2)
+    elsewhere = distance(first, second)
     assert elsewhere == pytest.approx(near)
     variance = scenario.last.var(axis=0)
     deviation = np.sqrt(variance.sum())
-    assert near == pytest.approx(0.1 / deviation, rel=0.01)
+    expected = 0.1 / deviation
+    assert near == pytest.approx(expected, rel=0.01)
 
 
 def test_many_particles_of_three_dimensions_find_themselves() -> None:
@@ -357,18 +411,22 @@ def test_many_particles_of_three_dimensions_find_themselves() -> None:
     points = rng.random((4400, 3))
     order = rng.permutation(len(points))
     liquid = np.zeros(len(points), np.int8)
-    box = Box.from_bounds([(0.0, 1.0)] * 3, [True, False, True])
+    bounds = [(0.0, 1.0)] * 3
+    box = Box.from_bounds(bounds, [True, False, True])
     partner = assign_particles(points, points[order], liquid, liquid, box)
-    np.testing.assert_array_equal(points[order][partner], points)
+    partners = points[order][partner]
+    np.testing.assert_array_equal(partners, points)
 
 
 def test_a_permuted_cloud_is_assigned_particle_by_particle() -> None:
     """Each material is assigned on its own."""
     points = scattered(120, 0.0, 1.0)
     material = np.repeat([0, 2], 60)
-    order = np.random.default_rng(1).permutation(120)
+    rng = np.random.default_rng(1)
+    order = rng.permutation(120)
     moved = points[order] + 1e-6
-    partner = assign_particles(points, moved, material, material[order])
+    moved_material = material[order]
+    partner = assign_particles(points, moved, material, moved_material)
     np.testing.assert_array_equal(order[partner], np.arange(120))
 
 
@@ -382,7 +440,8 @@ def test_unequal_clouds_are_assigned_evenly() -> None:
     uses = np.bincount(fewer, minlength=30)
     assert uses.tolist() == [3] * 30
     more = assign_particles(few_points, points, few_liquid, liquid)
-    assert len(set(more.tolist())) == 30
+    distinct = set(more.tolist())
+    assert len(distinct) == 30
 
 
 def test_a_material_that_is_lacking_takes_any() -> None:
@@ -390,7 +449,8 @@ def test_a_material_that_is_lacking_takes_any() -> None:
     points = scattered(9, 0.0, 1.0)
     liquid = np.zeros(9, np.int64)
     partner = assign_particles(points, points, liquid + 3, liquid)
-    assert set(partner.tolist()) == set(range(9))
+    distinct = set(partner.tolist())
+    assert distinct == set(range(9))
 
 
 def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
@@ -398,14 +458,16 @@ def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
 
     Their number per cell deviates less than that of a random choice, which is 2.
     """
-    jitter = 0.2 * scattered(48 * 48, -0.5, 0.5)
-    points = (lattice(48) + 0.5 + jitter) / 48
+    noise = scattered(48 * 48, -0.5, 0.5)
+    points = (lattice(48) + 0.5 + 0.2 * noise) / 48
     material = (points[:, 0] > 0.5).astype(np.int8)
     chosen = spread_subset(points, material, 576)
-    assert len(set(chosen.tolist())) == 576
+    distinct = set(chosen.tolist())
+    assert len(distinct) == 576
     assert np.count_nonzero(material[chosen]) == 288
     column, row = (points[chosen] * 12).astype(int).T
-    counts = np.bincount(column * 12 + row, minlength=144)
+    cell = column * 12 + row
+    counts = np.bincount(cell, minlength=144)
     assert counts.min() >= 1
     assert counts.std() < 1.4
     again = spread_subset(points, material, 576)
@@ -418,14 +480,18 @@ def test_the_subset_is_spread_evenly_in_three_dimensions() -> None:
     Their number per cell deviates less than that of a random choice, which is 2.6.
     """
     rng = np.random.default_rng(3)
-    axes = np.meshgrid(*[np.arange(16)] * 3, indexing="ij")
-    points = np.stack([axis.ravel() for axis in axes], axis=-1) + 0.5
-    points = (points + rng.uniform(-0.1, 0.1, points.shape)) / 16
+    axes = [np.arange(16)] * 3
+    coordinates = np.meshgrid(*axes, indexing="ij")
+    corners = np.stack(coordinates, axis=-1).reshape(-1, 3)
+    jitter = rng.uniform(-0.1, 0.1, corners.shape)
+    points = (corners + 0.5 + jitter) / 16
     material = np.zeros(len(points), np.int8)
     chosen = spread_subset(points, material, 512)
-    assert len(set(chosen.tolist())) == 512
+    distinct = set(chosen.tolist())
+    assert len(distinct) == 512
     x, y, z = (points[chosen] * 4).astype(int).T
-    counts = np.bincount((x * 4 + y) * 4 + z, minlength=64)
+    cell = (x * 4 + y) * 4 + z
+    counts = np.bincount(cell, minlength=64)
     assert counts.min() >= 3
     assert counts.std() < 2.0
 
@@ -439,10 +505,12 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     frames = []
     for k in reversed(range(size.task.input_frames)):
         frames.append(block - speed * interval * k)
-    scenario = given("fluid", np.stack(frames), area=0.04)
+    last_frames = np.stack(frames)
+    scenario = given("fluid", last_frames, area=0.04)
     positions = list(predict_with(scenario, size))
 
-    fall = np.array([0.0, -0.5 * size.value("gravity") * interval])
+    gravity = size.value("gravity")
+    fall = np.array([0.0, -0.5 * gravity * interval])
     mean_velocity = (frames[-1] - frames[-2]) / interval
     state = InitialState(
         position=frames[-1],
@@ -463,17 +531,20 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     size = load().size("cavity", "tiny")
     n = size.task.input_frames
     frame_count = n + size.task.horizon
-    (left, right), (bottom, top) = size.bounds
-    extent = np.array([right - left, top - bottom])
+    x_bounds, y_bounds = size.bounds
+    low = np.array([x_bounds[0], y_bounds[0]])
+    extent = np.array([np.ptp(x_bounds), np.ptp(y_bounds)])
     share = (lattice(18) + 0.5) / 18
-    position = np.array([left, bottom]) + share * extent
+    position = low + share * extent
     walls = np.zeros((frame_count, 4, 2))
     rng = np.random.default_rng(0)
     lid_speed = 0.2 * rng.normal(size=frame_count)
     walls[:, 3, 0] = lid_speed * size.frame_interval
     at_rest = np.stack([position] * n)
-    scenario = given("cavity", at_rest, area=float(np.prod(extent)))
-    scenario = replace(scenario, walls=walls, parameters={"viscosity": 1e-3})
+    area = float(np.prod(extent))
+    scenario = given("cavity", at_rest, area=area)
+    viscosity = {"viscosity": 1e-3}
+    scenario = replace(scenario, walls=walls, parameters=viscosity)
     positions = list(predict_with(scenario, size))
 
     state = InitialState(
@@ -485,14 +556,17 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
         wall_velocity=np.zeros((4, 2)),
         viscosity=1e-3,
     )
-    constants = replace(solver_constants(size), particles=len(position))
+    constants = solver_constants(size)
+    constants = replace(constants, particles=len(position))
     solver = compiled(constants)
     solver.load([state])
     wall_velocities = walls[n:] / size.frame_interval
-    for expected, wall_velocity in zip(positions, wall_velocities, strict=True):
-        solver.move_walls(wall_velocity[None].astype(np.float32))
+    wall_velocities = wall_velocities.astype(np.float32)
+    for frame, expected in enumerate(positions):
+        solver.move_walls(wall_velocities[frame][None])
         solver.advance(size.substeps_per_frame)
         np.testing.assert_array_equal(expected, solver.position()[0])
+    assert len(positions) == len(wall_velocities)
 
 
 def test_the_coarse_solver_moves_all_particles() -> None:
@@ -500,16 +574,19 @@ def test_the_coarse_solver_moves_all_particles() -> None:
     size = load().size("fluid", "mini")
     coarse = coarser(size, 2)
     assert coarse is not None
-    block = lattice(25) / 120 + np.array([0.4, 0.6])
+    corner = np.array([0.4, 0.6])
+    block = lattice(25) / 120 + corner
     area = (25 / 120) ** 2
     frames = np.stack([block, block])
     scenario = given("fluid", frames, size="mini", area=area)
     positions = predict_with(scenario, coarse)
-    fall_unit = 0.5 * size.value("gravity") * size.frame_interval**2
+    gravity = size.value("gravity")
+    fall_unit = 0.5 * gravity * size.frame_interval**2
     for k, position in zip(range(1, 11), positions, strict=False):
         assert position.shape == block.shape
         mean_fall = np.mean(block - position, axis=0)
-        expected = [0.0, fall_unit * k * (k + 1)]
+        expected_fall = fall_unit * k * (k + 1)
+        expected = [0.0, expected_fall]
         assert_allclose(mean_fall, expected, atol=1e-3)
 
 
@@ -529,11 +606,12 @@ def test_an_analog_needs_all_of_train(
     assert measurable(bench.size, root) == expected
 
     shutil.rmtree(train)
-    scenario, _ = opened(root, bench.size, bench.size.subsets["test"][0])
+    scenario = open_first(root, bench.size, "test")
     with pytest.raises(DataError):
         predicted("analog", scenario)
     predictions = bench.submit(root / "predictions.nc", straight)
-    card = replace(bench, root=root).evaluate(predictions)
+    damaged = replace(bench, root=root)
+    card = damaged.evaluate(predictions)
     assert tuple(card.scores) == (SUBMISSION, *expected)
     assert card.skill is not None
 
@@ -550,16 +628,19 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
     size = size.scored_on(content.get("subset", "test"))
     assert path == shipped_path(size)
     assert path.stat().st_size < 250_000
-    if major_of(content["dataset_version"]) != size.major:
+    major = major_of(content["dataset_version"])
+    if major != size.major:
         pytest.skip("measured on another version of the data")
 
     references = shipped(size)
-    assert list(references) == [predictor.name for predictor in references_of(size)]
+    names = [predictor.name for predictor in references_of(size)]
+    assert list(references) == names
     ranking = ranking_metric(size)
     naive_scores = {}
     for name, reference in references.items():
         score = reference.scores[ranking]
-        assert score.scenarios == tuple(sorted(size.scored_scenarios))
+        scored_scenarios = sorted(size.scored_scenarios)
+        assert score.scenarios == tuple(scored_scenarios)
         assert score.mean > 0.0
         assert reference.correlation.shape == score.values.shape
         if name in NAIVE:
@@ -580,14 +661,16 @@ def test_a_mirror_image_of_a_mirror_image_is_the_scenario(
     axes: tuple[int, ...],
 ) -> None:
     """A wall's upward motion is that of the wall across in the image along x."""
-    box = Box.from_bounds(load().size("cavity", "mini").bounds)
+    bounds = load().size("cavity", "mini").bounds
+    box = Box.from_bounds(bounds)
     mirror = Mirror(box, axes)
     points = scattered(30, 0.1, 0.9)
     image = mirror.positions(points)
     assert box.contains(image).all()
     assert_allclose(mirror.positions(image), points, atol=1e-15)
 
-    walls = np.random.default_rng(1).normal(size=(5, 4, 2))
+    rng = np.random.default_rng(1)
+    walls = rng.normal(size=(5, 4, 2))
     wall_image = mirror.walls(walls)
     np.testing.assert_array_equal(mirror.walls(wall_image), walls)
     if 0 in axes:
@@ -610,12 +693,14 @@ def test_the_mirror_image_of_a_scenario_of_train_is_found_and_predicted(
     assert analog == number
     assert reversal.axes == (0,)
     expected = mirror.positions(future)
-    assert_allclose(predicted("analog", image), expected, atol=1e-5)
+    positions = predicted("analog", image)
+    assert_allclose(positions, expected, atol=1e-5)
 
 
 def test_two_bodies_touch_when_they_are_a_radius_apart() -> None:
     left = scattered(60, 0.0, 0.1)
-    right = scattered(60, 0.0, 0.1, seed=1) + np.array([0.3, 0.0])
+    shift = np.array([0.3, 0.0])
+    right = scattered(60, 0.0, 0.1, seed=1) + shift
     position = np.concatenate([left, right])
     body = label_bodies(position, 0.05)
     first_label = body[0]
@@ -632,11 +717,14 @@ def test_a_flight_ends_when_a_tenth_of_the_particles_lie_on_the_floor() -> None:
     _, (floor, _) = size.bounds
     corner = np.array([0.4, floor + 0.2])
     block = corner + scattered(400, 0.0, 0.1)
-    scenario = given("fluid", np.stack([block, block]), size="mini")
+    frames = np.stack([block, block])
+    scenario = given("fluid", frames, size="mini")
     fallen = 0.2 + 0.1 * 0.1  # a tenth of the block lies below a tenth of its height
-    duration = math.sqrt(2.0 * fallen / size.value("gravity"))
+    square_duration = 2.0 * fallen / size.value("gravity")
+    duration = math.sqrt(square_duration)
     expected = duration / size.frame_interval
-    assert abs(frames_of_flight(scenario) - expected) < 2.0
+    difference = frames_of_flight(scenario) - expected
+    assert abs(difference) < 2.0
 
 
 @pytest.fixture(scope="module")
@@ -653,13 +741,15 @@ def test_a_state_of_train_is_nearest_to_itself(splash: tuple[Path, Size]) -> Non
     frame = 9
     with read_scenario(size.path(root, number)) as file:
         material = file.read("material")
-        now = file.read("position", frame).astype(np.float64)
-        before = file.read("position", frame - 1).astype(np.float64)
-    library = state_library(size, root, np.unique(material).tolist())
+        frames = file.read("position", slice(frame - 1, frame + 1))
+    before, now = frames.astype(np.float64)
+    materials = np.unique(material).tolist()
+    library = state_library(size, root, materials)
     assert library is not None
     for image, mirror in enumerate(mirrors_of(size)):
+        position = mirror.positions(now)
         velocity = mirror.velocities(now - before)
-        feature = describe_state(mirror.positions(now), velocity, material)
+        feature = describe_state(position, velocity, material)
         (state,) = library.nearest(feature, count=1)
         assert library.scenarios[state] == number
         assert library.mirrors[state] == image
@@ -673,23 +763,26 @@ def test_after_contact_the_particles_follow_their_analogs(
 ) -> None:
     """A body that starts on the floor, as no scenario does, follows train at once."""
     root, size = splash
-    scenario, _ = opened(root, size, size.subsets["train"][0])
+    scenario = open_first(root, size, "train")
     _, (floor, _) = size.bounds
     depth = scenario.last[:, 1].min() - floor
     # so deep that more than a tenth of the particles touch at once
-    on_floor = scenario.position - np.array([0.0, depth + 0.05])
-    on_floor[..., 1] = np.maximum(on_floor[..., 1], floor)
+    shift = np.array([0.0, depth + 0.05])
+    on_floor = scenario.position - shift
+    on_floor[..., 1] = on_floor[..., 1].clip(min=floor)
     resting = replace(scenario, position=on_floor)
     assert frames_of_flight(resting) == 0
     materials = np.unique(scenario.material)
     library = state_library(size, root, materials.tolist())
     choice = Choice(lag=0, analogs=2)
-    positions = list(predict_positions(resting, choice, library=library))
+    prediction = predict_positions(resting, choice, library=library)
+    positions = list(prediction)
     assert len(positions) == size.task.horizon
     assert scenario.box.contains(np.stack(positions)).all()
     first_step = positions[0] - resting.last
     assert np.abs(first_step).max() < 0.05
-    without_train = list(predict_positions(resting, choice, library=None))
+    prediction = predict_positions(resting, choice, library=None)
+    without_train = list(prediction)
     difference = positions[-1] - without_train[-1]
     assert np.abs(difference).max() > 0.01
 
@@ -699,30 +792,35 @@ def test_what_predicts_train_best_is_chosen(splash: tuple[Path, Size]) -> None:
     root, size = splash
     scenarios = {}
     for number in size.subsets["train"]:
-        scenarios[number], _ = opened(root, size, number)
+        scenario, _ = opened(root, size, number)
+        scenarios[number] = scenario
 
     def mean_error(choice: Choice) -> float:
         errors = []
         for number, scenario in scenarios.items():
-            errors.append(cloud_error(scenario, choice, number))
+            error = cloud_error(scenario, choice, number)
+            errors.append(error)
         return float(np.mean(errors))
 
     least = mean_error(choose(size, root))
-    for choice in (Choice(lag=0, analogs=1), Choice(lag=10, analogs=2)):
-        assert least <= mean_error(choice)
+    one_analog = Choice(lag=0, analogs=1)
+    two_analogs = Choice(lag=10, analogs=2)
+    assert least <= mean_error(one_analog)
+    assert least <= mean_error(two_analogs)
 
 
 def test_climatology_is_made_of_the_clouds_of_train(splash: tuple[Path, Size]) -> None:
     """Each position is that of a particle of train at that frame, or mirrored."""
     root, size = splash
-    scenario, _ = opened(root, size, size.subsets["test"][0])
+    scenario = open_first(root, size, "test")
     positions = predicted("climatology", scenario)
     frame = size.task.input_frames + 3
     clouds = []
     for number in size.subsets["train"]:
         with read_scenario(size.path(root, number)) as file:
-            cloud = np.asarray(file.read("position", frame), np.float64)
+            cloud = file.read("position", frame).astype(np.float64)
         for mirror in mirrors_of(size):
             clouds.append(mirror.positions(cloud))
-    nearest, _ = KDTree(np.concatenate(clouds)).query(positions[3])
+    tree = KDTree(np.concatenate(clouds))
+    nearest, _ = tree.query(positions[3])
     assert nearest.max() < 1e-6
