@@ -329,6 +329,12 @@ def rolled(model: Baseline, given: Batch, frames: int) -> Tensor:
     return torch.stack(predicted, dim=1)
 
 
+def greatest_difference(first: Tensor, second: Tensor) -> float:
+    """Return the greatest difference of two tensors, in absolute value."""
+    difference = first - second
+    return float(difference.abs().max())
+
+
 def share_of_persistence(
     model: Baseline,
     scenario: Floats,

@@ -13,7 +13,7 @@ import torch
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from simple_models import batch, info, jittered, rolled, swirl
+from simple_models import batch, greatest_difference, info, jittered, rolled, swirl
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -99,12 +99,6 @@ def roll_out_velocities(model: Any, window: Batch, frames: int) -> Tensor:
     """Return the differences of predicted positions, shape [particle, frame, 2]."""
     path = rolled(model, window, frames)
     return path.diff(dim=1)
-
-
-def greatest_change(first: Tensor, second: Tensor) -> float:
-    """Return the greatest difference of two tensors, in absolute value."""
-    difference = first - second
-    return float(difference.abs().max())
 
 
 def change_material(window: Batch, material: Tensor) -> Batch:
@@ -316,7 +310,7 @@ def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> 
 
     even_mean = velocity[::2].mean(dim=0)
     odd_mean = velocity[1::2].mean(dim=0)
-    assert greatest_change(even_mean, odd_mean) > 1e-5
+    assert greatest_difference(even_mean, odd_mean) > 1e-5
 
 
 def burst_speed(spacing: float) -> float:
@@ -368,7 +362,7 @@ def test_walls_push_only_beside_them(low: float, is_pushed: bool) -> None:
     frames = np.repeat(body[None], 3, axis=0)
     window = liquid(frames)
     path = rolled(model, window, 2)
-    change = greatest_change(path[:, -1], window.position[:, -1])
+    change = greatest_difference(path[:, -1], window.position[:, -1])
     assert (change > 1e-5) is is_pushed
 
 
@@ -403,7 +397,7 @@ def test_the_mirror_average_has_the_symmetry_of_the_box(
     image_matrix = matrix[None]
     image = mirror_batch(window, image_matrix, info().bounds)
 
-    def greatest_difference(*, average: bool) -> float:
+    def image_error(*, average: bool) -> float:
         model = surrogate(**options, awake=0.1, average=average)
         context_weight = model.context.numbers[-1].weight
         nn.init.normal_(context_weight, std=3.0)
@@ -412,11 +406,11 @@ def test_the_mirror_average_has_the_symmetry_of_the_box(
         path = rolled(model, window, 4)
         image_path = rolled(model, image, 4)
         expected = (path - 0.5) @ matrix.T + 0.5
-        return greatest_change(image_path, expected)
+        return greatest_difference(image_path, expected)
 
-    assert greatest_difference(average=True) < 2e-6
+    assert image_error(average=True) < 2e-6
     # The weights have no symmetry; number 0 is the identity.
-    has_difference = greatest_difference(average=False) > 1e-5
+    has_difference = image_error(average=False) > 1e-5
     assert has_difference is (number > 0)
 
 

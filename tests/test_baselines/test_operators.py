@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import random
 from collections.abc import Callable, Sequence
 
@@ -45,7 +46,11 @@ def small_graph() -> Graph:
     return graph(9, 24, node=2 * LATENT, edge=LATENT)
 
 
-def build_random(operator: type[Operator], *, scale: float = 1.0) -> Operator:
+def build_random(
+    operator: type[Operator],
+    *,
+    scale: float = 1.0,
+) -> Operator:
     """Return an operator in float64 whose every weight, biases too, is random."""
     torch.manual_seed(1)
     layer = operator(2 * LATENT, LATENT, HIDDEN).double()
@@ -58,26 +63,33 @@ def compute_update(layer: Operator, inputs: Graph) -> Array:
     """Return what each node gathers."""
     node, edge_index, edge = inputs
     update, _ = layer(node.double(), edge_index, edge.double())
-    return update.detach().numpy()
+    return as_array(update)
+
+
+def as_array(tensor: torch.Tensor) -> Array:
+    """Return a tensor as an array, without its graph of gradients."""
+    return tensor.detach().numpy()
 
 
 def read_weights(layer: Operator) -> Weights:
     """Return the layer's weights by name."""
     weights = {}
     for name, value in layer.named_parameters():
-        weights[name] = value.detach().numpy()
+        weights[name] = as_array(value)
     return weights
 
 
 def softmax(logits: Sequence[float]) -> Array:
     """Return exponentials over their sum."""
-    powers = np.exp(np.array(logits) - max(logits))
+    values = np.array(logits)
+    powers = np.exp(values - values.max())
     return powers / powers.sum()
 
 
 def sigmoid(x: Array | float) -> Array:
     """Return the logistic function."""
-    return 1 / (1 + np.exp(-np.asarray(x)))
+    values = np.asarray(x)
+    return 1 / (1 + np.exp(-values))
 
 
 def leaky(x: Array | float) -> Array:
@@ -86,7 +98,12 @@ def leaky(x: Array | float) -> Array:
     return np.where(values > 0, values, 0.2 * values)
 
 
-def neighbours(inputs: Graph, receiver: int, *, loop: bool) -> Neighbours:
+def neighbours(
+    inputs: Graph,
+    receiver: int,
+    *,
+    loop: bool,
+) -> Neighbours:
     """Return senders and edges of a node.
 
     A loop's edge is the mean of the others, and 0 without any.
@@ -95,20 +112,26 @@ def neighbours(inputs: Graph, receiver: int, *, loop: bool) -> Neighbours:
     edges = inputs.edge.double().numpy()
     near = []
     for number in np.flatnonzero(receivers == receiver):
-        near.append((int(senders[number]), edges[number]))
+        sender = int(senders[number])
+        near.append((sender, edges[number]))
     if loop:
         mean = np.zeros(edges.shape[1])
         if near:
-            mean = np.mean([edge for _, edge in near], axis=0)
+            near_edges = [edge for _, edge in near]
+            mean = np.mean(near_edges, axis=0)
         near.append((receiver, mean))
     return near
 
 
-def weighted_sum(attention: Array, value: Array, near: Neighbours) -> Array:
+def weighted_sum(
+    attention: Array,
+    value: Array,
+    near: Neighbours,
+) -> Array:
     """Return the sum of the neighbours' values times their attention."""
     total = np.zeros(value.shape[1])
-    for share, (sender, _) in zip(attention, near, strict=True):
-        total += share * value[sender]
+    for number, (sender, _) in enumerate(near):
+        total += attention[number] * value[sender]
     return total
 
 
@@ -121,20 +144,26 @@ def gat(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     logits = []
     for j, e in near:
         edge = w["conv.lin_edge.weight"] @ e
-        logits.append(float(leaky(z[j] @ source + z[i] @ target + edge @ of_edge)))
-    return weighted_sum(softmax(logits), z, near) + w["conv.bias"]
+        logit = z[j] @ source + z[i] @ target + edge @ of_edge
+        logits.append(float(leaky(logit)))
+    total = weighted_sum(softmax(logits), z, near)
+    return total + w["conv.bias"]
 
 
 def gatv2(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Brody et al. (2022), Eq. 7."""
-    left = x @ w["conv.lin_l.weight"].T + w["conv.lin_l.bias"]
-    right = x @ w["conv.lin_r.weight"].T + w["conv.lin_r.bias"]
+    left = x @ w["conv.lin_l.weight"].T
+    left = left + w["conv.lin_l.bias"]
+    right = x @ w["conv.lin_r.weight"].T
+    right = right + w["conv.lin_r.bias"]
     attention = w["conv.att"].ravel()
     logits = []
     for j, e in near:
         edge = w["conv.lin_edge.weight"] @ e
-        logits.append(float(leaky(left[j] + right[i] + edge) @ attention))
-    return weighted_sum(softmax(logits), left, near) + w["conv.bias"]
+        activated = leaky(left[j] + right[i] + edge)
+        logits.append(float(activated @ attention))
+    total = weighted_sum(softmax(logits), left, near)
+    return total + w["conv.bias"]
 
 
 SCALE = START * np.sqrt(LATENT)
@@ -152,8 +181,10 @@ def supergat_mx(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     logits = []
     for j, _ in near:
         gate = sigmoid(z[i] @ z[j])
-        logits.append(float(leaky((z[j] @ left + z[i] @ right) * gate)))
-    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
+        logit = z[j] @ left + z[i] @ right
+        logits.append(float(leaky(logit * gate)))
+    total = weighted_sum(softmax(logits), z, near)
+    return SCALE * (total + w["conv.bias"])
 
 
 def supergat_sd(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
@@ -161,15 +192,20 @@ def supergat_sd(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     z = x / SCALE @ w["conv.lin.weight"].T
     logits = []
     for j, _ in near:
-        logits.append(float(leaky(z[i] @ z[j] / np.sqrt(LATENT))))
-    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
+        product = z[i] @ z[j]
+        logit = leaky(product / np.sqrt(LATENT))
+        logits.append(float(logit))
+    total = weighted_sum(softmax(logits), z, near)
+    return SCALE * (total + w["conv.bias"])
 
 
 def transformer(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Shi et al. (2021), Eqs. 3 and 4, with a linear skip connection."""
 
     def project(name: str) -> Array:
-        rows: Array = x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
+        weight = w[f"conv.lin_{name}.weight"]
+        bias = w[f"conv.lin_{name}.bias"]
+        rows: Array = x @ weight.T + bias
         return rows
 
     total = project("skip")[i]
@@ -178,12 +214,16 @@ def transformer(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     key = project("key")
     query = project("query")
     value = project("value")
-    edges = [w["conv.lin_edge.weight"] @ e for _, e in near]
+    edge_weight = w["conv.lin_edge.weight"]
     logits = []
-    for (j, _), edge in zip(near, edges, strict=True):
-        logits.append(query[i] @ (key[j] + edge) / np.sqrt(LATENT))
-    for share, (j, _), edge in zip(softmax(logits), near, edges, strict=True):
-        total = total + share * (value[j] + edge)
+    values = []
+    for j, e in near:
+        edge = edge_weight @ e
+        product = query[i] @ (key[j] + edge)
+        logits.append(product / np.sqrt(LATENT))
+        values.append(value[j] + edge)
+    for share, near_value in zip(softmax(logits), values, strict=True):
+        total = total + share * near_value
     return total
 
 
@@ -222,7 +262,8 @@ def test_an_operator_is_its_published_equation(
     expected = []
     for receiver in range(len(x)):
         near = neighbours(inputs, receiver, loop=loop)
-        expected.append(equation(weights, x, receiver, near))
+        row = equation(weights, x, receiver, near)
+        expected.append(row)
     update = compute_update(layer, inputs)
     assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
@@ -232,15 +273,18 @@ def test_pointnet_is_that_of_pyg() -> None:
     inputs = small_graph()
     layer = build_random(PointNet)
     assert isinstance(layer, PointNet)
-    position = torch.randn(len(inputs.node), LATENT, dtype=torch.float64)
+    node_count = len(inputs.node)
+    position = torch.randn(node_count, LATENT, dtype=torch.float64)
 
     first = torch.nn.Linear(3 * LATENT, HIDDEN).double()
+    first_weights = [layer.of_node.weight, layer.of_edge.weight]
     with torch.no_grad():
-        first.weight[:] = torch.cat([layer.of_node.weight, layer.of_edge.weight], dim=1)
+        first.weight[:] = torch.cat(first_weights, dim=1)
         first.bias[:] = layer.of_node.bias
     with torch.random.fork_rng():
         convolution = PointNetConv()  # Its constructor would reset the weights.
-    convolution.local_nn = torch.nn.Sequential(first, *copy.deepcopy(layer.local))
+    other_layers = copy.deepcopy(layer.local)
+    convolution.local_nn = torch.nn.Sequential(first, *other_layers)
 
     sender, receiver = inputs.edge_index
     x = inputs.node.double()
@@ -255,8 +299,10 @@ def test_the_order_of_nodes_and_edges_means_nothing(operator: type[Operator]) ->
     """Nodes in another order get the same updates in that order."""
     inputs = small_graph()
     layer = build_random(operator).eval()
-    node_order = torch.randperm(len(inputs.node), generator=seeded(3))
-    edge_order = torch.randperm(len(inputs.edge), generator=seeded(4))
+    node_count = len(inputs.node)
+    edge_count = len(inputs.edge)
+    node_order = torch.randperm(node_count, generator=seeded(3))
+    edge_order = torch.randperm(edge_count, generator=seeded(4))
     new_number = torch.argsort(node_order)
     shuffled = Graph(
         inputs.node[node_order],
@@ -286,14 +332,22 @@ def test_without_edges_updates_and_gradients_are_finite(
             assert parameter.grad.isfinite().all()
 
 
+Pairs = set[tuple[int, int]]
+
+
+def set_of_pairs(pairs: torch.Tensor) -> Pairs:
+    """Return the columns of a tensor of shape [2, pair] as a set."""
+    senders, receivers = pairs.tolist()
+    return set(zip(senders, receivers, strict=True))
+
+
 def test_unlinked_pairs_are_neither_edges_nor_loops() -> None:
     """Every other pair comes up, and the same seed gives the same pairs."""
     edge_index = small_graph().edge_index
     pairs = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
-    drawn = set(map(tuple, pairs.t().tolist()))
-    linked = set(map(tuple, edge_index.t().tolist()))
-    every_pair = {(j, i) for j in range(9) for i in range(9) if i != j}
-    assert drawn == every_pair - linked  # 72 - 24 = 48 pairs in 20,000 draws of 81
+    every_pair = set(itertools.permutations(range(9), 2))
+    # 72 - 24 = 48 pairs in 20,000 draws of 81
+    assert set_of_pairs(pairs) == every_pair - set_of_pairs(edge_index)
     again = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
     assert torch.equal(pairs, again)
 
@@ -303,27 +357,38 @@ def test_the_link_loss_is_equation_5_28() -> None:
     inputs = small_graph()
     layer = build_random(SuperGAT, scale=0.4)
     node = inputs.node.double()
-    _, losses = layer(node, inputs.edge_index, inputs.edge, generator=seeded(2))
+    _, losses = layer(
+        node,
+        inputs.edge_index,
+        inputs.edge,
+        generator=seeded(2),
+    )
 
-    z = node.numpy() / SCALE @ read_weights(layer)["conv.lin.weight"].T
+    weight = read_weights(layer)["conv.lin.weight"]
+    z = node.numpy() / SCALE @ weight.T
 
     def link_probability(pairs: NDArray[np.int64]) -> Array:
         sender, receiver = pairs
-        return sigmoid(np.sum(z[sender] * z[receiver], axis=1))
+        products = z[sender] * z[receiver]
+        return sigmoid(products.sum(axis=1))
 
+    edge_index = inputs.edge_index
     loops = np.tile(np.arange(9), (2, 1))
-    linked = np.concatenate([inputs.edge_index.numpy(), loops], axis=1)
-    unlinked = draw_unlinked_pairs(inputs.edge_index, 9, 12, seeded(2)).numpy()
+    linked = np.concatenate([edge_index.numpy(), loops], axis=1)
+    drawn = draw_unlinked_pairs(edge_index, 9, 12, seeded(2))
+    unlinked = drawn.numpy()
     of_linked = np.log(link_probability(linked))
     of_unlinked = np.log(1 - link_probability(unlinked))
-    expected = -np.mean(np.concatenate([of_linked, of_unlinked]))
-    assert losses["link"].item() == pytest.approx(expected, rel=1e-9)
+    log_likelihood = np.concatenate([of_linked, of_unlinked])
+    expected = -np.mean(log_likelihood)
+    loss = losses["link"].item()
+    assert loss == pytest.approx(expected, rel=1e-9)
 
 
 def test_there_is_no_link_loss_in_evaluation() -> None:
-    inputs = small_graph()
+    node, edge_index, edge = small_graph()
     layer = build_random(SuperGAT, scale=0.4).eval()
-    _, losses = layer(inputs.node.double(), inputs.edge_index, inputs.edge)
+    _, losses = layer(node.double(), edge_index, edge)
     assert not losses
 
 
@@ -332,7 +397,8 @@ def test_the_link_loss_starts_low() -> None:
     torch.manual_seed(0)
     wide = graph(300, 2400, node=256, edge=128)
     wide.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
-    _, losses = SuperGAT(256, 128, 128)(*wide)
+    layer = SuperGAT(256, 128, 128)
+    _, losses = layer(*wide)
     assert 0.3 < losses["link"].item() < 3.0
 
 
@@ -342,7 +408,8 @@ def test_supergat_learns_who_are_neighbours() -> None:
     layer = SuperGAT(32, 16, 16)
     inputs.node.mul_(8.0)  # sums of about 8 normalised messages
     generator = seeded(0)
-    optimizer = torch.optim.Adam(layer.parameters(), lr=1e-2)
+    parameters = layer.parameters()
+    optimizer = torch.optim.Adam(parameters, lr=1e-2)
     course = []
     for _ in range(60):
         _, losses = layer(*inputs, generator=generator)
@@ -351,7 +418,9 @@ def test_supergat_learns_who_are_neighbours() -> None:
         loss.backward()
         optimizer.step()
         course.append(loss.item())
-    assert np.mean(course[-5:]) < 0.75 * np.mean(course[:5])
+    first_loss = np.mean(course[:5])
+    last_loss = np.mean(course[-5:])
+    assert last_loss < 0.75 * first_loss
 
 
 def global_random_states() -> tuple[object, ...]:
@@ -366,10 +435,12 @@ def global_random_states() -> tuple[object, ...]:
 def test_draws_leave_global_sources_alone() -> None:
     """SuperGAT draws from its generator only, the same for the same seed."""
     node, edge_index, edge = small_graph()
+    node = node.double()
     layer = build_random(SuperGAT, scale=0.4)
 
     def link_loss(seed: int) -> float:
-        _, losses = layer(node.double(), edge_index, edge, generator=seeded(seed))
+        generator = seeded(seed)
+        _, losses = layer(node, edge_index, edge, generator=generator)
         return losses["link"].item()
 
     before = global_random_states()
@@ -381,13 +452,10 @@ def test_draws_leave_global_sources_alone() -> None:
 
 def test_supergat_can_be_copied_after_training() -> None:
     """No graph of gradients hangs on it."""
-    inputs = small_graph()
+    node, edge_index, edge = small_graph()
     layer = build_random(SuperGAT, scale=0.4)
-    layer(inputs.node.double(), inputs.edge_index, inputs.edge, generator=seeded(0))
+    layer(node.double(), edge_index, edge, generator=seeded(0))
     copied = copy.deepcopy(layer)
-    for parameter, copied_parameter in zip(
-        layer.parameters(),
-        copied.parameters(),
-        strict=True,
-    ):
+    pairs = zip(layer.parameters(), copied.parameters(), strict=True)
+    for parameter, copied_parameter in pairs:
         assert torch.equal(parameter, copied_parameter)

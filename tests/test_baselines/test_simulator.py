@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from simple_models import (
     RADIUS,
     SMALL,
     batch,
+    greatest_difference,
     info,
     jittered,
     network,
@@ -23,6 +25,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lagbench.baselines.augmentation import mirror_batch
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.simulator import GraphNetwork, ParticleState
 from lagbench.errors import UsageError
@@ -32,7 +35,25 @@ TARGETS = pytest.mark.parametrize("target", ["acceleration", "velocity"])
 
 def seeded(seed: int = 0) -> torch.Generator:
     """Return a seeded source of randomness."""
-    return torch.Generator().manual_seed(seed)
+    generator = torch.Generator()
+    return generator.manual_seed(seed)
+
+
+def roll_out(model: Any, frames: NDArray[np.float64], count: int) -> Tensor:
+    """Return the positions after a window, shape [particle, frame, 2]."""
+    return rolled(model, batch(frames), count)
+
+
+def rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round to multiples of a power of two: sums of these are exact in float32."""
+    return np.round(values * 2**16) / 2**16
+
+
+def two_swirls() -> Batch:
+    """Return two windows of six frames, with walls."""
+    first = swirl(0, 6)
+    second = swirl(1, 6)
+    return batch(first, second, walls=True)
 
 
 @TARGETS
@@ -44,24 +65,28 @@ def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
     frames = swirl(0, 96)
     truth = batch(frames)
     exact = torch.from_numpy(frames).transpose(0, 1)
-    path = rolled(oracle(exact, target), truth.part(slice(6)), 90)
+    model = oracle(exact, target)
+    path = roll_out(model, frames[:6], 90)
 
-    displacement = truth.position[:, 95] - truth.position[:, 5]
-    assert float(displacement.norm(dim=1).max()) > 0.2
+    first = truth.position[:, 5]
+    displacement = truth.position[:, 95] - first
+    distance = displacement.norm(dim=1)
+    assert float(distance.max()) > 0.2
     # The initial velocities are differences of float32 positions: 6e-8 a frame, which
     # accelerations do not mend.
     tolerance = 1e-6
     if target == "acceleration":
         tolerance = 90 * 6e-8
-    error = (path - truth.position[:, 6:]).abs().max()
-    assert float(error) < tolerance
+    error = greatest_difference(path, truth.position[:, 6:])
+    assert error < tolerance
 
 
 def test_untrained_models_of_accelerations_keep_velocities() -> None:
     window = batch(swirl(0, 6))
     time = torch.arange(1.0, 4.0)[:, None]
-    velocity = window.position[:, -1] - window.position[:, -2]
-    straight = window.position[:, -1:] + time * velocity[:, None]
+    last = window.position[:, -1]
+    velocity = last - window.position[:, -2]
+    straight = last[:, None] + time * velocity[:, None]
     path = rolled(network(), window, 3)
     assert_close(path, straight, rtol=0.0, atol=3e-7)
 
@@ -69,8 +94,10 @@ def test_untrained_models_of_accelerations_keep_velocities() -> None:
 def test_untrained_models_of_velocities_stand_still() -> None:
     """They predict the mean velocity of the training data, which is 0 here."""
     window = batch(swirl(0, 6))
-    still = window.position[:, -1:].expand(-1, 3, -1)
-    path = rolled(network(target="velocity"), window, 3)
+    last = window.position[:, -1:]
+    still = last.expand(-1, 3, -1)
+    model = network(target="velocity")
+    path = rolled(model, window, 3)
     assert torch.equal(path, still)
 
 
@@ -78,18 +105,18 @@ def test_untrained_models_of_velocities_stand_still() -> None:
 def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
     """One vector moves all particles, and so the rollout; it is exact in binary."""
     rng = np.random.default_rng(0)
-    start = np.round(jittered(0, 8, 0.3, 0.5) * 2**16) / 2**16
+    start = rounded(jittered(0, 8, 0.3, 0.5))
     noise = rng.normal(0.0, 1e-3, (6, *start.shape))
-    steps = np.round(noise * 2**16) / 2**16
+    steps = rounded(noise)
     frames = start + steps.cumsum(axis=0)
     shift = np.array([0.25, 0.125])
 
     model = network(awake=True, target=target)
     window = batch(frames)
     path = rolled(model, window, 4)
-    shifted_path = rolled(model, batch(frames + shift), 4)
-    first_step = path[:, 0] - window.position[:, -1]
-    assert float(first_step.abs().max()) > 1e-4
+    shifted_path = roll_out(model, frames + shift, 4)
+    last = window.position[:, -1]
+    assert greatest_difference(path[:, 0], last) > 1e-4
     expected = path + torch.from_numpy(shift).float()
     assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
 
@@ -113,12 +140,17 @@ def mirror_model(model: Any, axis: int) -> Any:
         node_weight[:, axis:10:2] *= -1.0
 
         distance = node_weight[:, 10:14]
-        distance[:, [low, high]] = distance[:, [high, low]]
+        from_low = distance[:, low].clone()
+        distance[:, low] = distance[:, high]
+        distance[:, high] = from_low
 
-        wall_velocity = node_weight[:, 30:].reshape(-1, 4, 2)
+        columns = node_weight[:, 30:]
+        wall_velocity = columns.reshape(-1, 4, 2)
         wall_velocity[..., axis] *= -1.0
-        wall_velocity[:, [low, high]] = wall_velocity[:, [high, low]]
-        node_weight[:, 30:] = wall_velocity.flatten(1)
+        walls = [0, 1, 2, 3]
+        walls[low] = high
+        walls[high] = low
+        columns[:] = wall_velocity[:, walls].flatten(1)
 
         edge_weight = mirrored.network.edge_encoder[0].weight
         edge_weight[:, axis] *= -1.0
@@ -136,7 +168,8 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     windows = []
     for seed in (0, 1):
         steps = rng.normal(0.0, 2e-3, (6, 256, 2))
-        windows.append(jittered(seed) + steps.cumsum(axis=0))
+        path = steps.cumsum(axis=0)
+        windows.append(jittered(seed) + path)
     window = batch(*windows, walls=True)
     window.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
@@ -146,49 +179,60 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     model = network(awake=True, target=target, wall_velocity=True)
     expected = rolled(model, window, 3)
     expected[..., axis] = 1.0 - expected[..., axis]
-    path = rolled(mirror_model(model, axis), image, 3)
+    mirrored = mirror_model(model, axis)
+    path = rolled(mirrored, image, 3)
     assert_close(path, expected, rtol=0.0, atol=1e-6)
 
     # The weights matter: the model itself does not give the mirror image.
     unmirrored_path = rolled(model, image, 3)
-    assert float((unmirrored_path - expected).abs().max()) > 1e-5
+    assert greatest_difference(unmirrored_path, expected) > 1e-5
 
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:
     """Two windows in one batch roll out as they do alone."""
     model = network(awake=True)
-    windows = [swirl(0, 6), swirl(1, 6)]
-    together = rolled(model, batch(*windows), 3)
-    alone = [rolled(model, batch(window), 3) for window in windows]
-    assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-6)
+    first = swirl(0, 6)
+    second = swirl(1, 6)
+    together = rolled(model, batch(first, second), 3)
+    first_alone = roll_out(model, first, 3)
+    second_alone = roll_out(model, second, 3)
+    alone = torch.cat([first_alone, second_alone])
+    assert_close(together, alone, rtol=0.0, atol=1e-6)
 
 
 def test_two_frames_are_enough_to_start_from() -> None:
     """The first velocity repeats in place of those before the window."""
     window = batch(swirl(0, 8))
     model = network()
-    first_velocity = window.position[:, 1] - window.position[:, 0]
+    second_frame = window.position[:, 1]
+    first_velocity = second_frame - window.position[:, 0]
 
-    from_two = model.start(window.part(slice(2)))
+    two_frames = window.part(slice(2))
+    from_two = model.start(two_frames)
     repeated = first_velocity[:, None].expand(-1, 5, -1)
     assert torch.equal(from_two.velocity, repeated)
-    assert torch.equal(from_two.position, window.position[:, 1])
+    assert torch.equal(from_two.position, second_frame)
 
-    from_four = model.start(window.part(slice(4)))
+    four_frames = window.part(slice(4))
+    from_four = model.start(four_frames)
+    velocity = four_frames.position.diff(dim=1)
     assert torch.equal(from_four.velocity[:, :3], repeated[:, :3])
-    assert torch.equal(from_four.velocity[:, 2:], window.position[:, :4].diff(dim=1))
+    assert torch.equal(from_four.velocity[:, 2:], velocity)
 
+    one_frame = window.part(slice(1))
     with pytest.raises(UsageError):
-        model.start(window.part(slice(1)))
+        model.start(one_frame)
 
 
 def test_a_start_takes_the_last_frames_of_a_long_window() -> None:
     window = batch(swirl(0, 8))
     model = network()
     from_eight = model.start(window)
-    from_six = model.start(window.part(slice(2, 8)))
+    last_six = window.part(slice(2, 8))
+    from_six = model.start(last_six)
+    velocity = last_six.position.diff(dim=1)
     assert torch.equal(from_eight.velocity, from_six.velocity)
-    assert torch.equal(from_eight.velocity, window.position[:, 2:].diff(dim=1))
+    assert torch.equal(from_eight.velocity, velocity)
 
 
 def test_a_model_of_one_velocity_sees_two_frames() -> None:
@@ -196,17 +240,22 @@ def test_a_model_of_one_velocity_sees_two_frames() -> None:
     model = network(awake=True, velocities=1)
     assert model.history == 2
     assert model.features.count == 22
-    from_two = rolled(model, window.part(slice(6, 8)), 2)
-    assert torch.equal(rolled(model, window, 2), from_two)
+    last_two = window.part(slice(6, 8))
+    from_eight = rolled(model, window, 2)
+    from_two = rolled(model, last_two, 2)
+    assert torch.equal(from_eight, from_two)
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
     """The oldest velocity leaves and the new one comes last."""
     window = batch(swirl(0, 7))
     model = network()
-    state = model.start(window.part(slice(6)))
-    next_start = model.start(window.part(slice(1, 7)))
-    moved = state.move(next_start.position, next_start.velocity[:, -1])
+    first_six = window.part(slice(6))
+    last_six = window.part(slice(1, 7))
+    state = model.start(first_six)
+    next_start = model.start(last_six)
+    last_velocity = next_start.velocity[:, -1]
+    moved = state.move(next_start.position, last_velocity)
     for field in fields(ParticleState):
         value = getattr(moved, field.name)
         expected = getattr(next_start, field.name)
@@ -218,16 +267,18 @@ def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
 
 def test_wall_velocities_become_velocities_per_frame() -> None:
     """A frame is half a second here; each particle has the walls of its window."""
-    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    window = two_swirls()
     window.wall_velocity[1] *= 3.0
-    wall_velocity = network(wall_velocity=True).start(window).wall_velocity
-    expected = torch.arange(1.0, 9.0).reshape(4, 2) / 200
+    state = network(wall_velocity=True).start(window)
+    wall_velocity = state.wall_velocity
+    per_second = torch.arange(1.0, 9.0).reshape(4, 2) / 100
+    expected = per_second / 2
     assert_close(wall_velocity[0, 0], expected)
     assert_close(wall_velocity[1], 3.0 * wall_velocity[0])
 
 
 def test_models_without_wall_velocity_have_none() -> None:
-    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    window = two_swirls()
     assert network().start(window).wall_velocity is None
     with pytest.raises(UsageError) as caught:
         network(wall_velocity=True, changes={"moving_walls": False})
@@ -237,12 +288,16 @@ def test_models_without_wall_velocity_have_none() -> None:
 def test_a_predicted_frame_moves_with_its_own_wall_velocity() -> None:
     """After the last known wall velocity that one stays."""
     window = batch(swirl(0, 8), walls=True)
-    window.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
-    state = network(wall_velocity=True).start(window.part(slice(6)))
+    factor = torch.arange(8.0)[:, None, None]
+    window.wall_velocity.mul_(factor)
+    given = window.part(slice(6))
+    state = network(wall_velocity=True).start(given)
     speeds = []
     for _ in range(3):
-        speeds.append(float(state.wall_velocity[0, 0, 0, 0]))
-        state = state.move(state.position, state.velocity[:, -1])
+        left_wall = state.wall_velocity[0, 0, 0]
+        speeds.append(float(left_wall[0]))
+        last_velocity = state.velocity[:, -1]
+        state = state.move(state.position, last_velocity)
     assert speeds == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 
@@ -251,7 +306,8 @@ def flight_to_the_right_wall() -> Any:
     time = np.arange(6)
     x = 0.93 - 0.004 * (5 - time)
     y = 0.5 + 0.001 * time
-    return batch(np.stack([x, y], axis=-1)[:, None])
+    path = np.stack([x, y], axis=-1)
+    return batch(path[:, None])
 
 
 def test_a_particle_that_flies_out_stops_at_the_wall() -> None:
@@ -270,20 +326,24 @@ def test_a_particle_that_flies_out_stops_at_the_wall() -> None:
 
 
 def test_without_clamp_a_particle_flies_out() -> None:
-    path = rolled(network(clamp=False), flight_to_the_right_wall(), 3)
-    assert float(path[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
+    model = network(clamp=False)
+    path = rolled(model, flight_to_the_right_wall(), 3)
+    last_x = float(path[0, -1, 0])
+    assert last_x == pytest.approx(0.942, abs=1e-6)
 
 
 @TARGETS
 def test_no_rollout_leaves_the_box(target: str) -> None:
     """Whatever a network says: of 256 particles over 30 frames none is outside."""
     model = network(awake=True, target=target)
-    torch.nn.init.normal_(model.network.decoder[-1].bias, std=50.0)
-    path = rolled(model, batch(swirl(0, 6)), 30)
-    low, high = torch.tensor(info().bounds).T
-    is_inside = (path >= low) & (path <= high)
+    decoder_bias = model.network.decoder[-1].bias
+    torch.nn.init.normal_(decoder_bias, std=50.0)
+    path = roll_out(model, swirl(0, 6), 30)
+    bounds = torch.tensor(info().bounds)
+    low, high = bounds.T
+    assert bool((path >= low).all())
+    assert bool((path <= high).all())
     is_stopped = (path == low) | (path == high)
-    assert bool(is_inside.all())
     assert bool(is_stopped.any())
 
 
@@ -297,48 +357,63 @@ class RecordingNetwork(GraphNetwork):
         self, state: ParticleState, *_: object
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Record the state."""
-        self.states = [*getattr(self, "states", []), state]
+        earlier_states = getattr(self, "states", [])
+        self.states = [*earlier_states, state]
         return torch.zeros_like(state.position), {}
 
 
 def test_noise_stays_in_the_box() -> None:
     """Noise moves particles that rest at a wall to its inner side only."""
     y = 0.3 + 0.05 * np.arange(8)
-    resting = np.stack([np.full(8, 0.9375), y], axis=-1)
-    window = batch(np.repeat(resting[None], 7, axis=0))
-    model = RecordingNetwork.build(SMALL | {"noise_std": 1e-3}, info())
+    x = np.full(8, 0.9375)
+    resting = np.stack([x, y], axis=-1)
+    frames = np.repeat(resting[None], 7, axis=0)
+    window = batch(frames)
+    options = SMALL | {"noise_std": 1e-3}
+    model = RecordingNetwork.build(options, info())
     model(window, seeded())
-    x = model.states[0].position[:, 0]
-    assert float(x.max()) == 0.9375
-    assert float(x.min()) < 0.9375
+    noisy_x = model.states[0].position[:, 0]
+    assert float(noisy_x.max()) == 0.9375
+    assert float(noisy_x.min()) < 0.9375
 
 
 def test_a_wall_passes_gradients_on() -> None:
     """A prediction that a wall stops learns to stop before it, where the truth does."""
-    x = np.append(0.9275 + 0.002 * np.arange(6), 0.936)
+    given_x = 0.9275 + 0.002 * np.arange(6)
+    x = np.append(given_x, 0.936)
     y = np.full(7, 0.5)
-    arriving = np.stack([x, y], axis=-1)[:, None]
+    path = np.stack([x, y], axis=-1)
+    arriving = path[:, None]
     model = network()
-    loss = model(batch(arriving))["acceleration"]
-    (gradient,) = torch.autograd.grad(loss, model.network.decoder[-1].bias)
+    terms = model(batch(arriving))
+    decoder_bias = model.network.decoder[-1].bias
+    (gradient,) = torch.autograd.grad(terms["acceleration"], decoder_bias)
 
-    path = rolled(model, batch(arriving[:6]), 1)
-    assert float(path[0, 0, 0]) == 0.9375
+    predicted = roll_out(model, arriving[:6], 1)
+    assert float(predicted[0, 0, 0]) == 0.9375
     # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are
     # multiplied by.
-    assert float(gradient[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
+    expected = 2 * 0.0015 / 0.0002
+    assert float(gradient[0]) == pytest.approx(expected, rel=1e-3)
 
 
 def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     """A change of the wall velocity in an older frame changes nothing."""
-    frames = np.repeat(jittered(0)[None], 7, axis=0)
+    at_rest = jittered(0)[None]
+    frames = np.repeat(at_rest, 7, axis=0)
     window = batch(frames, walls=True)
-    model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
+    model = network(
+        awake=True,
+        layers=1,
+        wall_velocity=True,
+        wall_reach=1.0,
+    )
 
     def step_with(wall_velocity: Tensor) -> Tensor:
         forced = replace(window, wall_velocity=wall_velocity)
+        given = forced.part(slice(6))
         with torch.no_grad():
-            state, _ = model.step(model.start(forced.part(slice(6))))
+            state, _ = model.step(model.start(given))
         return state.position
 
     def reverse_walls_at(frame: int) -> Tensor:
@@ -347,35 +422,43 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
         return wall_velocity
 
     position = step_with(window.wall_velocity)
-    assert torch.equal(step_with(reverse_walls_at(5)), position)
+    older_position = step_with(reverse_walls_at(5))
+    assert torch.equal(older_position, position)
 
     difference = step_with(reverse_walls_at(6)) - position
     is_changed = difference.abs().amax(dim=1) > 0
     low, high = torch.tensor(info().bounds).T
     last = window.position[:, 5]
-    wall_distance = torch.minimum(last - low, high - last).amin(dim=1)
-    assert bool(is_changed[wall_distance < 0.9 * RADIUS].all())
+    nearer_wall = torch.minimum(last - low, high - last)
+    wall_distance = nearer_wall.amin(dim=1)
+    is_near = wall_distance < 0.9 * RADIUS
+    is_far = wall_distance > 2.0 * RADIUS
+    assert bool(is_changed[is_near].all())
     # One layer: a particle hears of the walls of its neighbours at most.
-    assert not bool(is_changed[wall_distance > 2.0 * RADIUS].any())
+    assert not bool(is_changed[is_far].any())
 
 
 def test_forgetful_windows_start_from_their_last_frames() -> None:
     """Every number of frames comes up, except all of them."""
-    window = batch(*(swirl(seed, 7) for seed in range(24)))
-    model = RecordingNetwork.build(SMALL | {"forgetful": 1.0}, info())
+    windows = [swirl(seed, 7) for seed in range(24)]
+    window = batch(*windows)
+    options = SMALL | {"forgetful": 1.0}
+    model = RecordingNetwork.build(options, info())
     model(window, seeded())
     velocity = model.states[0].velocity
 
     velocity_by_frame_count = {}
     for frame_count in range(2, 7):
         short = window.part(slice(6 - frame_count, 6))
-        velocity_by_frame_count[frame_count] = model.start(short).velocity
+        state = model.start(short)
+        velocity_by_frame_count[frame_count] = state.velocity
     frame_counts = set()
     for sample in range(24):
         members = window.sample == sample
+        sample_velocity = velocity[members]
         matches = []
         for frame_count, start_velocity in velocity_by_frame_count.items():
-            if torch.equal(velocity[members], start_velocity[members]):
+            if torch.equal(sample_velocity, start_velocity[members]):
                 matches.append(frame_count)
         assert len(matches) == 1
         frame_counts.update(matches)
@@ -383,7 +466,8 @@ def test_forgetful_windows_start_from_their_last_frames() -> None:
 
     # In validation there is no generator, and windows forget nothing.
     model(window)
-    assert torch.equal(model.states[1].velocity, velocity_by_frame_count[6])
+    all_velocities = velocity_by_frame_count[6]
+    assert torch.equal(model.states[1].velocity, all_velocities)
 
 
 def test_half_precision_moves_particles_in_full() -> None:
@@ -394,9 +478,10 @@ def test_half_precision_moves_particles_in_full() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         half = rolled(model, window, 1)
     assert half.dtype == torch.float32
-    displacement = (exact[:, 0] - window.position[:, -1]).abs().max()
-    difference = float((half - exact).abs().max())
-    assert 0.0 < difference < 0.02 * float(displacement)
+    last = window.position[:, -1]
+    displacement = greatest_difference(exact[:, 0], last)
+    difference = greatest_difference(half, exact)
+    assert 0.0 < difference < 0.02 * displacement
 
 
 def test_half_precision_changes_the_loss_by_rounding_only() -> None:
@@ -414,12 +499,13 @@ def test_half_precision_changes_the_loss_by_rounding_only() -> None:
 def test_scales_are_no_weights() -> None:
     """Weights stored in half precision bring back a model with the scales in full."""
     model = network(awake=True)
-    stored = {}
-    for name, value in model.state_dict().items():
-        stored[name] = value.bfloat16()
+    state = model.state_dict()
+    stored = {name: value.bfloat16() for name, value in state.items()}
     loaded = network()
     loaded.load_state_dict(stored)
     for name in ("position", "velocity", "acceleration"):
         deviation = getattr(model, name).std
-        assert torch.equal(getattr(loaded, name).std, deviation)
-    assert float(loaded.velocity.std[0]) == pytest.approx(0.004, rel=1e-7)
+        loaded_deviation = getattr(loaded, name).std
+        assert torch.equal(loaded_deviation, deviation)
+    x_deviation = float(loaded.velocity.std[0])
+    assert x_deviation == pytest.approx(0.004, rel=1e-7)

@@ -126,7 +126,8 @@ def test_windows_side_by_side_are_as_alone() -> None:
     position_tensor = to_tensor(position)
     velocity_tensor = to_tensor(velocity)
     counts = [150, 0, 200]
-    sample = torch.arange(3).repeat_interleave(torch.tensor(counts))
+    repeats = torch.tensor(counts)
+    sample = torch.arange(3).repeat_interleave(repeats)
 
     fields = compute_fields(
         position_tensor,
@@ -138,12 +139,24 @@ def test_windows_side_by_side_are_as_alone() -> None:
     )
     for window, end in enumerate(np.cumsum(counts)):
         members = slice(end - counts[window], end)
-        alone = reference.fields(position[members], velocity[members], grid, full=full)
-        assert_allclose(fields.velocity[window].numpy(), alone.velocity, atol=1e-15)
-        assert_allclose(fields.weight[window].numpy(), alone.weight, atol=1e-12)
+        alone = reference.fields(
+            position[members],
+            velocity[members],
+            grid,
+            full=full,
+        )
+        window_velocity = fields.velocity[window].numpy()
+        window_weight = fields.weight[window].numpy()
+        assert_allclose(window_velocity, alone.velocity, atol=1e-15)
+        assert_allclose(window_weight, alone.weight, atol=1e-12)
 
     # The number of windows follows from the samples.
-    sums = torch_grid.transfer(position_tensor, velocity_tensor, grid, sample=sample)
+    sums = torch_grid.transfer(
+        position_tensor,
+        velocity_tensor,
+        grid,
+        sample=sample,
+    )
     assert torch.equal(sums.weight, fields.weight)
 
 
@@ -154,8 +167,15 @@ def test_counted_nodes_may_be_those_of_the_truth() -> None:
     position, velocity = draw_particles(400)
     shrunk = position / 2
 
-    counted = reference.fields(position, velocity, grid, full=full).counted
-    expected = reference.fields(shrunk, velocity, grid, full=full, counted=counted)
+    truth = reference.fields(position, velocity, grid, full=full)
+    counted = truth.counted
+    expected = reference.fields(
+        shrunk,
+        velocity,
+        grid,
+        full=full,
+        counted=counted,
+    )
     fields = compute_fields(
         to_tensor(shrunk),
         to_tensor(velocity),
@@ -166,7 +186,10 @@ def test_counted_nodes_may_be_those_of_the_truth() -> None:
     compare_fields(fields, expected, 1e-12)
 
 
-@pytest.mark.parametrize("name", ["density", "velocity", "vorticity", "divergence"])
+GRADIENT_FIELDS = ["density", "velocity", "vorticity", "divergence"]
+
+
+@pytest.mark.parametrize("name", GRADIENT_FIELDS)
 @pytest.mark.parametrize("cells", [4, 5])
 def test_gradients_are_those_of_finite_differences(name: str, cells: int) -> None:
     """Positions and velocities both have gradients."""
@@ -174,11 +197,18 @@ def test_gradients_are_those_of_finite_differences(name: str, cells: int) -> Non
     position, velocity = draw_tensors(40, seed=3, low=-0.05, high=0.9)
     velocity = 100 * velocity
     full = grid.full_weight(40, 0.9)
-    counted = compute_fields(position, velocity, grid, full=full).counted
+    start = compute_fields(position, velocity, grid, full=full)
+    counted = start.counted
     assert counted.any()
 
     def field(position: Tensor, velocity: Tensor) -> Tensor:
-        fields = compute_fields(position, velocity, grid, full=full, counted=counted)
+        fields = compute_fields(
+            position,
+            velocity,
+            grid,
+            full=full,
+            counted=counted,
+        )
         return torch.as_tensor(getattr(fields, name))
 
     position.requires_grad_()
@@ -197,14 +227,16 @@ def test_weight_and_momentum_are_conserved() -> None:
 
     sums = torch_grid.transfer(position, velocity, Grid(8))
     mass = sums.weight.sum()
-    assert_close(mass, torch.tensor(30.0, dtype=torch.float64))
+    particle_count = torch.tensor(30.0).double()
+    assert_close(mass, particle_count)
 
     total = mass + sums.momentum.sum()
     position_gradient, velocity_gradient = torch.autograd.grad(
         total, (position, velocity)
     )
     assert_close(velocity_gradient, torch.ones_like(velocity))
-    assert float(position_gradient.abs().max()) < 1e-12
+    greatest_slope = position_gradient.abs().max()
+    assert float(greatest_slope) < 1e-12
 
 
 def test_lost_particles_have_no_weight_and_no_gradient() -> None:
@@ -214,18 +246,22 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
     """
     position, velocity = draw_tensors(50)
     position[0] = torch.tensor([1.5, 0.5])
-    position[1] = torch.tensor([float("nan"), 0.5])
-    position[2] = torch.tensor([0.5, -float("inf")])
+    position[1] = torch.tensor([torch.nan, 0.5])
+    position[2] = torch.tensor([0.5, -torch.inf])
     velocity[1] = float("nan")
     grid = Grid(6)
 
-    expected = compute_fields(position[3:], velocity[3:], grid, full=2.0)
+    other_position = position[3:].clone()
+    other_velocity = velocity[3:].clone()
+    expected = compute_fields(other_position, other_velocity, grid, full=2.0)
     position.requires_grad_()
     velocity.requires_grad_()
     fields = compute_fields(position, velocity, grid, full=2.0)
     assert_close(fields.velocity, expected.velocity)
 
-    loss = fields.vorticity.square().sum() + fields.density.square().sum()
+    square_vorticity = fields.vorticity.square()
+    square_density = fields.density.square()
+    loss = square_vorticity.sum() + square_density.sum()
     loss.backward()
     for gradient in (position.grad, velocity.grad):
         assert bool(gradient.isfinite().all())
@@ -258,6 +294,7 @@ def test_shapes_that_do_not_fit_are_refused(
         torch_grid.transfer(position, velocity, Grid(4), sample=sample)
 
 
+Bounds = tuple[tuple[float, float], tuple[float, float]]
 BOX = ((0.0625, 0.9375), (0.0625, 0.9375))
 OBLONG_BOX = ((0.1, 0.9), (0.2, 0.5))
 
@@ -270,8 +307,8 @@ def draw_cloud(
 ) -> Tensor:
     """Return random places in a square box, some of them on its walls and corners."""
     rng = np.random.default_rng(seed)
-    places = rng.uniform(low, high, (particles, 2)).astype(np.float32)
-    cloud = torch.from_numpy(places)
+    places = rng.uniform(low, high, (particles, 2))
+    cloud = torch.from_numpy(places).float()
     cloud[0] = low
     cloud[1] = high
     cloud[2, 0] = high
@@ -284,11 +321,18 @@ def one_window(particles: int) -> Tensor:
     return torch.zeros(particles, dtype=torch.int64)
 
 
+def spread_mass_of(grid: ParticleGrid, position: Tensor) -> Tensor:
+    """Return the mass at the nodes of particles that weigh 1 each."""
+    count = len(position)
+    stencil = grid.stencil(position, one_window(count))
+    mass = torch.ones(count, 1)
+    sums = grid.spread(stencil, mass, 1)
+    return sums[0, 0]
+
+
 @pytest.mark.parametrize("cells", [4, 7, 18, 22])
 @pytest.mark.parametrize("bounds", [BOX, OBLONG_BOX])
-def test_weights_are_a_partition_of_unity(
-    cells: int, bounds: tuple[tuple[float, float], tuple[float, float]]
-) -> None:
+def test_weights_are_a_partition_of_unity(cells: int, bounds: Bounds) -> None:
     """Nine weights sum to 1 anywhere in the box, its walls and corners too."""
     grid = ParticleGrid(bounds, cells, multiple=4)
     low, high = torch.tensor(bounds).T
@@ -297,16 +341,20 @@ def test_weights_are_a_partition_of_unity(
     place = place.clamp(low, high)
     stencil = grid.stencil(place, one_window(500))
 
+    columns, rows = grid.shape
+    total_weight = stencil.weight.sum(dim=1)
     assert float(stencil.weight.min()) >= 0.0
-    assert_close(stencil.weight.sum(dim=1), torch.ones(500))
+    assert_close(total_weight, torch.ones(500))
     assert int(stencil.node.min()) >= 0
-    assert int(stencil.node.max()) < grid.shape[0] * grid.shape[1]
-    sums = grid.spread(stencil, torch.ones(500, 1), 1)
-    assert float(sums.sum()) == pytest.approx(500, rel=1e-5)
+    assert int(stencil.node.max()) < columns * rows
+    mass = spread_mass_of(grid, place)
+    assert float(mass.sum()) == pytest.approx(500, rel=1e-5)
 
     # Quadratic B-splines reproduce the plane 2 + 3 x - 5 y.
     x, y = place.T
-    plane = 2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y
+    node_x = grid.axis_x[:, None]
+    node_y = grid.axis_y
+    plane = 2.0 + 3.0 * node_x - 5.0 * node_y
     gathered = grid.gather(stencil, plane[None, None])[:, 0]
     expected = 2.0 + 3.0 * x - 5.0 * y
     assert_close(gathered, expected, rtol=0, atol=1e-5)
@@ -317,10 +365,12 @@ def test_spread_is_the_scorers_transfer() -> None:
     place = draw_cloud(400, low=0.1, high=0.9)
     generator = torch.Generator().manual_seed(0)
     velocity = torch.randn(400, 2, generator=generator)
-    grid = ParticleGrid(((0.0, 1.0), (0.0, 1.0)), 16)
+    unit_square = ((0.0, 1.0), (0.0, 1.0))
+    grid = ParticleGrid(unit_square, 16)
 
     stencil = grid.stencil(place, one_window(400))
-    mass_and_momentum = torch.cat([torch.ones(400, 1), velocity], dim=1)
+    mass = torch.ones(400, 1)
+    mass_and_momentum = torch.cat([mass, velocity], dim=1)
     sums = grid.spread(stencil, mass_and_momentum, 1)
     inner = sums[0, :, 1:-1, 1:-1]
     weight = inner[0]
@@ -345,7 +395,8 @@ def test_gather_is_the_adjoint_of_spread() -> None:
     gathered = grid.gather(stencil, field)
     on_nodes = (spread.double() * field).sum()
     on_particles = (value.double() * gathered).sum()
-    assert float(on_nodes) == pytest.approx(float(on_particles), rel=1e-5)
+    expected = float(on_particles)
+    assert float(on_nodes) == pytest.approx(expected, rel=1e-5)
 
     # The particles of one layer give what they give alone.
     first = layer == 0
@@ -367,7 +418,8 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     stencil = grid.stencil(place, layer)
     mass = grid.spread(stencil, torch.ones(200, 1), 2)
     acceleration = grid.accelerate(stencil, place, stress, mass)
-    force = (acceleration * mass).permute(0, 2, 3, 1).reshape(-1, 3, 2)
+    force_field = (acceleration * mass).permute(0, 2, 3, 1)
+    force = force_field.reshape(-1, 3, 2)
 
     # The slope of each of the nine weights at each particle, shape [200, 9, 2].
     variable = place.clone().requires_grad_()
@@ -381,20 +433,26 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
         )
         slopes.append(slope)
 
-    matrix = stress[..., [0, 1, 1, 2]].unflatten(2, (2, 2))
-    pull = torch.einsum("pfcd,pnd->pnfc", matrix, torch.stack(slopes, dim=1))
+    components = stress[..., [0, 1, 1, 2]]
+    matrix = components.unflatten(2, (2, 2))
+    slope_of_node = torch.stack(slopes, dim=1)
+    pull = torch.einsum("pfcd,pnd->pnfc", matrix, slope_of_node)
     pull = -grid.spacing * pull
     columns, rows = grid.shape
-    expected = torch.zeros(2 * columns * rows, 3, 2)
+    node_count = 2 * columns * rows
+    expected = torch.zeros(node_count, 3, 2)
     expected.index_add_(0, stencil.node, pull.flatten(0, 1))
     assert_close(force, expected, rtol=0, atol=2e-5)
 
-    nodes = torch.cartesian_prod(grid.axis_x, grid.axis_y).repeat(2, 1)
-    x, y = nodes.T[..., None]
-    moment = (x * force[..., 1] - y * force[..., 0]).sum(0)
+    nodes = torch.cartesian_prod(grid.axis_x, grid.axis_y)
+    x, y = nodes.repeat(2, 1).T[..., None]
+    force_x, force_y = force.unbind(2)
+    moment = (x * force_y - y * force_x).sum(0)
     total = force.sum(dim=0)
-    assert_close(total, torch.zeros(3, 2), rtol=0, atol=1e-4)
-    assert_close(moment, torch.zeros(3), rtol=0, atol=1e-4)
+    no_force = torch.zeros(3, 2)
+    no_moment = torch.zeros(3)
+    assert_close(total, no_force, rtol=0, atol=1e-4)
+    assert_close(moment, no_moment, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("swap", [False, True])
@@ -417,15 +475,13 @@ def test_the_image_of_a_transfer_is_the_transfer_of_the_image(
     if swap:
         image = image.flip(1)
 
-    def spread_mass(position: Tensor) -> Tensor:
-        stencil = grid.stencil(position, one_window(300))
-        return grid.spread(stencil, torch.ones(300, 1), 1)[0, 0]
-
-    mirrored_axes = [axis for axis, sign in enumerate(signs) if sign < 0]
-    expected = spread_mass(place).flip(mirrored_axes)
+    mirrored_axes = [axis for axis in (0, 1) if signs[axis] < 0]
+    mass = spread_mass_of(grid, place)
+    expected = mass.flip(mirrored_axes)
     if swap:
         expected = expected.T
-    assert_close(spread_mass(image), expected, rtol=0, atol=1e-4)
+    image_mass = spread_mass_of(grid, image)
+    assert_close(image_mass, expected, rtol=0, atol=1e-4)
 
 
 def test_walls_lie_between_two_rows_of_nodes() -> None:
@@ -433,7 +489,8 @@ def test_walls_lie_between_two_rows_of_nodes() -> None:
     grid = ParticleGrid(BOX, 7)
     distance = grid.wall_distance(1.0)
     for wall, beside in enumerate(grid.beside_walls()):
-        assert int(beside.sum()) == 2 * grid.shape[wall // 2]
+        nodes_along = grid.shape[wall // 2]
+        assert int(beside.sum()) == 2 * nodes_along
         nearest = distance[wall][beside.bool()].abs()
         half_cell = torch.full_like(nearest, grid.spacing / 2)
         assert_close(nearest, half_cell)
@@ -442,8 +499,14 @@ def test_walls_lie_between_two_rows_of_nodes() -> None:
 def test_positions_without_a_number_gather_no_number() -> None:
     """A rollout that diverges gives NaN, which the rollout freezes, and no error."""
     grid = ParticleGrid(BOX, 7)
-    place = torch.tensor([[torch.nan, 0.5], [0.5, 0.5]])
+    place = torch.tensor(
+        [
+            [torch.nan, 0.5],
+            [0.5, 0.5],
+        ]
+    )
     stencil = grid.stencil(place, one_window(2))
-    gathered = grid.gather(stencil, torch.ones(1, 1, *grid.shape))
+    ones = torch.ones(1, 1, *grid.shape)
+    gathered = grid.gather(stencil, ones)
     assert gathered[0].isnan().all()
     assert gathered[1].isfinite().all()
