@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from simple_models import OPERATORS, graph
+from simple_models import OPERATORS, Graph, graph
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -30,7 +30,10 @@ from lagbench.errors import UsageError
 EVERY = pytest.mark.parametrize("operator", OPERATORS)
 
 
-def network(operator: type[Operator], **options: Any) -> EncodeProcessDecode:
+def network(
+    operator: type[Operator],
+    **options: Any,
+) -> EncodeProcessDecode:
     """Return a small network with weights of seed 0."""
     torch.manual_seed(0)
     sizes = {
@@ -50,8 +53,10 @@ def apply_to_concatenation(
 ) -> Tensor:
     """Return the MLP of the concatenation [edge, receiver, sender]."""
     sender, receiver = edge_index
-    whole = torch.cat([edge, node[receiver], node[sender]], dim=1)
-    hidden = nn.functional.linear(whole, layer.first.weight, layer.first.bias)
+    parts = [edge, node[receiver], node[sender]]
+    whole = torch.cat(parts, dim=1)
+    first = layer.first
+    hidden = nn.functional.linear(whole, first.weight, first.bias)
     update: Tensor = layer.rest(hidden)
     return update
 
@@ -59,14 +64,27 @@ def apply_to_concatenation(
 def largest_relative_error(value: Tensor, expected: Tensor) -> float:
     """Return the largest error over the largest expected value."""
     error = (value - expected).abs().max()
-    return (error / expected.abs().max()).item()
+    scale = expected.abs().max()
+    return (error / scale).item()
+
+
+def small_graph() -> Graph:
+    """Return a random graph with the features of the small network."""
+    return graph(30, 150, node=7, edge=3)
+
+
+def total_loss(prediction: Tensor, losses: Losses) -> Tensor:
+    """Return a loss in which every output has a part."""
+    own_losses = sum(losses.values())
+    return prediction.square().sum() + own_losses
 
 
 def test_products_per_node_give_the_mlp_of_the_concatenation() -> None:
     """In float32 they agree to 6e-7."""
     torch.manual_seed(0)
     layer = EdgeMLP(128, 128)
-    node, edge_index, edge = graph(200, 1600, node=128, edge=128)
+    inputs = graph(200, 1600, node=128, edge=128)
+    node, edge_index, edge = inputs
     update = layer(edge, node, edge_index)
     expected = apply_to_concatenation(
         layer.double(),
@@ -102,11 +120,13 @@ def test_recomputed_hidden_layers_give_the_same_gradients(
             update = layer(edge, node, inputs.edge_index)
         loss = update.square().sum()
         variables = [node, edge, *layer.parameters()]
-        return [update, *torch.autograd.grad(loss, variables)]
+        gradients = torch.autograd.grad(loss, variables)
+        return [update, *gradients]
 
     from_memory = compute_update_and_gradients(1e12)
     recomputed = compute_update_and_gradients(0.0)
-    for value, expected in zip(recomputed, from_memory, strict=True):
+    pairs = zip(recomputed, from_memory, strict=True)
+    for value, expected in pairs:
         assert largest_relative_error(value, expected) < tolerance
 
 
@@ -124,7 +144,8 @@ def test_gradients_of_the_edge_update_are_finite_differences(
     def update(edge: Tensor, node: Tensor, *_: Tensor) -> Tensor:
         return layer(edge, node, inputs.edge_index)
 
-    torch.autograd.gradcheck(update, (edge, node, *layer.parameters()))
+    variables = (edge, node, *layer.parameters())
+    torch.autograd.gradcheck(update, variables)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 257])
@@ -147,8 +168,9 @@ def test_linear_and_its_gradients_are_those_of_numpy(rows: int) -> None:
 
     exact_x = x.detach().double().numpy()
     exact_weight = weight.detach().double().numpy()
+    exact_bias = bias.detach().numpy()
     exact_slope = slope.double().numpy()
-    compare(y.detach(), exact_x @ exact_weight.T + bias.detach().numpy())
+    compare(y.detach(), exact_x @ exact_weight.T + exact_bias)
     compare(x.grad, exact_slope @ exact_weight)
     compare(weight.grad, exact_slope.T @ exact_x)
     compare(bias.grad, exact_slope.sum(axis=0))
@@ -160,9 +182,11 @@ def test_linear_leaves_other_types_and_shapes_to_torch() -> None:
     x = torch.randn(2, 3, 5)
     expected = nn.functional.linear(x, layer.weight, layer.bias)
     assert torch.equal(layer(x), expected)
-    assert layer.double()(x.double()).dtype == torch.float64
+    exact_layer = layer.double()
+    assert exact_layer(x.double()).dtype == torch.float64
     with torch.autocast("cpu", torch.bfloat16):
-        assert layer.float()(x[0]).dtype == torch.bfloat16
+        rounded = layer.float()(x[0])
+    assert rounded.dtype == torch.bfloat16
 
 
 def test_layer_norm_learns_in_bfloat16() -> None:
@@ -181,8 +205,10 @@ def test_layer_norm_learns_in_bfloat16() -> None:
     rounded = [rounded_x, *layer.parameters()]
     exact = [exact_x, *exact_layer.parameters()]
     for variable, exact_variable in zip(rounded, exact, strict=True):
-        difference = (variable.grad - exact_variable.grad).norm()
-        assert float(difference / exact_variable.grad.norm()) < 0.03
+        exact_gradient = exact_variable.grad
+        difference = (variable.grad - exact_gradient).norm()
+        relative_error = difference / exact_gradient.norm()
+        assert float(relative_error) < 0.03
 
 
 def test_a_layer_is_the_interaction_network_node_by_node() -> None:
@@ -191,15 +217,18 @@ def test_a_layer_is_the_interaction_network_node_by_node() -> None:
     inputs = graph(6, 12, node=8, edge=8)
     node = inputs.node.double()
     edge = inputs.edge.double()
-    _, receiver = inputs.edge_index
-    new_node, new_edge, _ = layer(node, inputs.edge_index, edge)
+    edge_index = inputs.edge_index
+    _, receiver = edge_index
+    new_node, new_edge, _ = layer(node, edge_index, edge)
 
-    message = apply_to_concatenation(layer.message, edge, node, inputs.edge_index)
-    assert_close(new_edge, edge + message, rtol=1e-10, atol=1e-10)
+    message = apply_to_concatenation(layer.message, edge, node, edge_index)
+    expected_edge = edge + message
+    assert_close(new_edge, expected_edge, rtol=1e-10, atol=1e-10)
     for i in range(6):
         total = message[receiver == i].sum(dim=0)
-        update = layer.update(torch.cat([node[i], total]))
-        assert_close(new_node[i], node[i] + update, rtol=1e-10, atol=1e-10)
+        own_and_total = torch.cat([node[i], total])
+        expected_node = node[i] + layer.update(own_and_total)
+        assert_close(new_node[i], expected_node, rtol=1e-10, atol=1e-10)
 
 
 @EVERY
@@ -208,24 +237,31 @@ def test_every_layer_adds_something_else_to_the_edges(operator: type[Operator]) 
     model = network(operator, layers=10)
     latents: list[Tensor] = []
 
-    def record_edges(_: nn.Module, inputs: tuple[Tensor, ...], __: object) -> None:
+    def record_edges(
+        _: nn.Module,
+        inputs: tuple[Tensor, ...],
+        __: object,
+    ) -> None:
         latents.append(inputs[2].detach())
 
     for layer in model.processor:
         layer.register_forward_hook(record_edges)
-    model(*graph(30, 150, node=7, edge=3))
-    changes = [after - before for before, after in itertools.pairwise(latents)]
-    for before, change in zip(latents, changes, strict=False):
+    model(*small_graph())
+    for before, after in itertools.pairwise(latents):
+        change = after - before
         cosine = nn.functional.cosine_similarity(before, change, dim=1)
-        assert float(change.abs().mean()) > 0.1
+        mean_change = change.abs().mean()
+        assert float(mean_change) > 0.1
         assert float(cosine.max()) < 0.999  # doubling would give 1
-    assert float(latents[-1].norm() / latents[0].norm()) < 20.0
+    growth = latents[-1].norm() / latents[0].norm()
+    assert float(growth) < 20.0
 
 
 def test_gns_has_1_6_million_parameters() -> None:
     """At latent 128 with 10 layers."""
     model = network(GNS, node_features=30, latent=128, layers=10)
-    count = sum(parameter.numel() for parameter in model.parameters())
+    parameters = model.parameters()
+    count = sum(parameter.numel() for parameter in parameters)
     square = 128 * 128 + 128
     norm = 2 * 128
     node_encoder = 31 * 128 + 2 * square + norm
@@ -233,12 +269,16 @@ def test_gns_has_1_6_million_parameters() -> None:
     edge_update = 385 * 128 + 2 * square + norm
     node_update = 257 * 128 + 2 * square + norm
     decoder = 2 * square + 129 * 2
-    expected = node_encoder + edge_encoder + 10 * (edge_update + node_update) + decoder
+    layer = edge_update + node_update
+    expected = node_encoder + edge_encoder + 10 * layer + decoder
     assert count == expected
     assert count == 1_591_682
 
 
-def shapes_beside_operators(model: torch.nn.Module) -> dict[str, torch.Size]:
+Shapes = dict[str, torch.Size]
+
+
+def shapes_beside_operators(model: torch.nn.Module) -> Shapes:
     """Return the shapes of all weights that do not belong to an operator."""
     shapes = {}
     for name, parameter in model.named_parameters():
@@ -261,8 +301,8 @@ def test_no_weight_is_idle(operator: type[Operator]) -> None:
     The bias of a key shifts all logits alike, so that its gradient may be 0.
     """
     model = network(operator)
-    prediction, losses = model(*graph(30, 150, node=7, edge=3))
-    loss = prediction.square().sum() + sum(losses.values())
+    prediction, losses = model(*small_graph())
+    loss = total_loss(prediction, losses)
     loss.backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
@@ -276,9 +316,10 @@ def test_windows_side_by_side(operator: type[Operator]) -> None:
     model = network(operator).eval()
     first = graph(12, 40, node=7, edge=3, seed=1)
     second = graph(9, 24, node=7, edge=3, seed=2)
+    second_index = second.edge_index + 12
     node = torch.cat([first.node, second.node])
     edge = torch.cat([first.edge, second.edge])
-    edge_index = torch.cat([first.edge_index, second.edge_index + 12], dim=1)
+    edge_index = torch.cat([first.edge_index, second_index], dim=1)
     together, _ = model(node, edge_index, edge)
     first_prediction, _ = model(*first)
     second_prediction, _ = model(*second)
@@ -295,9 +336,10 @@ def test_mixed_precision(operator: type[Operator]) -> None:
     with torch.autocast("cpu", torch.bfloat16):
         prediction, losses = model(*inputs)
     assert prediction.dtype == torch.float32
-    error = (prediction - exact).norm() / exact.norm()
+    difference = (prediction - exact).norm()
+    error = difference / exact.norm()
     assert error.item() < 0.05
-    loss = prediction.square().sum() + sum(losses.values())
+    loss = total_loss(prediction, losses)
     loss.backward()
     for parameter in model.parameters():
         assert parameter.grad is not None
@@ -310,7 +352,12 @@ class Total(Operator):
     method = "GNS + sum"
     weights = {"size": 0.5}  # noqa: RUF012
 
-    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        latent: int,
+        hidden: int,
+    ) -> None:
         super().__init__(inputs, latent, hidden)
         self.linear = nn.Linear(inputs, latent)
 
@@ -325,7 +372,13 @@ class Total(Operator):
         """Return what each node gathers and a loss of its own."""
         sender, receiver = edge_index
         total = node.index_add(0, receiver, node[sender])
-        return self.linear(total), {"size": total.square().mean()}
+        size = total.square().mean()
+        return self.linear(total), {"size": size}
+
+
+def twice(update: Tensor) -> Tensor:
+    """Return an update of twice as many columns."""
+    return torch.cat([update, update], dim=1)
 
 
 @pytest.mark.parametrize(
@@ -334,7 +387,7 @@ class Total(Operator):
         lambda update: update,
         lambda update: (update, None),
         lambda update: (update[:1], {}),
-        lambda update: (torch.cat([update, update], dim=1), {}),
+        lambda update: (twice(update), {}),
         lambda update: (update, {"size": 1.0}),
         lambda update: (update, {"size": update}),
     ],
@@ -352,8 +405,10 @@ def test_an_operator_that_returns_something_else_is_refused(
             update, _ = super().forward(*inputs, **options)
             return change_output(update)
 
+    model = network(Odd)
+    inputs = graph(12, 40, node=7, edge=3)
     with pytest.raises(UsageError) as caught:
-        network(Odd)(*graph(12, 40, node=7, edge=3))
+        model(*inputs)
     assert "Odd" in str(caught.value.where)
 
 
@@ -361,15 +416,21 @@ def test_the_loss_of_an_operator_is_the_mean_over_layers() -> None:
     model = network(Total)
     sizes: list[Tensor] = []
 
-    def record_loss(_: nn.Module, __: object, output: tuple[Any, ...]) -> None:
+    def record_loss(
+        _: nn.Module,
+        __: object,
+        output: tuple[Any, ...],
+    ) -> None:
         sizes.append(output[2]["size"])
 
     for layer in model.processor:
         layer.register_forward_hook(record_loss)
-    prediction, losses = model(*graph(12, 40, node=7, edge=3))
+    inputs = graph(12, 40, node=7, edge=3)
+    prediction, losses = model(*inputs)
     assert prediction.shape == (12, 2)
     mean = torch.stack(sizes).mean()
-    assert losses["size"].item() == pytest.approx(mean.item())
+    loss = losses["size"].item()
+    assert loss == pytest.approx(mean.item())
 
 
 @pytest.mark.slow

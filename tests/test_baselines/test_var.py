@@ -10,7 +10,13 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from simple_models import batch_of, info_of, rolled, rotations, share_of_persistence
+from simple_models import (
+    batch_of,
+    info_of,
+    rolled,
+    rotations,
+    share_of_persistence,
+)
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 
 from lagbench.baselines.var import (
@@ -29,13 +35,23 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 
-def random_orthogonal(rng: np.random.Generator, size: int) -> Array:
+def random_orthogonal(
+    rng: np.random.Generator,
+    size: int,
+) -> Array:
     """Return a random orthogonal matrix."""
-    q, _ = np.linalg.qr(rng.normal(size=(size, size)))
+    matrix = rng.normal(size=(size, size))
+    q, _ = np.linalg.qr(matrix)
     return q
 
 
-def series(frames: int, features: int, *, spread: float = 1.0, seed: int = 0) -> Floats:
+def series(
+    frames: int,
+    features: int,
+    *,
+    spread: float = 1.0,
+    seed: int = 0,
+) -> Floats:
     """Return noise whose features are mixed, shape [frame, feature].
 
     The singular values of the mixing matrix go from 1 down to `spread`.
@@ -52,15 +68,17 @@ def series(frames: int, features: int, *, spread: float = 1.0, seed: int = 0) ->
 
 def design_matrix(states: Floats, lags: int) -> Array:
     """Return regressors by hand, shape [row, 1 + lag x feature]."""
-    columns = [np.ones(len(states) - lags)]
+    row_count = len(states) - lags
+    columns = [np.ones(row_count)]
     for lag in range(1, lags + 1):
-        columns.append(states[lags - lag : len(states) - lag])
+        first = lags - lag
+        columns.append(states[first : first + row_count])
     return np.column_stack(columns).astype(float)
 
 
 def least_squares(x: Array, y: Array) -> Array:
     """Return the coefficients by LAPACK."""
-    coefficients: Array = np.linalg.lstsq(x, y, rcond=None)[0]
+    coefficients, *_ = np.linalg.lstsq(x, y, rcond=None)
     return coefficients
 
 
@@ -83,10 +101,12 @@ def relative_error(value: Array, expected: Array) -> float:
 def test_coefficients_are_those_of_statsmodels(lags: int, spread: float) -> None:
     """They agree within 1e-6, up to condition numbers of 1e6."""
     states = series(300, 24, spread=spread)
-    solution = solve(LaggedRows([states], lags=lags))
+    rows = LaggedRows([states], lags=lags)
+    solution = solve(rows)
     model = StatsmodelsVAR(states.astype(float))
     expected = model.fit(lags, trend="c").params
-    condition = np.linalg.cond(design_matrix(states, lags))
+    x = design_matrix(states, lags)
+    condition = np.linalg.cond(x)
     assert condition <= 1e6
     assert relative_error(solution.coefficients, expected) <= 1e-6
     assert solution.condition == pytest.approx(condition, rel=2e-3)
@@ -115,12 +135,14 @@ def test_the_solution_is_that_of_lapack(
     x = design_matrix(states, 1)
     y = states[1:].astype(float)
     expected = least_squares(x, y)
-    solution = solve(LaggedRows([states], lags=1))
+    rows = LaggedRows([states], lags=1)
+    solution = solve(rows)
     assert relative_error(solution.coefficients, expected) < tolerance
     condition = np.linalg.cond(x)
     assert solution.condition == pytest.approx(condition, rel=2e-3)
     if frames > 24:
-        normal_equations = np.linalg.solve(x.T @ x, x.T @ y)
+        gram = x.T @ x
+        normal_equations = np.linalg.solve(gram, x.T @ y)
         assert relative_error(normal_equations, expected) > tolerance
 
 
@@ -128,7 +150,8 @@ def test_equal_columns_fit_as_well() -> None:
     """The fit to a singular matrix is as good as the best; its condition says so."""
     states = series(200, 12)
     states[:, 5] = states[:, 4]
-    solution = solve(LaggedRows([states], lags=1))
+    rows = LaggedRows([states], lags=1)
+    solution = solve(rows)
     x = design_matrix(states, 1)
     y = states[1:].astype(float)
     residual = y - x @ solution.coefficients
@@ -144,27 +167,35 @@ def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
     longer_than_a_block = series(BLOCK + 300, 3, seed=1)
     plain = series(40, 3, seed=2)
     too_short = series(1, 3, seed=3)
-    rows = LaggedRows([longer_than_a_block, plain, too_short], lags=2)
+    scenarios = [longer_than_a_block, plain, too_short]
+    rows = LaggedRows(scenarios, lags=2)
 
-    blocks = [design_matrix(states, 2) for states in (longer_than_a_block, plain)]
+    blocks = [
+        design_matrix(longer_than_a_block, 2),
+        design_matrix(plain, 2),
+    ]
     x = np.concatenate(blocks)
-    y = np.concatenate([longer_than_a_block[2:], plain[2:]]).astype(float)
+    next_states = [longer_than_a_block[2:], plain[2:]]
+    y = np.concatenate(next_states).astype(float)
     assert rows.rows == len(x)
-    assert sum(len(block) for block, _ in rows) == len(x)
+    block_lengths = [len(block) for block, _ in rows]
+    assert sum(block_lengths) == len(x)
     coefficients = solve(rows).coefficients
     assert relative_error(coefficients, least_squares(x, y)) < 1e-12
 
 
 def test_scenarios_as_short_as_the_lags_are_refused() -> None:
+    rows = LaggedRows([series(2, 3)], lags=2)
     with pytest.raises(WorkFailedError, match="nothing to fit"):
-        solve(LaggedRows([series(2, 3)], lags=2))
+        solve(rows)
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
     states = series(30, 3)
     states[4, 1] = np.nan
+    rows = LaggedRows([states], lags=1)
     with pytest.raises(WorkFailedError, match="not finite"):
-        solve(LaggedRows([states], lags=1))
+        solve(rows)
 
 
 def noisy_orbits(
@@ -180,11 +211,15 @@ def noisy_orbits(
     for _ in range(scenarios):
         speed = rng.uniform(0.05, 0.3, particles)
         phase = rng.uniform(0, 2 * np.pi, particles)
-        angle = phase + speed * time + 0.4 * np.sin(0.2 * time)
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        wobble = 0.4 * np.sin(0.2 * time)
+        angle = phase + speed * time + wobble
+        x = np.cos(angle)
+        y = np.sin(angle)
+        circle = np.stack([x, y], axis=-1)
         orbit = 0.5 + 0.2 * circle
         noise = rng.normal(0.0, 0.01, orbit.shape)
-        orbits.append((orbit + noise).astype(np.float32))
+        noisy = orbit + noise
+        orbits.append(noisy.astype(np.float32))
     return orbits
 
 
@@ -194,8 +229,10 @@ def test_the_model_fits_what_statsmodels_fits() -> None:
     model = VAR.build({}, info_of([scenario]))
     report = model.fit(iter([scenario]))
     states = model.states(scenario).astype(float)
-    expected = StatsmodelsVAR(states).fit(1, trend="c").params
-    assert relative_error(model.coefficients.numpy(), expected) <= 1e-6
+    statsmodels = StatsmodelsVAR(states)
+    expected = statsmodels.fit(1, trend="c").params
+    coefficients = model.coefficients.numpy()
+    assert relative_error(coefficients, expected) <= 1e-6
     assert report["rows"] == 198
     assert 1 < report["condition"] < 1e6
 
@@ -205,26 +242,30 @@ def test_a_linear_motion_is_forecast() -> None:
     rng = np.random.default_rng(3)
     shape = (20, 1, 4, 2)
     phase = rng.uniform(0, 2 * np.pi, shape)
-    angle = phase + 0.2 * np.arange(40)[:, None, None]
+    time = np.arange(40)[:, None, None]
+    angle = phase + 0.2 * time
     amplitude = rng.uniform(0.05, 0.3, shape)
     position = 0.5 + amplitude * np.cos(angle)
     scenarios = list(position.astype(np.float32))
     model = VAR.build({}, info_of(scenarios))
     model.fit(scenarios[:19])
-    assert share_of_persistence(model, scenarios[19], frames=30) < 1e-6
+    share = share_of_persistence(model, scenarios[19], frames=30)
+    assert share < 1e-6
 
 
 def test_lags_count_from_the_latest_frame() -> None:
     """A step is the intercept + A_1 times the last state + A_2 times the one before."""
     scenario = noisy_orbits(1)[0]
-    model = VAR.build({"lags": 2}, info_of([scenario]))
+    info = info_of([scenario])
+    model = VAR.build({"lags": 2}, info)
     rng = np.random.default_rng(0)
     coefficients = rng.normal(0, 0.1, (49, 24))
     model.coefficients.copy_(torch.from_numpy(coefficients))
 
-    start = model.start(batch_of([scenario[:5]]))
+    given = scenario[:5]
+    start = model.start(batch_of([given]))
     next_state = model.next_state(start).flatten().numpy()
-    states = model.states(scenario[:5]).astype(float)
+    states = model.states(given).astype(float)
     before, last = states[-2:]
     regressors = np.concatenate([[1.0], last, before])
     expected = regressors @ model.coefficients.numpy()
@@ -233,7 +274,8 @@ def test_lags_count_from_the_latest_frame() -> None:
 
 def test_a_model_of_two_lags_starts_from_two_frames() -> None:
     scenario = noisy_orbits(1)[0]
-    model = VAR.build({"lags": 2}, info_of([scenario]))
+    info = info_of([scenario])
+    model = VAR.build({"lags": 2}, info)
     start = model.start(batch_of([scenario[:2]]))
     assert start.state.shape == (1, 2, 6, 4)
 
@@ -244,11 +286,14 @@ def test_one_step_of_training_and_of_a_rollout_agree() -> None:
     model = VAR.build({}, info_of(scenarios))
     model.fit(scenarios)
     window = scenarios[0][10:13]
-    predicted = rolled(model, batch_of([window[:2]]), 1)[:, 0]
+    before = batch_of([window[:2]])
+    predicted = rolled(model, before, 1)[:, 0]
+    truth = torch.from_numpy(window[2])
     deviation = torch.tensor(model.info.statistics["position_std"])
-    error = (predicted - torch.from_numpy(window[2])) / deviation
+    error = (predicted - truth) / deviation
     mean_square = float(error.square().mean())
-    loss = float(model(batch_of([window]))["position"])
+    terms = model(batch_of([window]))
+    loss = float(terms["position"])
     assert loss == pytest.approx(mean_square, rel=1e-3)
 
 
@@ -257,22 +302,27 @@ def test_without_ridge_and_truncation_stable_is_plain() -> None:
     scenarios = noisy_orbits(4)
     info = info_of(scenarios)
     plain = VAR.build({}, info)
-    stable = StableVAR.build({"rank": 1000, "ridge": 0}, info)
+    options = {"rank": 1000, "ridge": 0}
+    stable = StableVAR.build(options, info)
     plain.fit(scenarios)
     report = stable.fit(scenarios)
     assert report["variance"] == pytest.approx(1.0)
-    window = batch_of([scenario[20:22] for scenario in scenarios])
+    windows = [scenario[20:22] for scenario in scenarios]
+    window = batch_of(windows)
     step = rolled(stable, window, 1)
-    torch.testing.assert_close(step, rolled(plain, window, 1), atol=2e-5, rtol=0)
+    plain_step = rolled(plain, window, 1)
+    torch.testing.assert_close(step, plain_step, atol=2e-5, rtol=0)
 
 
 def test_with_a_light_ridge_a_rotation_is_learned() -> None:
     """It takes two directions of position and two of velocity."""
     scenarios = rotations(24)
-    model = StableVAR.build({"rank": 6, "ridge": 1e-3}, info_of(scenarios))
+    options = {"rank": 6, "ridge": 1e-3}
+    model = StableVAR.build(options, info_of(scenarios))
     model.fit(scenarios)
     new_angle = rotations(30)[-1]
-    assert share_of_persistence(model, new_angle, frames=20) < 0.1
+    share = share_of_persistence(model, new_angle, frames=20)
+    assert share < 0.1
 
 
 def test_a_heavy_ridge_leaves_persistence() -> None:
@@ -280,12 +330,14 @@ def test_a_heavy_ridge_leaves_persistence() -> None:
     scenarios = rotations(24)
     model = StableVAR.build({"ridge": 1e9}, info_of(scenarios))
     model.fit(scenarios)
-    window = batch_of([scenarios[0][:2]])
+    first_frames = scenarios[0][:2]
+    window = batch_of([first_frames])
     predicted = rolled(model, window, 1)[:, 0]
     step = predicted - window.position[:, -1]
     changes = []
     for positions in scenarios:
-        changes.append(np.diff(positions[1:].astype(float), axis=0))
+        later = positions[1:].astype(float)
+        changes.append(np.diff(later, axis=0))
     mean_change = np.concatenate(changes).mean(axis=0)
     assert_allclose(step.numpy(), mean_change, atol=1e-6)
 
@@ -294,16 +346,20 @@ def test_stable_holds_where_plain_diverges() -> None:
     """There are hardly more rows than features: the plain forecast leaves the box."""
     scenarios = noisy_orbits(2, frames=60, particles=25)
     info = info_of(scenarios)
-    window = batch_of([scenarios[0][:2]])
+    first_frames = scenarios[0][:2]
+    window = batch_of([first_frames])
 
     def greatest_distance(model: VAR | StableVAR) -> float:
         model.fit(scenarios)
         path = rolled(model, window, 200)
-        return float((path - 0.5).abs().max())
+        from_middle = path - 0.5
+        return float(from_middle.abs().max())
 
-    stable = StableVAR.build({"rank": 8, "ridge": 1.0}, info)
+    options = {"rank": 8, "ridge": 1.0}
+    stable = StableVAR.build(options, info)
+    plain = VAR.build({}, info)
     assert greatest_distance(stable) < 5
-    assert greatest_distance(VAR.build({}, info)) > 100
+    assert greatest_distance(plain) > 100
 
 
 def test_principal_directions_are_those_of_the_svd() -> None:
@@ -315,8 +371,10 @@ def test_principal_directions_are_those_of_the_svd() -> None:
         rank=10,
     )
     _, singular_values, right = np.linalg.svd(x)
-    assert_allclose(eigenvalues, singular_values[:10] ** 2, rtol=1e-9)
-    overlap = np.abs(directions.T @ right[:10].T)
+    squares = singular_values[:10] ** 2
+    assert_allclose(eigenvalues, squares, rtol=1e-9)
+    leading = right[:10].T
+    overlap = np.abs(directions.T @ leading)
     assert_allclose(overlap, np.eye(10), atol=1e-6)
 
 
