@@ -14,6 +14,7 @@ from lagbench.baselines.augmentation import (
     draw_mirror_matrices,
     mirror_batch,
 )
+from lagbench.baselines.baseline import Batch
 from lagbench.baselines.graph import (
     NodeFeatures,
     Standardisation,
@@ -28,7 +29,15 @@ BOUNDS = info().bounds
 
 def generator(seed: int = 0) -> torch.Generator:
     """Return a seeded source of randomness."""
-    return torch.Generator().manual_seed(seed)
+    source = torch.Generator()
+    return source.manual_seed(seed)
+
+
+def two_swirls() -> Batch:
+    """Return two windows of three frames, with walls."""
+    first = swirl(0, 3)
+    second = swirl(1, 3)
+    return batch(first, second, walls=True)
 
 
 def node_features(**options: bool) -> NodeFeatures:
@@ -49,8 +58,18 @@ def node_features(**options: bool) -> NodeFeatures:
 def test_noise_widens_the_deviation_of_the_data() -> None:
     """Data of deviation 3 and 0 with noise of deviation 4 have deviation 5 and 4."""
     scale = Standardisation((1.0, 2.0), (3.0, 0.0), noise=4.0)
-    value = torch.tensor([[6.0, 6.0], [-4.0, 2.0]])
-    expected = torch.tensor([[1.0, 1.0], [-1.0, 0.0]])
+    value = torch.tensor(
+        [
+            [6.0, 6.0],
+            [-4.0, 2.0],
+        ]
+    )
+    expected = torch.tensor(
+        [
+            [1.0, 1.0],
+            [-1.0, 0.0],
+        ]
+    )
     assert torch.equal(scale(value), expected)
     assert torch.equal(scale.inverse(expected), value)
 
@@ -73,7 +92,8 @@ def test_walls_are_seen_within_the_radius_only() -> None:
             [-1.0, 1.0, 1.0, 0.25],
         ]
     )
-    assert torch.equal(wall_distance(position, BOUNDS, RADIUS), expected)
+    distance = wall_distance(position, BOUNDS, RADIUS)
+    assert torch.equal(distance, expected)
 
 
 def test_edges_show_what_a_loop_over_pairs_shows() -> None:
@@ -85,8 +105,9 @@ def test_edges_show_what_a_loop_over_pairs_shows() -> None:
 
     expected = []
     for sender, receiver in edges.T.tolist():
-        x, y = position[sender] - position[receiver]
-        expected.append((x / RADIUS, y / RADIUS, np.hypot(x, y) / RADIUS))
+        difference = position[sender] - position[receiver]
+        x, y = difference / RADIUS
+        expected.append((x, y, np.hypot(x, y)))
     assert len(expected) > 500
     np.testing.assert_allclose(features, expected, atol=1e-14)
     assert features[:, 2].max() <= 1.0
@@ -102,12 +123,23 @@ def test_two_particles_in_one_place_have_no_gradient_of_distance() -> None:
         ],
         requires_grad=True,
     )
-    edges = torch.tensor([[0, 2], [1, 1]])
-    distance = edge_features(position, edges, RADIUS)[:, 2]
+    senders = [0, 2]
+    receivers = [1, 1]
+    edges = torch.tensor([senders, receivers])
+    features = edge_features(position, edges, RADIUS)
+    distance = features[:, 2]
     assert distance.tolist() == [0.0, 0.5]
     distance.sum().backward()
     # d distance / d y of the third is 1 / radius, of the second its opposite.
-    assert position.grad.tolist() == [[0.0, 0.0], [0.0, -16.0], [0.0, 16.0]]
+    expected = torch.tensor(
+        [
+            [0.0, 0.0],
+            [0.0, -16.0],
+            [0.0, 16.0],
+        ]
+    )
+    assert position.grad is not None
+    assert torch.equal(position.grad, expected)
 
 
 def test_a_particle_shows_thirty_numbers() -> None:
@@ -119,16 +151,29 @@ def test_a_particle_shows_thirty_numbers() -> None:
     # The deviations are (0.004, 0.003) and (0.0002, 0.0001): changes of 1, 2, 3 and 4
     # deviations end at 0.002 and 0.001.
     changes = torch.tensor([0.0, 1.0, 3.0, 6.0, 10.0])
-    velocity = changes[None, :, None] * torch.tensor([0.0002, 0.0001])
+    deviation = torch.tensor([0.0002, 0.0001])
+    velocity = changes[None, :, None] * deviation
     position = torch.tensor([[0.5, 0.5]])
-    numbers = features(position, velocity, torch.tensor([2]))
+    material = torch.tensor([2])
+    numbers = features(position, velocity, material)
 
     assert features.count == 30
     assert numbers.shape == (1, 30)
-    expected = torch.tensor([0.5, 1 / 3, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 4.0, 4.0])
-    assert_close(numbers[0, :10], expected)
-    assert numbers[0, 10:14].tolist() == [1.0] * 4
-    assert torch.equal(numbers[0, 14:], features.embedding.weight[2])
+    expected = torch.tensor(
+        [
+            [0.5, 1 / 3],
+            [1.0, 1.0],
+            [2.0, 2.0],
+            [3.0, 3.0],
+            [4.0, 4.0],
+        ]
+    )
+    motion = numbers[0, :10]
+    walls = numbers[0, 10:14]
+    embedding = features.embedding.weight[2]
+    assert_close(motion, expected.flatten())
+    assert walls.tolist() == [1.0] * 4
+    assert torch.equal(numbers[0, 14:], embedding)
 
 
 def test_moving_walls_are_felt_near_them() -> None:
@@ -138,15 +183,28 @@ def test_moving_walls_are_felt_near_them() -> None:
     """
     features = node_features(moving_walls=True)
     assert features.count == 38
-    position = torch.tensor([[0.5, 0.9375], [0.5, 0.90625], [0.5, 0.8]])
+    position = torch.tensor(
+        [
+            [0.5, 0.9375],
+            [0.5, 0.90625],
+            [0.5, 0.8],
+        ]
+    )
     wall_velocity = torch.zeros(3, 4, 2)
-    wall_velocity[:, 3] = torch.tensor([0.008, 0.003])
+    top_velocity = torch.tensor([0.008, 0.003])
+    wall_velocity[:, 3] = top_velocity
     at_rest = torch.zeros(3, 5, 2)
     material = torch.zeros(3, dtype=torch.int64)
 
     numbers = features(position, at_rest, material, wall_velocity)
     walls = numbers[:, 30:].reshape(3, 4, 2)
-    expected = torch.tensor([[2.0, 1.0], [1.0, 0.5], [0.0, 0.0]])
+    expected = torch.tensor(
+        [
+            [2.0, 1.0],
+            [1.0, 0.5],
+            [0.0, 0.0],
+        ]
+    )
     assert_close(walls[:, 3], expected)
     assert not walls[:, :3].any()
 
@@ -157,20 +215,26 @@ def test_moving_walls_are_felt_near_them() -> None:
 def test_features_do_not_see_where_particles_are() -> None:
     """Away from walls a common shift changes no bit of any feature."""
     features = node_features(moving_walls=True)
-    lattice = np.round(jittered(1, 8, 0.3, 0.6) * 1024) / 1024
+    cloud = jittered(1, 8, 0.3, 0.6)
+    lattice = np.round(cloud * 1024) / 1024
     position = torch.from_numpy(lattice).float()
     count = len(position)
-    velocity = torch.randn(count, 5, 2, generator=generator()) * 0.01
+    draw = torch.randn(count, 5, 2, generator=generator())
+    velocity = 0.01 * draw
     material = torch.arange(count) % 4
     walls = torch.randn(count, 4, 2, generator=generator())
-    shifted = position + torch.tensor([0.125, -0.0625])
+    shift = torch.tensor([0.125, -0.0625])
+    shifted = position + shift
 
     edges = radius_graph(position, RADIUS)
-    assert torch.equal(radius_graph(shifted, RADIUS), edges)
+    shifted_edges = radius_graph(shifted, RADIUS)
+    assert torch.equal(shifted_edges, edges)
     of_nodes = features(position, velocity, material, walls)
-    assert torch.equal(features(shifted, velocity, material, walls), of_nodes)
+    of_shifted_nodes = features(shifted, velocity, material, walls)
+    assert torch.equal(of_shifted_nodes, of_nodes)
     of_edges = edge_features(position, edges, RADIUS)
-    assert torch.equal(edge_features(shifted, edges, RADIUS), of_edges)
+    of_shifted_edges = edge_features(shifted, edges, RADIUS)
+    assert torch.equal(of_shifted_edges, of_edges)
 
 
 def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
@@ -178,23 +242,28 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
 
     Components, and neighbours in the row, are uncorrelated.
     """
-    walks = add_walk_noise(torch.zeros(40_000, 6, 2), 6, 0.3, generator())
+    at_rest = torch.zeros(40_000, 6, 2)
+    walks = add_walk_noise(at_rest, 6, 0.3, generator())
     assert not walks[:, 0].any()
     velocity = walks.diff(dim=1)
     draw_count = velocity[:, 0].numel()
-    covariance = torch.einsum("pjc,pkc->jk", velocity, velocity) / draw_count
+    products = torch.einsum("pjc,pkc->jk", velocity, velocity)
+    covariance = products / draw_count
     step = torch.arange(1.0, 6.0)
-    expected = 0.09 * torch.minimum(step[:, None], step) / 5.0
+    earlier_step = torch.minimum(step[:, None], step)
+    expected = 0.09 * earlier_step / 5.0
     # The error of a variance from n draws is sqrt(2 / n) of it. With 80,000 draws it
     # is 0.5 %; five of those are allowed.
     assert_close(covariance, expected, rtol=0.0, atol=0.025 * 0.09)
-    assert abs(float(velocity[:, -1].std()) - 0.3) < 0.003
+    last = velocity[:, -1]
+    assert abs(float(last.std()) - 0.3) < 0.003
 
-    last = velocity[:, -1] / 0.3
-    component_correlation = float((last[:, 0] * last[:, 1]).mean())
-    assert abs(component_correlation) < 5 / np.sqrt(len(last))
-    neighbour_correlation = float((last[1:, 0] * last[:-1, 0]).mean())
-    assert abs(neighbour_correlation) < 5 / np.sqrt(len(last) - 1)
+    x, y = (last / 0.3).T
+    component_correlation = float((x * y).mean())
+    assert abs(component_correlation) < 5 / np.sqrt(len(x))
+    neighbours = x[1:] * x[:-1]
+    neighbour_correlation = float(neighbours.mean())
+    assert abs(neighbour_correlation) < 5 / np.sqrt(len(neighbours))
 
 
 def test_the_target_makes_up_for_the_noise() -> None:
@@ -202,17 +271,22 @@ def test_the_target_makes_up_for_the_noise() -> None:
 
     The acceleration is the true one less the noise of the velocity.
     """
-    truth = batch(swirl(0, 8)).position.double()
+    window = batch(swirl(0, 8))
+    truth = window.position.double()
     disturbed = add_walk_noise(truth, 6, 1e-3, generator(1))
     noise = disturbed - truth
-    assert float(noise[:, 5].abs().mean()) > 1e-4
+    last_noise = noise[:, 5].abs()
+    assert float(last_noise.mean()) > 1e-4
 
     velocity = disturbed.diff(dim=1)
     true_velocity = truth.diff(dim=1)
     velocity_noise = noise.diff(dim=1)
-    assert_close(velocity[:, 5:], true_velocity[:, 5:], atol=1e-15, rtol=0)
+    next_velocity = velocity[:, 5:]
+    true_next_velocity = true_velocity[:, 5:]
+    assert_close(next_velocity, true_next_velocity, atol=1e-15, rtol=0)
     acceleration = velocity.diff(dim=1)[:, 4]
-    expected = true_velocity.diff(dim=1)[:, 4] - velocity_noise[:, 4]
+    true_acceleration = true_velocity.diff(dim=1)[:, 4]
+    expected = true_acceleration - velocity_noise[:, 4]
     assert_close(acceleration, expected, atol=1e-15, rtol=0)
 
 
@@ -226,13 +300,17 @@ def test_the_target_makes_up_for_the_noise() -> None:
 )
 def test_every_image_is_drawn_evenly(symmetry: str, image_count: int) -> None:
     """Each mirror image comes up equally often, within five deviations."""
-    matrices = draw_mirror_matrices(Symmetry(symmetry), 8000, generator())
-    images, counts = matrices.reshape(-1, 4).unique(dim=0, return_counts=True)
+    kind = Symmetry(symmetry)
+    matrices = draw_mirror_matrices(kind, 8000, generator())
+    flat = matrices.reshape(-1, 4)
+    images, counts = flat.unique(dim=0, return_counts=True)
+    row_sums = images.abs().sum(dim=1)
     assert len(images) == image_count
-    assert images.abs().sum(dim=1).tolist() == [2.0] * image_count
+    assert row_sums.tolist() == [2.0] * image_count
     assert [1.0, 0.0, 0.0, 1.0] in images.tolist()
     expected = 8000 / image_count
-    assert abs(counts - expected).max() <= 5 * np.sqrt(expected)
+    deviation = abs(counts - expected)
+    assert deviation.max() <= 5 * np.sqrt(expected)
     if symmetry == "mirror":
         assert (images[:, 3] == 1.0).all()  # gravity stays down
 
@@ -247,9 +325,11 @@ def test_walls_move_with_the_particles_on_them() -> None:
             [0.5, 0.9375],
         ]
     )
-    at_rest = batch(np.stack([middle, middle]), walls=True)
+    standing = np.stack([middle, middle])
+    at_rest = batch(standing, walls=True)
     wall_velocity = at_rest.wall_velocity[0, 0].numpy()
-    riders = batch(np.stack([middle, middle + wall_velocity]), walls=True)
+    moving = np.stack([middle, middle + wall_velocity])
+    riders = batch(moving, walls=True)
     middle_of_walls = torch.from_numpy(middle).float()
 
     wall_orders = set()
@@ -258,29 +338,33 @@ def test_walls_move_with_the_particles_on_them() -> None:
         image = mirror_batch(riders, matrix[None], BOUNDS)
         first = image.position[:, 0]
         velocity = image.position[:, 1] - first
-        distance = (first[:, None] - middle_of_walls).norm(dim=2)
+        to_walls = first[:, None] - middle_of_walls
+        distance = to_walls.norm(dim=2)
         wall = distance.argmin(dim=1)
-        assert_close(image.wall_velocity[0, 0][wall], velocity, atol=1e-6, rtol=0)
+        own_wall_velocity = image.wall_velocity[0, 0][wall]
+        assert_close(own_wall_velocity, velocity, atol=1e-6, rtol=0)
         wall_orders.add(tuple(wall.tolist()))
     assert len(wall_orders) == 8
 
 
 def test_images_are_per_window_and_leave_the_data_alone() -> None:
     """The first window stays, the second is mirrored: x becomes 1 - x in this box."""
-    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
+    windows = two_swirls()
     original = windows.position.clone()
-    mirror_x = torch.diag(torch.tensor([-1.0, 1.0]))
+    signs = torch.tensor([-1.0, 1.0])
+    mirror_x = torch.diag(signs)
     matrices = torch.stack([torch.eye(2), mirror_x])
     image = mirror_batch(windows, matrices, BOUNDS)
     assert torch.equal(windows.position, original)
 
     expected = original.clone()
-    expected[256:, :, 0] = 1.0 - original[256:, :, 0]
+    second = expected[256:]
+    second[..., 0] = 1.0 - second[..., 0]
     assert_close(image.position, expected)
 
 
 def test_mixed_precision_does_not_round_images() -> None:
-    windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
+    windows = two_swirls()
     matrices = draw_mirror_matrices(Symmetry.SQUARE, 2, generator(3))
     exact = mirror_batch(windows, matrices, BOUNDS)
     with torch.autocast("cpu", torch.bfloat16):
@@ -293,5 +377,6 @@ def test_axes_change_places_only_in_a_square() -> None:
     """In an oblong box a quarter turn is refused, with the option that works."""
     quarter_turn = torch.eye(2).flip(0)[None]
     oblong = ((0.0, 1.0), (0.0, 0.5))
+    window = batch(swirl(0, 3))
     with pytest.raises(UsageError, match="symmetry: mirror"):
-        mirror_batch(batch(swirl(0, 3)), quarter_turn, oblong)
+        mirror_batch(window, quarter_turn, oblong)

@@ -41,7 +41,8 @@ def with_velocity(
 
 
 def cells_of_vortex(
-    constants: ClosedBoxParameters, state: InitialState
+    constants: ClosedBoxParameters,
+    state: InitialState,
 ) -> tuple[Any, Any]:
     """Return velocity and gradient of u = sin kx cos ky, v = -cos kx sin ky, k =
     pi/L.
@@ -49,12 +50,19 @@ def cells_of_vortex(
     low, high = box(constants)
     k = np.pi / (high - low)
     x, y = k * (state.position - low).T
-    u = np.sin(x) * np.cos(y)
-    v = -np.cos(x) * np.sin(y)
-    velocity = np.stack([u, v], axis=1)
-    straight = np.cos(x) * np.cos(y)
-    across = np.sin(x) * np.sin(y)
-    matrix = np.array([[straight, -across], [across, -straight]])
+    sin_x = np.sin(x)
+    cos_x = np.cos(x)
+    sin_y = np.sin(y)
+    cos_y = np.cos(y)
+    velocity = np.stack([sin_x * cos_y, -cos_x * sin_y], axis=1)
+    straight = cos_x * cos_y
+    across = sin_x * sin_y
+    matrix = np.array(
+        [
+            [straight, -across],
+            [across, -straight],
+        ]
+    )
     gradient = k * matrix.transpose(2, 0, 1)
     return velocity, gradient
 
@@ -65,8 +73,10 @@ def test_a_regular_lattice_stays_at_rest() -> None:
     """
     state = scenario(NO_SLIP, jitter=0.0)
     result = after(NO_SLIP, [state], 400)
-    assert_allclose(result["position"][0], state.position, rtol=0, atol=2e-5)
-    assert np.abs(result["velocity"]).max() < 2e-5
+    position = result["position"][0]
+    assert_allclose(position, state.position, rtol=0, atol=2e-5)
+    speed = np.abs(result["velocity"])
+    assert speed.max() < 2e-5
     assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
 
 
@@ -83,9 +93,11 @@ def test_transfers_conserve_momentum() -> None:
     before = state.velocity.sum(axis=0)
     result = after(INERT, [state], 4)
     moved = result["velocity"][0].astype(np.float64)
-    assert np.abs(moved - state.velocity).max() > 0.05
-    tolerance = 1e-6 * np.abs(state.velocity).sum()
-    assert_allclose(moved.sum(axis=0), before, rtol=0, atol=tolerance)
+    change = np.abs(moved - state.velocity)
+    assert change.max() > 0.05
+    total_speed = np.abs(state.velocity).sum()
+    momentum = moved.sum(axis=0)
+    assert_allclose(momentum, before, rtol=0, atol=1e-6 * total_speed)
 
 
 def test_a_vortex_decays_as_navier_stokes_says() -> None:
@@ -97,16 +109,24 @@ def test_a_vortex_decays_as_navier_stokes_says() -> None:
         "density_coupling": 0.002,
         "shift": 0.002,
     }
-    constants = parameters(particles=4900, grid=32, dt=2e-3, no_slip=False, **exact)
+    constants = parameters(
+        particles=4900,
+        grid=32,
+        dt=2e-3,
+        no_slip=False,
+        **exact,
+    )
     state = scenario(constants, seed=2, viscosity=5e-3)
     shape, gradient = cells_of_vortex(constants, state)
     state = with_velocity(state, 0.05 * shape, 0.05 * gradient)
     solver = loaded(constants, [state])
     solver.advance(2000)
-    moved = dataclasses.replace(state, position=solver.position()[0])
+    position = solver.position()[0]
+    moved = dataclasses.replace(state, position=position)
     shape, _ = cells_of_vortex(constants, moved)
     velocity = solver.velocity()[0]
-    amplitude = np.sum(velocity * shape) / np.sum(shape**2)
+    projection = np.sum(velocity * shape)
+    amplitude = projection / np.sum(shape**2)
     low, high = box(constants)
     wave_number = np.pi / (high - low)
     decay_rate = 2.0 * 5e-3 * wave_number**2
@@ -123,7 +143,8 @@ def test_energy_falls_when_the_lid_rests() -> None:
     state = scenario(constants, seed=3, viscosity=1e-3)
     shape, gradient = cells_of_vortex(constants, state)
     low, high = box(constants)
-    phase = np.pi * (state.position - low) / (high - low)
+    share = (state.position - low) / (high - low)
+    phase = np.pi * share
     envelope = np.sin(phase).prod(axis=1)
     velocity = 0.1 * envelope[:, None] * shape
     moving = with_velocity(state, velocity, 0.0 * gradient)
@@ -140,7 +161,8 @@ def test_energy_falls_when_the_lid_rests() -> None:
 def test_jacobian_stays_near_one() -> None:
     """Away from the lid's corners J stays within 2 % while the lid drives the flow."""
     constants = parameters(particles=2500, grid=32, dt=2e-3)
-    state = scenario(constants, seed=4, walls=(0.0, 0.0, 0.0, 0.1))
+    walls = (0.0, 0.0, 0.0, 0.1)
+    state = scenario(constants, seed=4, walls=walls)
     solver = loaded(constants, [state])
     solver.advance(2000)
     x, y = solver.position()[0].T
@@ -159,6 +181,20 @@ def test_jacobian_stays_near_one() -> None:
     assert fastest <= health.max_speed <= 0.12
 
 
+# by 90 degrees: left, right <- top, bottom
+QUARTER_TURN = [
+    [0.0, -1.0],
+    [1.0, 0.0],
+]
+TURNED_WALLS = [3, 2, 0, 1]
+# x -> 1 - x: left and right change places
+FLIP = [
+    [-1.0, 0.0],
+    [0.0, 1.0],
+]
+FLIPPED_WALLS = [1, 0, 2, 3]
+
+
 @pytest.mark.parametrize(
     "constants",
     [NO_SLIP, FREE_SLIP],
@@ -167,17 +203,15 @@ def test_jacobian_stays_near_one() -> None:
 @pytest.mark.parametrize(
     ("turn", "walls_from"),
     [
-        # by 90 degrees: left, right <- top, bottom
-        ([[0.0, -1.0], [1.0, 0.0]], (3, 2, 0, 1)),
-        # x -> 1 - x: left and right change places
-        ([[-1.0, 0.0], [0.0, 1.0]], (1, 0, 2, 3)),
+        (QUARTER_TURN, TURNED_WALLS),
+        (FLIP, FLIPPED_WALLS),
     ],
     ids=["turned", "flipped"],
 )
 def test_no_direction_is_special(
     constants: ClosedBoxParameters,
     turn: list[list[float]],
-    walls_from: tuple[int, ...],
+    walls_from: list[int],
 ) -> None:
     """A turned or mirrored box, its moving walls included, evolves into the turned or
     mirrored result.
@@ -185,21 +219,31 @@ def test_no_direction_is_special(
     matrix = np.array(turn)
 
     def change(state: InitialState) -> InitialState:
+        position = (state.position - 0.5) @ matrix.T + 0.5
+        wall_velocity = state.wall_velocity @ matrix.T
         return dataclasses.replace(
             state,
-            position=(state.position - 0.5) @ matrix.T + 0.5,
+            position=position,
             velocity=state.velocity @ matrix.T,
             affine=matrix @ state.affine @ matrix.T,
-            wall_velocity=(state.wall_velocity @ matrix.T)[list(walls_from)],
+            wall_velocity=wall_velocity[walls_from],
         )
 
-    walls = ALL_LIDS if constants.no_slip else (0.0, 0.0, 0.0, 0.0)
+    walls = (0.0, 0.0, 0.0, 0.0)
+    if constants.no_slip:
+        walls = ALL_LIDS
     state = scenario(constants, seed=5, speed=0.2, walls=walls)
     plain = after(constants, [state], 60)
-    turned = after(constants, [change(state)], 60)
+    changed_state = change(state)
+    turned = after(constants, [changed_state], 60)
     position = plain["position"][0]
     velocity = plain["velocity"][0]
-    image = change(dataclasses.replace(state, position=position, velocity=velocity))
+    last_state = dataclasses.replace(
+        state,
+        position=position,
+        velocity=velocity,
+    )
+    image = change(last_state)
     turned_position = turned["position"][0]
     turned_velocity = turned["velocity"][0]
     assert_allclose(turned_position, image.position, rtol=0, atol=1e-5)
@@ -208,13 +252,15 @@ def test_no_direction_is_special(
 
 def test_displaced_particles_stay_in_the_box() -> None:
     """Offsets are added in float32; who would leave stands just inside the wall."""
-    solver = loaded(NO_SLIP, [scenario(NO_SLIP)])
+    state = scenario(NO_SLIP)
+    solver = loaded(NO_SLIP, [state])
     before = solver.position()
-    offset = np.full_like(before, 2.0**-20)
+    step = np.float32(2.0**-20)
+    offset = np.full_like(before, step)
     offset[0, 0] = 5.0
     solver.displace(offset)
     moved = solver.position()[0]
-    expected = before[0, 1:] + np.float32(2.0**-20)
+    expected = before[0, 1:] + step
     np.testing.assert_array_equal(moved[1:], expected)
     _, high = box(NO_SLIP)
     just_inside = high - 0.01 / NO_SLIP.grid
@@ -227,12 +273,14 @@ def test_sums_hold_every_particle_in_one_place() -> None:
     """
     speed = 0.9 / (INERT.grid * INERT.dt)
     everywhere = np.ones((INERT.particles, 2))
-    state = dataclasses.replace(
-        scenario(INERT, viscosity=0.0), position=0.5 * everywhere
-    )
-    state = with_velocity(state, speed * everywhere, 0.0 * state.affine)
-    nodes = after(INERT, [state], 1)["grid_velocity"][0]
-    assert_allclose(nodes[19:22, 19:22], speed, rtol=1e-6)
+    at_rest = scenario(INERT, viscosity=0.0)
+    state = dataclasses.replace(at_rest, position=0.5 * everywhere)
+    no_gradient = 0.0 * state.affine
+    state = with_velocity(state, speed * everywhere, no_gradient)
+    result = after(INERT, [state], 1)
+    nodes = result["grid_velocity"][0]
+    around_the_spot = nodes[19:22, 19:22]
+    assert_allclose(around_the_spot, speed, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -246,33 +294,46 @@ def test_a_blow_up_is_an_error(device: Device, scenarios: int) -> None:
     """A substep beyond the viscous limit ends in an error that says where, when and
     which bound.
     """
-    state = scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS, viscosity=1.0)
-    solver = loaded(NO_SLIP, [state] * scenarios, device=device)
+    state = scenario(
+        NO_SLIP,
+        seed=6,
+        speed=0.4,
+        walls=ALL_LIDS,
+        viscosity=1.0,
+    )
+    states = [state] * scenarios
+    solver = loaded(NO_SLIP, states, device=device)
     with pytest.raises(WorkFailedError) as caught:
         solver.advance(400)
     assert caught.value.where == "scenario 0, substeps 0 to 400"
     assert "CFL" in str(caught.value.expected)
     low, high = box(NO_SLIP)
-    assert low < solver.position().min() <= solver.position().max() < high
+    position = solver.position()
+    assert low < position.min()
+    assert position.max() < high
 
 
 def test_a_blow_up_names_the_scenario_and_leaves_the_others() -> None:
     """Of two scenarios only the second is not finite; the solver can be loaded
     again.
     """
-    states = [scenario(NO_SLIP, seed=seed, speed=0.2) for seed in (7, 8)]
-    wild = [states[0], dataclasses.replace(states[1], viscosity=np.inf)]
+    first = scenario(NO_SLIP, seed=7, speed=0.2)
+    second = scenario(NO_SLIP, seed=8, speed=0.2)
+    infinite = dataclasses.replace(second, viscosity=np.inf)
+    wild = [first, infinite]
     solver = loaded(NO_SLIP, wild, device=Device.PARALLEL)
     with pytest.raises(WorkFailedError) as caught:
         solver.advance(20)
     assert caught.value.where == "scenario 1, substeps 0 to 20"
-    assert [health.finite for health in solver.health()] == [True, False]
-    np.testing.assert_array_equal(
-        solver.position()[:1], after(NO_SLIP, [states[0]], 20)["position"]
-    )
-    solver.load(states)
+    is_finite = [health.finite for health in solver.health()]
+    assert is_finite == [True, False]
+    alone = after(NO_SLIP, [first], 20)
+    first_position = solver.position()[:1]
+    np.testing.assert_array_equal(first_position, alone["position"])
+    solver.load([first, second])
     solver.advance(20)
-    assert all(health.finite for health in solver.health())
+    for health in solver.health():
+        assert health.finite
 
 
 def test_states_outside_the_bounds_are_refused() -> None:
@@ -282,11 +343,13 @@ def test_states_outside_the_bounds_are_refused() -> None:
     state = scenario(NO_SLIP)
     walls = np.zeros((4, 2))
     walls[0, 0] = 0.1
-    fast = dataclasses.replace(state, velocity=state.velocity + 100.0)
+    high_speed = state.velocity + 100.0
+    fast = dataclasses.replace(state, velocity=high_speed)
     with pytest.raises(WorkFailedError) as caught:
         loaded(NO_SLIP, [fast])
     assert caught.value.where == "scenario 0"
-    one_less = dataclasses.replace(state, position=state.position[1:])
+    fewer_positions = state.position[1:]
+    one_less = dataclasses.replace(state, position=fewer_positions)
     with pytest.raises(UsageError) as caught:
         loaded(NO_SLIP, [one_less])
     assert caught.value.where == "scenario 0"
@@ -301,13 +364,12 @@ def test_states_outside_the_bounds_are_refused() -> None:
         {"area": 0.0},
         {"area": None},
     ):
+        odd_state = dataclasses.replace(state, **odd)
         with pytest.raises(UsageError):
-            loaded(NO_SLIP, [dataclasses.replace(state, **odd)])
+            loaded(NO_SLIP, [odd_state])
     across = dataclasses.replace(state, wall_velocity=walls)
-    for constants, moving in (
-        (NO_SLIP, across),
-        (FREE_SLIP, scenario(FREE_SLIP, walls=(0, 0, 0, 0.1))),
-    ):
+    sliding = scenario(FREE_SLIP, walls=(0, 0, 0, 0.1))
+    for constants, moving in ((NO_SLIP, across), (FREE_SLIP, sliding)):
         with pytest.raises(UsageError) as caught:
             loaded(constants, [moving])
         assert (

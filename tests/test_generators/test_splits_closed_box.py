@@ -43,24 +43,29 @@ def test_cavity_scenarios_draw_what_the_design_says() -> None:
     size = registry.load().size("cavity", "full")
     fastest = size.value("speed_max")
     states = all_of("cavity")
-    for scenario, state in zip(usual_ids(size), states, strict=True):
+    scenarios = usual_ids(size)
+    for scenario, state in zip(scenarios, states, strict=True):
         drawn = state.parameters
         assert 20.0 <= float(drawn["reynolds"]) <= 400.0
         # Re = (U / 2) L / nu with L = 0.875 and mu = rho nu with rho = 1e-4.
         reynolds = 0.5 * fastest * 0.875 / state.viscosity
         assert reynolds == pytest.approx(drawn["reynolds"])
-        assert drawn["dynamic_viscosity"] == pytest.approx(1e-4 * state.viscosity)
+        viscosity = drawn["dynamic_viscosity"]
+        assert viscosity == pytest.approx(1e-4 * state.viscosity)
         assert state.area == 0.875**2
         assert not state.velocity.any()
         assert 60 <= state.start_frame <= 120
         frame_count = state.start_frame + size.frame_count(scenario)
         assert state.wall_velocity.shape == (frame_count, 4, 2)
-        assert np.abs(state.wall_velocity).max() <= fastest
-    assert len({state.start_frame for state in states}) > 30
+        speed = np.abs(state.wall_velocity)
+        assert speed.max() <= fastest
+    start_frames = {state.start_frame for state in states}
+    assert len(start_frames) > 30
     reynolds_numbers = {state.parameters["reynolds"] for state in states}
     assert len(reynolds_numbers) == len(states)
-    speeds = [np.abs(state.wall_velocity).max() for state in states]
-    assert max(speeds) > 0.98 * fastest
+    speeds = [np.abs(state.wall_velocity) for state in states]
+    greatest_speeds = [speed.max() for speed in speeds]
+    assert max(greatest_speeds) > 0.98 * fastest
 
 
 def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> None:
@@ -76,8 +81,10 @@ def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> Non
         assert moving == set(stated)
         assert moving <= {"left", "right"} or moving <= {"bottom", "top"}
         # left and right along x, bottom and top along y
-        normal = state.wall_velocity[:, (0, 1, 2, 3), (0, 0, 1, 1)]
-        assert not normal.any()
+        left_and_right = state.wall_velocity[:, [0, 1], 0]
+        bottom_and_top = state.wall_velocity[:, [2, 3], 1]
+        assert not left_and_right.any()
+        assert not bottom_and_top.any()
         if moving == {"bottom", "top"}:  # each has a program of its own
             bottom = state.wall_velocity[:, 2, 0]
             top = state.wall_velocity[:, 3, 0]
@@ -92,7 +99,8 @@ def test_shifted_cavities_lie_outside_train(size: str) -> None:
     most = 0.0
     usual = set()
     for state in all_of("cavity", size):
-        most = max(most, float(state.parameters["reynolds"]))
+        reynolds = float(state.parameters["reynolds"])
+        most = max(most, reynolds)
         usual.add(state.parameters["wall"])
     states = shifted("cavity", size)
     for state in states[::2]:
@@ -100,17 +108,21 @@ def test_shifted_cavities_lie_outside_train(size: str) -> None:
         assert state.parameters["wall"] in usual
     # each wall's direction anticlockwise, in the order of WALLS
     turn = np.array([-1.0, 1.0, 1.0, -1.0])
+    corners = set()
     for state in states[1::2]:
         assert state.parameters["wall"] not in usual
         assert float(state.parameters["reynolds"]) <= most
-        tangential = state.wall_velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)]
+        corners.add(state.parameters["wall"])
+        left_and_right = state.wall_velocity[:, [0, 1], 1]
+        bottom_and_top = state.wall_velocity[:, [2, 3], 0]
+        tangential = np.hstack([left_and_right, bottom_and_top])
         along = tangential * turn
         moving = np.flatnonzero(along.any(axis=0))
         assert len(moving) == 2
-        assert set(moving) not in ({0, 1}, {2, 3})
+        assert set(moving) != {0, 1}
+        assert set(moving) != {2, 3}
         first, second = along[:, moving].T
         np.testing.assert_array_equal(first, second)
-    corners = {state.parameters["wall"] for state in states[1::2]}
     assert len(corners) == 4
 
 
@@ -119,8 +131,10 @@ def test_shifted_frequencies_lie_outside_train(size: str) -> None:
     """One below and one above all of train, half of the scenarios each."""
     usual = frequencies_of(all_of("curl-noise", size))
     shifts = frequencies_of(shifted("curl-noise", size))
-    assert max(shifts[::2]) < min(usual)
-    assert min(shifts[1::2]) > max(usual)
+    lower = shifts[::2]
+    higher = shifts[1::2]
+    assert max(lower) < min(usual)
+    assert min(higher) > max(usual)
 
 
 def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
@@ -131,7 +145,8 @@ def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
     size = changed(mini, knot_gap_min=25, knot_gap_max=25)
     for scenario in (0, 3, 4):
         state = draw(size, scenario)
-        for speed in state.wall_velocity.reshape(-1, 8).T:
+        speeds = state.wall_velocity.reshape(-1, 8).T
+        for speed in speeds:
             if not speed.any():
                 continue
             knots = np.arange(0, len(speed), 25)
@@ -143,7 +158,8 @@ def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
             np.testing.assert_allclose(speed[:last], expected, atol=2.0**-20)
             signs = np.sign(knot_speeds)
             np.testing.assert_array_equal(signs[1:], -signs[:-1])
-            assert len(np.unique(knot_speeds)) == len(knots)
+            distinct_speeds = np.unique(knot_speeds)
+            assert len(distinct_speeds) == len(knots)
 
 
 @pytest.mark.parametrize(
@@ -158,9 +174,9 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
     train has all walls.
     """
     tier = registry.load().size("cavity", size)
-    states = zip(usual_ids(tier), all_of("cavity", size), strict=True)
+    states = all_of("cavity", size)
     classic = {}
-    for i, state in states:
+    for i, state in zip(usual_ids(tier), states, strict=True):
         has_constant_speed = state.parameters["motion"] == "constant"
         assert is_classic(i) == has_constant_speed
         if has_constant_speed:
@@ -169,7 +185,8 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
     for state in classic.values():
         speed = np.abs(state.wall_velocity).max(axis=2)
         starts = np.argmax(speed > 0.0, axis=0)
-        for wall in np.flatnonzero(speed.any(axis=0)):
+        is_moving = speed.any(axis=0)
+        for wall in np.flatnonzero(is_moving):
             start = starts[wall]
             assert state.start_frame - 15 <= start <= state.start_frame + 5
             last_speed = speed[-1, wall]
@@ -184,11 +201,20 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
         assert sorted(train.values()) == [1] * 6
 
 
-@given(st.integers(4, 3000), st.integers(0, 2**30))
+@given(
+    count=st.integers(4, 3000),
+    scenario=st.integers(0, 2**30),
+)
 def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
     """Any particle count: columns differ by one particle, no gap and no clump."""
     rng = draws.generator("cavity", "test", 1, scenario)
-    position = draws.fill(rng, count, low=0.0625, high=0.9375, jitter=0.25)
+    position = draws.fill(
+        rng,
+        count,
+        low=0.0625,
+        high=0.9375,
+        jitter=0.25,
+    )
     columns = math.isqrt(count)
     share = (position[:, 0] - 0.0625) / 0.875
     column = np.floor(share * columns).astype(int)
@@ -201,17 +227,31 @@ def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
     assert gaps[:, 1].min() >= 0.74 * closest
 
 
-def test_curl_noise_frequencies_follow_the_thesis() -> None:
+@pytest.mark.parametrize(
+    ("size", "count", "least"),
+    [
+        ("full", 10, 4),
+        ("mini", 3, 2),
+        ("tiny", 2, 1),
+    ],
+)
+def test_curl_noise_frequencies_follow_the_thesis(
+    size: str,
+    count: int,
+    least: int,
+) -> None:
     """Eq. 5.55 with 4 to 13 at full; mini holds those that its grid resolves, tiny
     two.
     """
-    for size, count, least in (("full", 10, 4), ("mini", 3, 2), ("tiny", 2, 1)):
-        states = all_of("curl-noise", size)
-        frequencies = frequencies_of(states)
-        ids = usual_ids(registry.load().size("curl-noise", size))
-        assert frequencies == [i % count + least for i in ids]
-    # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
-    # one scale.
+    frequencies = frequencies_of(all_of("curl-noise", size))
+    ids = usual_ids(registry.load().size("curl-noise", size))
+    assert frequencies == [i % count + least for i in ids]
+
+
+def test_curl_noise_scales() -> None:
+    """At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
+    one scale.
+    """
     drawn = [state.parameters for state in all_of("curl-noise", "mini")]
     for frequency in (2, 3, 4):
         vorticities = []
@@ -229,15 +269,17 @@ def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
     """
     for state in all_of("curl-noise")[:10]:
         trace = np.trace(state.affine, axis1=1, axis2=2)
+        gradient = np.abs(state.affine)
         assert not trace.any()
-        assert np.abs(state.affine).max() > 0.1
+        assert gradient.max() > 0.1
     state = state_of("curl-noise", "full", 0)
     distance, index = neighbours(state.position, 2)
     nearest = index[:, 1]
     middle = 0.5 * (state.affine + state.affine[nearest])
     offset = state.position[nearest] - state.position
     change = state.velocity[nearest] - state.velocity
-    residual = change - np.einsum("pij,pj->pi", middle, offset)
+    predicted = np.einsum("pij,pj->pi", middle, offset)
+    residual = change - predicted
     assert distance.max() < 0.02
     residual_rms = np.sqrt(np.mean(residual**2))
     change_rms = np.sqrt(np.mean(change**2))
@@ -250,16 +292,17 @@ def test_curl_noise_energy_grows_with_frequency() -> None:
     recorded = []
     for state in states:
         recorded.append(float(state.parameters["initial_kinetic_energy"]))
-    for state, energy in zip(states[:10], recorded, strict=False):
+    for number, state in enumerate(states[:10]):
         square_speed = np.sum(state.velocity**2, axis=1)
         expected = 0.5 * np.mean(square_speed)
-        assert energy == pytest.approx(expected, rel=1e-12)
+        assert recorded[number] == pytest.approx(expected, rel=1e-12)
 
     by_frequency = np.reshape(recorded[:70], (7, 10)).T
     mean = by_frequency.mean(axis=1)
     assert np.all(np.diff(mean) > 0)
     frequency = np.arange(4, 14)
-    slope, _ = np.polyfit(np.log(frequency), np.log(mean), 1)
+    log_frequency = np.log(frequency)
+    slope, _ = np.polyfit(log_frequency, np.log(mean), 1)
     assert 1.6 < slope < 2.4
 
 
@@ -270,17 +313,20 @@ def test_curl_noise_divergence_is_the_grids_share_alone() -> None:
     size = registry.load().size("curl-noise", "full")
     coarse = draw(size, 0).parameters
     # (4 + 1/2) / 120 = (1 + 1/2) / 40: the same walls with cells a third as wide.
-    fine = draw(changed(size, grid=120, wall=4), 0).parameters
+    fine_size = changed(size, grid=120, wall=4)
+    fine = draw(fine_size, 0).parameters
     coarse_divergence = float(coarse["initial_divergence_rms"])
     fine_divergence = float(fine["initial_divergence_rms"])
     vorticity = float(coarse["initial_vorticity_rms"])
-    assert coarse_divergence / fine_divergence == pytest.approx(9.0, rel=0.15)
+    ratio = coarse_divergence / fine_divergence
+    assert ratio == pytest.approx(9.0, rel=0.15)
     assert coarse_divergence < 0.03 * vorticity
 
 
 def test_curl_noise_refuses_a_lattice_of_another_count() -> None:
     """A lattice that does not hold the particles is a mistake in datasets.yaml."""
-    size = changed(registry.load().size("curl-noise", "tiny"), lattice_x=20)
+    tiny = registry.load().size("curl-noise", "tiny")
+    size = changed(tiny, lattice_x=20)
     with pytest.raises(UsageError) as caught:
         draw(size, 0)
     assert caught.value.where == "datasets.yaml, curl-noise tiny"
