@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +33,8 @@ def search_by_torch(
     """Search by the operations that a GPU runs."""
     if sample is None:
         sample = torch.zeros(len(position), dtype=torch.int64)
-    numbers = edge_numbers(torch, position.double(), sample, radius, self_edges)
+    exact = position.double()
+    numbers = edge_numbers(torch, exact, sample, radius, self_edges)
     numbers = numbers.sort().values
     sender = numbers & 0xFFFFFFFF
     receiver = numbers >> 32
@@ -54,7 +56,8 @@ def brute_force(
 ) -> NDArray[np.int64]:
     """Compare every pair; return [sender, receiver] by receiver, then by sender."""
     with np.errstate(invalid="ignore", over="ignore"):
-        difference = x[:, None].astype(np.float64) - x.astype(np.float64)
+        exact = x.astype(np.float64)
+        difference = exact[:, None] - exact
         dx = difference[..., 0]
         dy = difference[..., 1]
         is_near = dx * dx + dy * dy <= radius * radius
@@ -77,7 +80,13 @@ def compare_with_brute_force(
     sample_tensor = None
     if sample is not None:
         sample_tensor = torch.from_numpy(sample)
-    edges = search(torch.from_numpy(x), radius, sample_tensor, self_edges=self_edges)
+    position = torch.from_numpy(x)
+    edges = search(
+        position,
+        radius,
+        sample_tensor,
+        self_edges=self_edges,
+    )
     assert edges.dtype == torch.int64
     expected = brute_force(x, radius, sample, self_edges)
     np.testing.assert_array_equal(edges.numpy(), expected)
@@ -86,20 +95,26 @@ def compare_with_brute_force(
 
 def uniform(count: int, seed: int) -> Floats:
     """Return random particles in the unit square."""
-    return np.random.default_rng(seed).random((count, 2), dtype=np.float32)
+    rng = np.random.default_rng(seed)
+    return rng.random((count, 2), dtype=np.float32)
 
 
 def lattice(side: int, spacing: float) -> Floats:
     """Return side x side particles, shape [particle, 2]."""
     axis = np.arange(side) * spacing
-    points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    columns, rows = np.meshgrid(axis, axis, indexing="ij")
+    points = np.stack([columns, rows], axis=-1)
     return points.reshape(-1, 2).astype(np.float32)
 
 
 @BOTH
 @pytest.mark.parametrize("radius", [0.004, 0.03, 0.2, 2.0])
 @pytest.mark.parametrize("self_edges", [False, True])
-def test_random_particles(search: Search, radius: float, self_edges: bool) -> None:
+def test_random_particles(
+    search: Search,
+    radius: float,
+    self_edges: bool,
+) -> None:
     """Uniform particles, from hardly any edge to all pairs."""
     x = uniform(400, seed=1)
     edge_count = compare_with_brute_force(search, x, radius, self_edges=self_edges)
@@ -111,10 +126,12 @@ def test_clustered_particles(search: Search) -> None:
     """Dense clumps, particles in the very same place, and lone particles far off."""
     rng = np.random.default_rng(2)
     centres = rng.random((6, 1, 2))
-    clumps = centres + 0.01 * rng.normal(size=(6, 60, 2))
+    spread = rng.normal(size=(6, 60, 2))
+    clumps = centres + 0.01 * spread
     clumps = clumps.reshape(-1, 2)
     far_off = rng.uniform(-50.0, 50.0, (30, 2))
-    x = np.concatenate([clumps, clumps[:20], far_off]).astype(np.float32)
+    all_points = np.concatenate([clumps, clumps[:20], far_off])
+    x = all_points.astype(np.float32)
     assert compare_with_brute_force(search, x, 0.015) > 6 * 60
 
 
@@ -152,7 +169,8 @@ def test_diagonal_pairs_exactly_at_the_radius_are_edges(search: Search) -> None:
 @pytest.mark.parametrize("spacing", [0.1, 0.015, 1 / 3])
 def test_radius_that_float32_cannot_hold(search: Search, spacing: float) -> None:
     """Rounding decides which neighbours are within the radius, as in brute force."""
-    edge_count = compare_with_brute_force(search, lattice(12, spacing), spacing)
+    x = lattice(12, spacing)
+    edge_count = compare_with_brute_force(search, x, spacing)
     assert 0 < edge_count < 2 * 2 * 12 * 11  # some of the 264 pairs fall outside
 
 
@@ -176,9 +194,12 @@ def test_few_particles(search: Search) -> None:
     """No particle has no edges, one particle only the edge to itself."""
     none = np.zeros((0, 2), np.float32)
     one = np.ones((1, 2), np.float32)
-    assert compare_with_brute_force(search, none, 0.1, self_edges=True) == 0
-    assert compare_with_brute_force(search, one, 0.1) == 0
-    assert compare_with_brute_force(search, one, 0.1, self_edges=True) == 1
+    of_none = compare_with_brute_force(search, none, 0.1, self_edges=True)
+    of_one = compare_with_brute_force(search, one, 0.1)
+    with_itself = compare_with_brute_force(search, one, 0.1, self_edges=True)
+    assert of_none == 0
+    assert of_one == 0
+    assert with_itself == 1
 
 
 @BOTH
@@ -193,7 +214,8 @@ def test_diverged_particles_have_no_wrong_edge(search: Search) -> None:
     x[10] = [-3e38, 2.0]
     x[11] = [5e4, 5e4]
     x[12] = [5e4, 5e4 + 0.0625]
-    assert compare_with_brute_force(search, x, 0.1, self_edges=True) > 60
+    edge_count = compare_with_brute_force(search, x, 0.1, self_edges=True)
+    assert edge_count > 60
     all_lost = np.full((3, 2), np.nan, np.float32)
     assert compare_with_brute_force(search, all_lost, 0.1) == 0
 
@@ -223,11 +245,14 @@ def test_scipy_agrees() -> None:
     x = uniform(5000, seed=5)
     tree = cKDTree(x.astype(np.float64))
     pairs = tree.query_pairs(0.015, output_type="ndarray")
-    edges = radius_graph(torch.from_numpy(x), 0.015).numpy()
+    position = torch.from_numpy(x)
+    edges = radius_graph(position, 0.015).numpy()
     assert edges.shape[1] == 2 * len(pairs)
     sender, receiver = edges
     once = edges[:, sender < receiver].T
-    np.testing.assert_array_equal(np.unique(once, axis=0), np.unique(pairs, axis=0))
+    edge_set = np.unique(once, axis=0)
+    pair_set = np.unique(pairs, axis=0)
+    np.testing.assert_array_equal(edge_set, pair_set)
 
 
 def test_positions_may_have_gradients_and_any_precision() -> None:
@@ -239,17 +264,24 @@ def test_positions_may_have_gradients_and_any_precision() -> None:
     assert torch.equal(radius_graph(with_gradient, 0.2), edges)
     coarse = x.bfloat16()
     coarse_edges = radius_graph(coarse, 0.2)
-    assert torch.equal(coarse_edges, radius_graph(coarse.float(), 0.2))
+    rounded_edges = radius_graph(coarse.float(), 0.2)
+    assert torch.equal(coarse_edges, rounded_edges)
+
+
+FLAT = torch.zeros(4, 2)
+SOLID = torch.zeros(4, 3)
+THREE_WINDOWS = torch.tensor([0, 0, 0])
+OUT_OF_ORDER = torch.tensor([0, 1, 0])
 
 
 @pytest.mark.parametrize(
     ("position", "radius", "sample", "words"),
     [
-        (torch.zeros(4, 3), 0.1, None, "wrong shape"),
-        (torch.zeros(4, 2), 0.0, None, "no length"),
-        (torch.zeros(4, 2), float("nan"), None, "no length"),
-        (torch.zeros(4, 2), 0.1, torch.tensor([0, 0, 0]), "do not fit"),
-        (torch.zeros(3, 2), 0.1, torch.tensor([0, 1, 0]), "do not fit"),
+        (SOLID, 0.1, None, "wrong shape"),
+        (FLAT, 0.0, None, "no length"),
+        (FLAT, math.nan, None, "no length"),
+        (FLAT, 0.1, THREE_WINDOWS, "do not fit"),
+        (FLAT[:3], 0.1, OUT_OF_ORDER, "do not fit"),
     ],
 )
 def test_what_does_not_fit_is_refused(
@@ -265,7 +297,8 @@ def test_what_does_not_fit_is_refused(
 
 def heap_of_twelve() -> Floats:
     """Return 120 particles, twelve of them in one place and one of them nowhere."""
-    x = np.random.default_rng(1).random((120, 2), np.float32)
+    rng = np.random.default_rng(1)
+    x = rng.random((120, 2), np.float32)
     x[40:52] = x[40]
     x[100] = np.nan
     return x
@@ -278,21 +311,32 @@ def test_each_receiver_keeps_its_shortest_edges(most: int) -> None:
     sample = np.repeat([0, 1], 60)
     radius = 0.25
     senders, receivers = brute_force(x, radius, sample)
-    difference = x[senders].astype(float) - x[receivers].astype(float)
+    exact = x.astype(float)
+    difference = exact[senders] - exact[receivers]
     lengths = np.sum(difference**2, axis=1)
     length_of_pair = {}
-    for sender, receiver, length in zip(senders, receivers, lengths, strict=True):
-        length_of_pair[sender, receiver] = length
+    for number, length in enumerate(lengths):
+        pair = (senders[number], receivers[number])
+        length_of_pair[pair] = length
 
-    position = torch.from_numpy(x)
-    edges = radius_graph(position, radius, torch.from_numpy(sample), most=most).numpy()
+    edges = radius_graph(
+        torch.from_numpy(x),
+        radius,
+        torch.from_numpy(sample),
+        most=most,
+    ).numpy()
     edge_count = edges.shape[1]
-    assert len(set(map(tuple, edges.T))) == edge_count
+    distinct = np.unique(edges, axis=1)
+    assert distinct.shape[1] == edge_count
     # The order is by receiver, then by sender.
-    np.testing.assert_array_equal(np.lexsort(edges), np.arange(edge_count))
+    order = np.lexsort(edges)
+    np.testing.assert_array_equal(order, np.arange(edge_count))
     for receiver in range(len(x)):
         edge_senders = edges[0, edges[1] == receiver]
-        edge_lengths = sorted(length_of_pair[s, receiver] for s in edge_senders)
+        edge_lengths = []
+        for sender in edge_senders:
+            edge_lengths.append(length_of_pair[sender, receiver])
+        edge_lengths.sort()
         all_lengths = sorted(lengths[receivers == receiver])
         assert edge_lengths == all_lengths[:most]
 
@@ -301,8 +345,8 @@ def test_each_receiver_keeps_its_shortest_edges(most: int) -> None:
 def test_each_particle_keeps_its_self_edge(most: int) -> None:
     """The particle that is nowhere has none."""
     position = torch.from_numpy(heap_of_twelve())
-    edges = radius_graph(position, 0.25, self_edges=True, most=most).numpy()
-    sender, receiver = edges
+    edges = radius_graph(position, 0.25, self_edges=True, most=most)
+    sender, receiver = edges.numpy()
     self_edges = sender[sender == receiver]
     assert set(self_edges) == set(range(120)) - {100}
 
@@ -312,7 +356,9 @@ def test_a_heap_takes_bounded_memory() -> None:
 
     Without a limit they would have a hundred million.
     """
-    edges = radius_graph(torch.full((10_000, 2), 0.5), 0.01, most=4)
+    heap = torch.full((10_000, 2), 0.5)
+    edges = radius_graph(heap, 0.01, most=4)
     assert edges.shape == (2, 40_000)
     edges_per_receiver = edges[1].bincount()
-    assert torch.equal(edges_per_receiver, torch.full((10_000,), 4))
+    expected = torch.full((10_000,), 4)
+    assert torch.equal(edges_per_receiver, expected)

@@ -17,6 +17,8 @@ from lagbench.generators import backend, constitutive
 from lagbench.generators.solver import Device
 from lagbench.generators.transfer import Nothing
 
+Single: TypeAlias = NDArray[np.float32]
+
 if TYPE_CHECKING:
     Array: TypeAlias = Any
 else:
@@ -35,7 +37,11 @@ def taichi_runtime() -> None:
 
 
 @ti.kernel
-def evaluate_scalars(z: Array, exponential: Array, hardening: Array) -> Nothing:
+def evaluate_scalars(
+    z: Array,
+    exponential: Array,
+    hardening: Array,
+) -> Nothing:
     """Evaluate the functions of these names for every entry."""
     for i in range(z.shape[0]):
         exponential[i] = constitutive.exponential(z[i])
@@ -52,7 +58,9 @@ def evaluate(
 ) -> Nothing:
     """Evaluate rotation, corotated stress and plastic return for every gradient."""
     for i in range(f.shape[0]):
-        m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
+        first_row = [f[i, 0, 0], f[i, 0, 1]]
+        second_row = [f[i, 1, 0], f[i, 1, 1]]
+        m = ti.Matrix([first_row, second_row])
         rotation = constitutive.rotation(m)
         tau = constitutive.corotated_stress(m, MU, LAMBDA)
         clamped, factor = constitutive.plastic_return(m, LOW, HIGH)
@@ -64,9 +72,7 @@ def evaluate(
                 elastic[i, a, b] = clamped[a, b]
 
 
-def scalars(
-    values: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def scalars(values: Single) -> tuple[Single, Single]:
     """Return exponential and hardening of numbers."""
     exponential = np.empty_like(values)
     hardening = np.empty_like(values)
@@ -74,75 +80,89 @@ def scalars(
     return exponential, hardening
 
 
-def models(gradients: Any) -> tuple[NDArray[np.float32], ...]:
+def models(gradients: Any) -> tuple[Single, ...]:
     """Return (cosine, sine), corotated stress, elastic part and volume ratio of
     gradients [n, 2, 2].
     """
     f = np.ascontiguousarray(gradients, np.float32)
-    turn = np.empty(f.shape[:2], np.float32)
+    count = len(f)
+    turn = np.empty((count, 2), np.float32)
     stress = np.empty_like(f)
     elastic = np.empty_like(f)
-    ratio = np.empty(len(f), np.float32)
+    ratio = np.empty(count, np.float32)
     evaluate(f, turn, stress, elastic, ratio)
     return turn, stress, elastic, ratio
 
 
-def deformations(spread: float) -> NDArray[np.float32]:
+def deformations(spread: float) -> Single:
     """Draw gradients near the identity, then turn each by a random angle, shape [COUNT,
     2, 2].
     """
     rng = np.random.default_rng(5)
-    deviation = 2.0 * rng.random((COUNT, 2, 2)) - 1.0
+    share = rng.random((COUNT, 2, 2))
+    deviation = 2.0 * share - 1.0
     near = np.eye(2) + spread * deviation
     angle = 2.0 * np.pi * rng.random(COUNT)
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    rows = np.stack([cosine, -sine, sine, cosine], -1)
-    turn = rows.reshape(-1, 2, 2)
-    return (turn @ near).astype(np.float32)
+    first_row = np.stack([cosine, -sine], axis=-1)
+    second_row = np.stack([sine, cosine], axis=-1)
+    turn = np.stack([first_row, second_row], axis=1)
+    turned = turn @ near
+    return turned.astype(np.float32)
 
 
 def energy(f: NDArray[np.float64]) -> float:
     """Fixed corotated energy mu |F - R|^2 + lambda/2 (J - 1)^2, R from SciPy."""
     rotation, _ = polar(f)
-    shear = ((f - rotation) ** 2).sum()
+    difference = f - rotation
+    shear = (difference**2).sum()
     bulk = (np.linalg.det(f) - 1.0) ** 2
     return float(MU * shear + 0.5 * LAMBDA * bulk)
 
 
 def test_exponential_holds_its_stated_error() -> None:
     """The polynomial is exp to 3e-6 over its domain."""
-    z = np.linspace(-4.0, 4.0, 200_001, dtype=np.float32)
+    domain = np.linspace(-4.0, 4.0, 200_001)
+    z = domain.astype(np.float32)
     exponential, _ = scalars(z)
     expected = np.exp(z.astype(np.float64))
-    assert np.abs(exponential / expected - 1.0).max() <= 3e-6
+    relative_error = exponential / expected - 1.0
+    assert np.abs(relative_error).max() <= 3e-6
 
 
 def test_hardening_is_capped_and_monotone() -> None:
     """Compacted snow is never stiffer than the cap, stretched snow never softer than
     the floor.
     """
-    jp = np.linspace(0.3, 4.0, 10_001, dtype=np.float32)
+    domain = np.linspace(0.3, 4.0, 10_001)
+    jp = domain.astype(np.float32)
     _, out = scalars(jp)
     assert out.max() == np.float32(5.0)
     assert out.min() == np.float32(0.05)
-    assert (np.diff(out) <= 0.0).all()
-    assert out[jp >= 1.0].max() <= 1.0 + 2e-6
+    rises = np.diff(out)
+    of_stretched = out[jp >= 1.0]
+    assert (rises <= 0.0).all()
+    assert of_stretched.max() <= 1.0 + 2e-6
 
 
 def test_rotation_is_the_polar_factor() -> None:
     """R equals SciPy's polar factor for gradients of positive determinant."""
     f = deformations(0.4)
-    f = f[np.linalg.det(f) > 0.05]
-    rotations = [polar(m.astype(np.float64))[0] for m in f]
-    expected = np.array(rotations)[:, :, 0]
+    determinant = np.linalg.det(f)
+    f = f[determinant > 0.05]
+    expected = []
+    for gradient in f.astype(np.float64):
+        rotation, _ = polar(gradient)
+        expected.append(rotation[:, 0])
     turn, *_ = models(f)
     assert_allclose(turn, expected, atol=2e-6)
     # A gradient without a direction (all zero, or a pure reflection) gives R = I.
     zero = np.zeros((2, 2))
     reflection = np.diag([1.0, -1.0])
     turn, *_ = models([zero, reflection])
-    assert turn.tolist() == [[1.0, 0.0], [1.0, 0.0]]
+    identity = [1.0, 0.0]
+    assert turn.tolist() == [identity, identity]
 
 
 def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
@@ -150,7 +170,8 @@ def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
     f = deformations(0.3)[:64]
     stress = models(f)[1]
     step = 1e-6
-    for m, tau in zip(f.astype(np.float64), stress, strict=True):
+    gradients = f.astype(np.float64)
+    for m, tau in zip(gradients, stress, strict=True):
         gradient = np.empty((2, 2))
         for entry in np.ndindex(2, 2):
             shift = np.zeros((2, 2))
@@ -163,19 +184,33 @@ def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
 def test_corotated_stress_ignores_rotation_before_and_follows_rotation_after() -> None:
     """tau(Q F) = Q tau(F) Q^T and tau(F Q) = tau(F): objective and isotropic."""
     f = deformations(0.2)
-    q = np.array([[0.6, -0.8], [0.8, 0.6]], np.float32)
+    q = np.array(
+        [
+            [0.6, -0.8],
+            [0.8, 0.6],
+        ],
+        np.float32,
+    )
     _, stress, *_ = models(f)
     _, turned_after, *_ = models(q @ f)
     _, turned_before, *_ = models(f @ q)
-    assert_allclose(turned_after, q @ stress @ q.T, atol=3e-4)
+    turned_stress = q @ stress @ q.T
+    assert_allclose(turned_after, turned_stress, atol=3e-4)
     assert_allclose(turned_before, stress, atol=3e-4)
 
 
 def test_small_strain_is_hookes_law() -> None:
     """For F = I + eps e the stress is 2 mu e + lambda tr(e) I to first order."""
-    strain = np.array([[2.0, 0.5], [0.5, -1.0]]) * 1e-3
-    hooke = 2.0 * MU * strain + LAMBDA * np.trace(strain) * np.eye(2)
-    _, stress, *_ = models([np.eye(2) + strain])
+    strain = np.array(
+        [
+            [2e-3, 0.5e-3],
+            [0.5e-3, -1e-3],
+        ]
+    )
+    identity = np.eye(2)
+    pressure = LAMBDA * np.trace(strain)
+    hooke = 2.0 * MU * strain + pressure * identity
+    _, stress, *_ = models([identity + strain])
     assert_allclose(stress[0], hooke, rtol=5e-3, atol=2e-4)
 
 
@@ -183,20 +218,24 @@ def test_plastic_return_clamps_numpys_singular_values() -> None:
     """The elastic part is U clamp(Sigma) V^T of NumPy's SVD, and Jp takes the rest."""
     f = deformations(0.15)
     *_, elastic, ratio = models(f)
-    u, sigma, vt = np.linalg.svd(f.astype(np.float64))
+    gradients = f.astype(np.float64)
+    u, sigma, vt = np.linalg.svd(gradients)
     clamped = np.clip(sigma, LOW, HIGH)
     expected = u @ (clamped[:, :, None] * vt)
     expected_ratio = sigma.prod(1) / clamped.prod(1)
     assert_allclose(elastic, expected, atol=2e-5)
     assert_allclose(ratio, expected_ratio, rtol=2e-5)
-    assert np.isclose(ratio, 1.0).mean() < 0.5
+    is_elastic = np.isclose(ratio, 1.0)
+    assert is_elastic.mean() < 0.5
 
 
 def test_plastic_return_leaves_elastic_states_alone() -> None:
     """Stretches inside the yield limits change nothing but rounding."""
     rng = np.random.default_rng(3)
-    deviation = 2.0 * rng.random((COUNT, 2, 2)) - 1.0
-    f = (np.eye(2) + 1e-3 * deviation).astype(np.float32)
+    share = rng.random((COUNT, 2, 2))
+    deviation = 2.0 * share - 1.0
+    gradients = np.eye(2) + 1e-3 * deviation
+    f = gradients.astype(np.float32)
     *_, elastic, ratio = models(f)
     assert_allclose(elastic, f, atol=3e-7)
     assert_allclose(ratio, 1.0, atol=5e-7)
@@ -208,7 +247,8 @@ def test_inverted_snow_stays_finite() -> None:
     turned = -np.eye(2)
     reflected = np.diag([1.0, -1.0])
     swapped = np.eye(2)[::-1]
-    *_, elastic, ratio = models([collapsed, turned, reflected, swapped])
+    gradients = [collapsed, turned, reflected, swapped]
+    *_, elastic, ratio = models(gradients)
     assert np.isfinite(elastic).all()
     assert (ratio > 0.0).all()
     assert np.isfinite(ratio).all()
@@ -222,4 +262,5 @@ def test_lame_constants() -> None:
     assert constitutive.lame(40.0, 0.25) == (16.0, 16.0)
     assert constitutive.lame(30.0, 0.0) == (15.0, 0.0)
     mu, la = constitutive.lame(100.0, 0.3)
-    assert math.isclose(la + 2.0 * mu, 100.0 * 0.7 / (1.3 * 0.4))
+    wave_modulus = 100.0 * 0.7 / (1.3 * 0.4)
+    assert math.isclose(la + 2.0 * mu, wave_modulus)

@@ -25,12 +25,16 @@ class Script:
         """Take what to say."""
         self.values = list(values)
 
-    def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
+    def random(
+        self,
+        size: tuple[int, ...],
+    ) -> NDArray[np.float64]:
         """Return the next values in the wanted shape."""
         count = math.prod(size)
         first = self.values[:count]
         del self.values[:count]
-        return np.array(first, dtype=np.float64).reshape(size)
+        numbers = np.array(first, dtype=np.float64)
+        return numbers.reshape(size)
 
 
 def source(name: str = "test") -> np.random.Generator:
@@ -39,14 +43,25 @@ def source(name: str = "test") -> np.random.Generator:
     return stream
 
 
-def pcg64(state: int, increment: int, count: int) -> list[float]:
+MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
+
+
+def pcg64(
+    state: int,
+    increment: int,
+    count: int,
+) -> list[float]:
     """Return doubles of PCG64 XSL-RR 128/64 as O'Neill (2014) defines it."""
     values = []
     for _ in range(count):
-        state = (state * 0x2360ED051FC65DA44385DF649FCCF645 + increment) % 2**128
-        word = (state >> 64) ^ (state % 2**64)
+        state = (state * MULTIPLIER + increment) % 2**128
+        high = state >> 64
+        low = state % 2**64
+        word = high ^ low
         turn = state >> 122
-        turned = ((word >> turn) | (word << (64 - turn))) % 2**64
+        right = word >> turn
+        left = word << (64 - turn)
+        turned = (right | left) % 2**64
         values.append((turned >> 11) * 2.0**-53)
     return values
 
@@ -73,7 +88,8 @@ def test_seed_text_rebuilds_the_stream() -> None:
     seed = np.random.SeedSequence(words)
     again = np.random.Generator(np.random.PCG64(seed))
     stream = draws.generator("fluid", "tiny", 1, 3)
-    assert again.random(5).tolist() == stream.random(5).tolist()
+    expected = stream.random(5)
+    assert again.random(5).tolist() == expected.tolist()
 
 
 def test_every_name_changes_the_stream() -> None:
@@ -85,7 +101,8 @@ def test_every_name_changes_the_stream() -> None:
         ("cavity", "full", 2, 0),
         ("cavity", "full", 1, 1),
     ]
-    numbers = {draws.generator(*key).random() for key in keys}
+    streams = [draws.generator(*key) for key in keys]
+    numbers = {stream.random() for stream in streams}
     assert len(numbers) == len(keys)
 
 
@@ -95,17 +112,27 @@ def test_quantise_rounds_to_the_nearest_exact_float32(value: float) -> None:
     float32 and stable.
     """
     quantum = 2.0**-20
-    halves = draws.quantise([0.5 * quantum, 1.5 * quantum])
+    two_halves = [0.5 * quantum, 1.5 * quantum]
+    halves = draws.quantise(two_halves)
     assert halves.tolist() == [0.0, 2.0 * quantum]
     result = float(draws.quantise(value))
     assert (result * 2**20).is_integer()
     assert abs(result - value) <= 2.0**-21
     assert float(np.float32(result)) == result
     assert float(draws.quantise(result)) == result
-    assert math.copysign(1.0, result) == 1.0 or result < 0.0
+    sign = math.copysign(1.0, result)
+    assert sign == 1.0 or result < 0.0
 
 
-@pytest.mark.parametrize("value", [16.0, -16.0, math.inf, math.nan])
+@pytest.mark.parametrize(
+    "value",
+    [
+        16.0,
+        -16.0,
+        math.inf,
+        math.nan,
+    ],
+)
 def test_quantise_refuses_what_float32_would_round(value: float) -> None:
     """Too large or not finite is an error that says where to look."""
     with pytest.raises(WorkFailedError) as caught:
@@ -118,9 +145,12 @@ def test_uniform_follows_its_law() -> None:
     rng = source()
     values = [draws.uniform(rng, -0.3, 0.5) for _ in range(2000)]
     law = stats.uniform(-0.3, 0.8)
-    assert stats.kstest(values, law.cdf).pvalue > 0.01
-    assert draws.uniform(Script(0.0), -0.25, 0.5) == -0.25
-    assert draws.uniform(Script(0.5), -0.25, 0.75) == 0.25
+    test = stats.kstest(values, law.cdf)
+    assert test.pvalue > 0.01
+    least = draws.uniform(Script(0.0), -0.25, 0.5)
+    middle = draws.uniform(Script(0.5), -0.25, 0.75)
+    assert least == -0.25
+    assert middle == 0.25
 
 
 def test_log_uniform_follows_its_law() -> None:
@@ -130,19 +160,22 @@ def test_log_uniform_follows_its_law() -> None:
     rng = source()
     values = [draws.log_uniform(rng, 20.0, 400.0) for _ in range(2000)]
     law = stats.loguniform(20.0, 400.0)
-    assert stats.kstest(values, law.cdf).pvalue > 0.01
-    assert draws.log_uniform(Script(0.0), 20.0, 400.0) == 20.0
+    test = stats.kstest(values, law.cdf)
+    assert test.pvalue > 0.01
+    least = draws.log_uniform(Script(0.0), 20.0, 400.0)
+    assert least == 20.0
     # Half-way in the logarithm lies the geometric mean, sqrt(20 * 400).
-    assert draws.log_uniform(Script(0.5), 20.0, 400.0) == math.sqrt(8000.0)
+    middle = draws.log_uniform(Script(0.5), 20.0, 400.0)
+    assert middle == math.sqrt(8000.0)
     for ends in ((0.0, 1.0), (-1.0, 1.0), (2.0, 1.0)):
         with pytest.raises(WorkFailedError):
             draws.log_uniform(rng, *ends)
 
 
 @given(
-    st.floats(0.0, 1.0, exclude_max=True),
-    st.floats(1e-3, 10.0),
-    st.floats(1.0, 1e4),
+    u=st.floats(0.0, 1.0, exclude_max=True),
+    low=st.floats(1e-3, 10.0),
+    ratio=st.floats(1.0, 1e4),
 )
 def test_log_uniform_agrees_with_extended_precision(
     u: float,
@@ -150,12 +183,14 @@ def test_log_uniform_agrees_with_extended_precision(
     ratio: float,
 ) -> None:
     """It is the 80-bit result of low (high/low)^u to one unit in the last place."""
+    high = low * ratio
     least = np.longdouble(low)
-    most = np.longdouble(low * ratio)
+    most = np.longdouble(high)
     span = np.log(most / least)
     wide = least * np.exp(span * np.longdouble(u))
-    expected = pytest.approx(float(wide), rel=2.3e-16, abs=0.0)
-    assert draws.log_uniform(Script(u), low, low * ratio) == expected
+    expected = float(wide)
+    drawn = draws.log_uniform(Script(u), low, high)
+    assert drawn == pytest.approx(expected, rel=2.3e-16, abs=0.0)
 
 
 def test_normal_has_the_moments_of_twelve_uniforms() -> None:
@@ -163,13 +198,16 @@ def test_normal_has_the_moments_of_twelve_uniforms() -> None:
     six.
     """
     values = draws.normal(source(), 1.0, (100_000,))
+    kurtosis = stats.kurtosis(values)
+    test = stats.kstest(values[:2000], stats.norm.cdf)
     assert abs(values.mean()) < 0.01
     assert values.var() == pytest.approx(1.0, abs=0.015)
     assert abs(stats.skew(values)) < 0.03
-    assert stats.kurtosis(values) == pytest.approx(-0.1, abs=0.05)
-    assert stats.kstest(values[:2000], stats.norm.cdf).pvalue > 0.01
+    assert kurtosis == pytest.approx(-0.1, abs=0.05)
+    assert test.pvalue > 0.01
     zeros = Script(*([0.0] * 12))
-    assert draws.normal(zeros, 0.5, (1,)).tolist() == [-3.0]
+    least = draws.normal(zeros, 0.5, (1,))
+    assert least.tolist() == [-3.0]
     narrow = draws.normal(source(), 0.35, (50, 2))
     wide = draws.normal(source(), 0.7, (50, 2))
     assert (2.0 * narrow == wide).all()
@@ -179,14 +217,16 @@ def test_choice_is_fair_and_never_reaches_its_count() -> None:
     """Chi-squared over six; the largest variate below 1 gives the last choice, the
     least the first.
     """
-    for count in (*range(1, 40), 10**6, 2**40 - 1, 2**40):
+    counts = [*range(1, 40), 10**6, 2**40 - 1, 2**40]
+    for count in counts:
         largest = Script(1.0 - 2.0**-53)
         assert draws.choice(largest, count) == count - 1
         assert draws.choice(Script(0.0), count) == 0
     rng = source()
     choices = [draws.choice(rng, 6) for _ in range(3000)]
-    counts = np.bincount(choices, minlength=6)
-    assert stats.chisquare(counts).pvalue > 0.01
+    counts_of_choices = np.bincount(choices, minlength=6)
+    test = stats.chisquare(counts_of_choices)
+    assert test.pvalue > 0.01
 
 
 def test_direction_is_uniform_over_the_circle() -> None:
@@ -194,10 +234,13 @@ def test_direction_is_uniform_over_the_circle() -> None:
     rng = source()
     vectors = [draws.direction(rng) for _ in range(2000)]
     x, y = np.transpose(vectors)
-    np.testing.assert_allclose(np.hypot(x, y), 1.0, rtol=3e-16)
+    length = np.hypot(x, y)
+    np.testing.assert_allclose(length, 1.0, rtol=3e-16)
     turns = np.arctan2(x, y) / (2.0 * np.pi) + 0.5
-    assert stats.kstest(turns, stats.uniform.cdf).pvalue > 0.01
+    test = stats.kstest(turns, stats.uniform.cdf)
+    assert test.pvalue > 0.01
     # Corners and the very centre are refused; (0.6, 0.8) x 1/2 is normalised.
     script = Script(0.0, 0.0, 0.5, 0.5, 0.65, 0.7)
-    assert draws.direction(script) == pytest.approx((0.6, 0.8))
+    direction = draws.direction(script)
+    assert direction == pytest.approx((0.6, 0.8))
     assert script.values == []

@@ -16,17 +16,25 @@ LOW = 0.0375
 HIGH = 0.9625
 NUMBERS = st.floats(-2, 2, allow_subnormal=False)
 
+Array = NDArray[np.float64]
 
-def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
+
+def points(
+    count: int,
+    low: float = 0.0,
+    high: float = 1.0,
+) -> Array:
     """Return reproducible points of a square."""
     rng = np.random.Generator(np.random.PCG64(5))
-    return low + (high - low) * rng.random((count, 2))
+    share = rng.random((count, 2))
+    return low + (high - low) * share
 
 
-def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
+def noise_by_hand(x: float, y: float, lattice: Array) -> float:
     """Perlin noise as thesis Eqs. 5.40 and 5.41 spell it, one point at a time."""
-    i = min(int(x), len(lattice) - 2)
-    j = min(int(y), len(lattice) - 2)
+    last_cell = len(lattice) - 2
+    i = min(int(x), last_cell)
+    j = min(int(y), last_cell)
 
     def dot(k: int, m: int) -> float:
         slope_x, slope_y = lattice[i + k, j + m]
@@ -48,8 +56,8 @@ def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
 
 
 def psi_by_hand(
-    position: NDArray[np.float64],
-    lattice: NDArray[np.float64],
+    position: Array,
+    lattice: Array,
     scale: float,
 ) -> float:
     """The windowed stream function at one point, from its definition."""
@@ -58,7 +66,8 @@ def psi_by_hand(
     x, y = (position - LOW) / width
     value = noise_by_hand(x * frequency, y * frequency, lattice)
     value *= scale * width
-    for wall in (x, 1 - x, y, 1 - y):
+    distances = [x, 1 - x, y, 1 - y]
+    for wall in distances:
         t = 2 * frequency * wall
         if t < 1:
             ramp = 15 * t - 10 * t**3 + 3 * t**5
@@ -66,26 +75,38 @@ def psi_by_hand(
     return float(value)
 
 
-def lattice_of(frequency: int) -> NDArray[np.float64]:
+def lattice_of(frequency: int) -> Array:
     """Return the gradients of a test lattice."""
     rng = draws.generator("curl-noise", "test", 1, frequency)
     return np.asarray(noise.gradients(rng, frequency))
 
 
-def stream(position: NDArray[np.float64], lattice: NDArray[np.float64]) -> noise.Jet:
+def stream(position: Array, lattice: Array) -> noise.Jet:
     """Return the stream function of scale 0.01 and its derivatives."""
-    return curl_noise.stream_function(position, lattice, low=LOW, high=HIGH, scale=0.01)
+    return curl_noise.stream_function(
+        position,
+        lattice,
+        low=LOW,
+        high=HIGH,
+        scale=0.01,
+    )
 
 
-@given(st.lists(NUMBERS, min_size=1, max_size=6), NUMBERS, NUMBERS)
+@given(
+    coefficients=st.lists(NUMBERS, min_size=1, max_size=6),
+    x=NUMBERS,
+    y=NUMBERS,
+)
 def test_jets_differentiate_polynomials(
     coefficients: list[float],
     x: float,
     y: float,
 ) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
-    jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
-    p = (jet_x * jet_y).polynomial(*coefficients)
+    point = np.array([[x, y]])
+    jet_x, jet_y = noise.coordinates(point)
+    product = jet_x * jet_y
+    p = product.polynomial(*coefficients)
     exact = Polynomial(coefficients)
     first = exact.deriv(1)(x * y)
     second = exact.deriv(2)(x * y)
@@ -97,33 +118,42 @@ def test_jets_differentiate_polynomials(
         first + x * y * second,
         x * x * second,
     ]
-    terms = (p.value, p.x, p.y, p.xx, p.xy, p.yy)
-    derivatives = [term[0] for term in terms]
+    derivatives = []
+    for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy):
+        derivatives.append(term[0])
     assert derivatives == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
     lattice = lattice_of(3)
-    node = np.array(list(np.ndindex(4, 4)), dtype=np.float64)
-    field = noise.noise(*noise.coordinates(node), lattice)
+    node = np.array(list(np.ndindex(4, 4)), float)
+    x, y = noise.coordinates(node)
+    field = noise.noise(x, y, lattice)
     assert_allclose(field.value, 0.0, atol=1e-15)
     slope = np.stack([field.x, field.y], -1)
-    assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
+    expected = lattice.reshape(-1, 2)
+    assert_allclose(slope, expected, atol=1e-14)
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
     length = np.hypot(*large.T)
     assert_allclose(length, 1.0, rtol=3e-16)
-    assert len(np.unique(large, axis=0)) == 14 * 14
+    distinct = np.unique(large, axis=0)
+    assert len(distinct) == 14 * 14
 
 
-@given(st.floats(0.0, 5.0), st.floats(0.0, 5.0))
+@given(
+    x=st.floats(0.0, 5.0),
+    y=st.floats(0.0, 5.0),
+)
 def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
     """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
     lattice = lattice_of(5)
-    point = noise.coordinates(np.array([[x, y]]))
+    position = np.array([[x, y]])
+    point = noise.coordinates(position)
     field = noise.noise(*point, lattice)
     expected = noise_by_hand(x, y, lattice)
-    assert field.value[0] == pytest.approx(expected, abs=1e-13)
+    value = field.value[0]
+    assert value == pytest.approx(expected, abs=1e-13)
 
 
 def test_ramp_joins_one_with_two_derivatives() -> None:
@@ -134,9 +164,11 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
     position = np.stack([t, np.zeros(4)], axis=1)
     along_x, _ = noise.coordinates(position)
     ramp = noise.ramp(along_x)
-    assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
-    assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
-    assert_allclose(ramp.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
+    value = [0.0, 1.0, 1.0, 1.0]
+    slope = [1.875, 0.0, 0.0, 0.0]
+    assert_allclose(ramp.value, value, atol=1e-15)
+    assert_allclose(ramp.x, slope, atol=1e-15)
+    assert_allclose(ramp.xx, np.zeros(4), atol=1e-7)
 
 
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
@@ -148,12 +180,14 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
     step = 1e-6
     position = points(60, LOW + 0.001, HIGH - 0.001)
     psi = stream(position, lattice)
-    for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
+    steps = step * np.eye(2)
+    for term, offset in zip((psi.x, psi.y), steps, strict=True):
         slopes = []
         for point in position:
             above = psi_by_hand(point + offset, lattice, 0.01)
             below = psi_by_hand(point - offset, lattice, 0.01)
-            slopes.append((above - below) / (2 * step))
+            rise = above - below
+            slopes.append(rise / (2 * step))
         assert_allclose(term, slopes, atol=2e-9 * frequency)
 
 
@@ -165,8 +199,10 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
     position = points(200, LOW + 0.001, HIGH - 0.001)
     here = stream(position, lattice)
     tolerance = 2e-5 * frequency**2
-    rows = ((here.xx, here.xy), (here.xy, here.yy))
-    for (along_x, along_y), offset in zip(rows, np.eye(2) * step, strict=True):
+    along_axes = [(here.xx, here.xy), (here.xy, here.yy)]
+    steps = step * np.eye(2)
+    for axis, offset in enumerate(steps):
+        along_x, along_y = along_axes[axis]
         after = stream(position + offset, lattice)
         before = stream(position - offset, lattice)
         slope_x = (after.x - before.x) / (2 * step)
@@ -178,13 +214,18 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
 @pytest.mark.parametrize("frequency", [1, 4, 13])
 def test_no_flow_crosses_the_walls(frequency: int) -> None:
     """The normal velocity is exactly 0 on each wall; the flow along it is not."""
-    along = LOW + (HIGH - LOW) * np.arange(101) / 100
+    share = np.arange(101) / 100
+    along = LOW + (HIGH - LOW) * share
     lattice = lattice_of(frequency)
     for wall in (LOW, HIGH):
-        upright = np.stack([np.full(101, wall), along], -1)
+        across = np.full(101, wall)
+        upright = np.stack([across, along], axis=-1)
+        level = np.stack([along, across], axis=-1)
         side = stream(upright, lattice)
-        floor = stream(upright[:, ::-1], lattice)
+        floor = stream(level, lattice)
         assert not side.y.any()
         assert not floor.x.any()
-        assert np.abs(side.x).max() > 1e-4
-        assert np.abs(floor.y).max() > 1e-4
+        speed_at_side = np.abs(side.x)
+        speed_at_floor = np.abs(floor.y)
+        assert speed_at_side.max() > 1e-4
+        assert speed_at_floor.max() > 1e-4

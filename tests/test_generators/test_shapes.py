@@ -17,7 +17,14 @@ from lagbench.errors import WorkFailedError
 from lagbench.generators import draws, shapes
 
 # Three overlapping unit discs in a row, and one that touches them from above.
-ROW = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.5]])
+ROW = np.array(
+    [
+        [-1.0, 0.0],
+        [0.0, 0.0],
+        [1.0, 0.0],
+        [0.0, 1.5],
+    ]
+)
 SHAPES: dict[str, shapes.Shape] = {
     "rectangle": shapes.Rectangle(0.3, 0.15),
     "rope": shapes.Rectangle(0.65, 0.05, (0.6, 0.8)),
@@ -28,7 +35,8 @@ SHAPES: dict[str, shapes.Shape] = {
 
 def source(scenario: int = 0) -> np.random.Generator:
     """Return a stream of its own for one test."""
-    stream: np.random.Generator = draws.generator("fluid", "test", 1, scenario)
+    stream: np.random.Generator
+    stream = draws.generator("fluid", "test", 1, scenario)
     return stream
 
 
@@ -42,21 +50,28 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
     shape = SHAPES[name]
     node_count = 1501
     cell = 1.2 / node_count
-    side = 0.6 * ((2 * np.arange(node_count) + 1) / node_count - 1)
+    middles = np.arange(node_count) + 0.5
+    side = 1.2 * middles / node_count - 0.6
     columns, rows = np.meshgrid(side, side)
     grid = np.stack([columns, rows], -1).reshape(-1, 2)
     inside = grid[shape.distance(grid) <= 0.0]
-    assert len(inside) * cell**2 == pytest.approx(shape.area, rel=5e-3)
+    area = len(inside) * cell**2
+    assert area == pytest.approx(shape.area, rel=5e-3)
     low = np.negative(shape.reach)
-    assert_allclose(inside.max(axis=0), shape.reach, atol=cell)
-    assert_allclose(inside.min(axis=0), low, atol=cell)
+    greatest = inside.max(axis=0)
+    least = inside.min(axis=0)
+    assert_allclose(greatest, shape.reach, atol=cell)
+    assert_allclose(least, low, atol=cell)
 
     rng = np.random.Generator(np.random.PCG64(1))
-    probes = rng.random((300, 2)) * 1.6 - 0.8
+    share = rng.random((300, 2))
+    probes = share * 1.6 - 0.8
     distance = shape.distance(probes)
     is_outside = distance > 0.0
-    gaps, _ = neighbours(probes[is_outside], 1, among=inside)
-    assert_allclose(distance[is_outside], gaps[:, 0], atol=1.5 * cell)
+    outer_probes = probes[is_outside]
+    outer_distance = distance[is_outside]
+    gaps, _ = neighbours(outer_probes, 1, among=inside)
+    assert_allclose(outer_distance, gaps[:, 0], atol=1.5 * cell)
 
 
 def test_shapes_by_hand() -> None:
@@ -64,11 +79,21 @@ def test_shapes_by_hand() -> None:
     (3-4-5); one blob.
     """
     rectangle = shapes.Rectangle(4.0, 2.0)
-    at = np.array([[0.0, 0.0], [3.0, 0.5], [5.0, 5.0], [1.5, 0.0]])
-    assert rectangle.distance(at).tolist() == [-1.0, 1.0, 5.0, -0.5]
+    at = np.array(
+        [
+            [0.0, 0.0],
+            [3.0, 0.5],
+            [5.0, 5.0],
+            [1.5, 0.0],
+        ]
+    )
+    distance = rectangle.distance(at)
+    assert distance.tolist() == [-1.0, 1.0, 5.0, -0.5]
     # The counted area of a unit disc is pi to 1e-3, hence the radius sqrt(area / pi).
-    blob = shapes.Blobs.of_area(0.05, np.zeros((1, 2)), cells=512)
-    assert blob.radius == pytest.approx(math.sqrt(0.05 / math.pi), rel=1e-3)
+    one_centre = np.zeros((1, 2))
+    blob = shapes.Blobs.of_area(0.05, one_centre, cells=512)
+    radius = math.sqrt(0.05 / math.pi)
+    assert blob.radius == pytest.approx(radius, rel=1e-3)
     assert blob.centres == ((0.0, 0.0),)
 
 
@@ -79,7 +104,8 @@ def test_sample_points_lie_evenly_inside(name: str, count: int) -> None:
     body = shapes.body_at(SHAPES[name], 0.5, 0.4)
     position = shapes.sample_points(source(), body, count)
     assert position.shape == (count, 2)
-    assert body.distance(position).max() <= 2.0**-20
+    distance = body.distance(position)
+    assert distance.max() <= 2.0**-20
     spacing = math.sqrt(body.shape.area / count)
     gaps, _ = neighbours(position, 2)
     gap = gaps[:, 1]
@@ -97,8 +123,10 @@ def test_sample_points_have_the_centre_and_spread_of_the_body() -> None:
     moments, axes = np.linalg.eigh(covariance)
     expected = [0.05**2 / 12, 0.65**2 / 12]
     assert moments == pytest.approx(expected, rel=0.03)
-    assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
-    assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
+    long_axis = np.abs(axes[:, 1])
+    centre = position.mean(axis=0)
+    assert_allclose(long_axis, [0.6, 0.8], atol=0.003)
+    assert_allclose(centre, 0.5, atol=0.003)
     # Two scenarios spread different points in the same body.
     body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
     first = shapes.sample_points(source(0), body, 50)
@@ -107,11 +135,15 @@ def test_sample_points_have_the_centre_and_spread_of_the_body() -> None:
     assert gaps.min() > 0.0
 
 
-@given(st.integers(0, 2**30), st.sampled_from(sorted(SHAPES)))
+@given(
+    scenario=st.integers(0, 2**30),
+    name=st.sampled_from(sorted(SHAPES)),
+)
 def test_place_keeps_within_its_region(scenario: int, name: str) -> None:
     """The bounding box lies in the region whatever was drawn."""
     region = ((0.05, 0.95), (0.1, 0.8))
-    body = shapes.place(source(scenario), SHAPES[name], region)
+    stream = source(scenario)
+    body = shapes.place(stream, SHAPES[name], region)
     quantum = 2.0**-20
     for axis, (low, high) in enumerate(region):
         centre = body.centre[axis]
@@ -122,5 +154,7 @@ def test_place_keeps_within_its_region(scenario: int, name: str) -> None:
 
 def test_place_refuses_a_body_that_does_not_fit() -> None:
     """The error says how wide the body is and what to change."""
+    narrow = ((0.1, 0.3), (0.0, 1.0))
+    stream = source()
     with pytest.raises(WorkFailedError):
-        shapes.place(source(), SHAPES["rectangle"], ((0.1, 0.3), (0.0, 1.0)))
+        shapes.place(stream, SHAPES["rectangle"], narrow)
