@@ -35,7 +35,13 @@ def root(tiny_split: Callable[..., GenerationResult]) -> Path:
 @pytest.fixture(scope="module")
 def batch(root: Path) -> Batch:
     """Two windows of different scenarios, from different frames."""
-    data = WindowDataset(SPLIT, size="tiny", root=root, history=GIVEN, future=4)
+    data = WindowDataset(
+        SPLIT,
+        size="tiny",
+        root=root,
+        history=GIVEN,
+        future=4,
+    )
     return collate([data[2], data[-1]])
 
 
@@ -45,7 +51,8 @@ def test_windows_hold_the_force_of_their_frames(root: Path) -> None:
     window = data[5]
     assert window.body_force is not None
     with read_scenario(SIZE.path(root, window.scenario)) as file:
-        expected = file.read("body_force")[window.frame : window.frame + 3]
+        force = file.read("body_force")
+    expected = force[window.frame : window.frame + 3]
     assert np.abs(expected).max() > 0.0
     np.testing.assert_array_equal(window.body_force, expected)
 
@@ -55,11 +62,14 @@ def test_the_force_goes_with_the_frames(batch: Batch) -> None:
     force = batch.body_force
     assert force is not None
     assert force.shape == (2, GIVEN + 4, 2, 2)
-    assert_close(force[:, :, 1], -force[:, :, 0])
+    lower = force[:, :, 0]
+    upper = force[:, :, 1]
+    assert_close(upper, -lower)
     given = batch.part(slice(GIVEN))
     assert given.body_force is not None
     assert_close(given.body_force, force)
-    later = given.followed_by(given.position[:, -1])
+    last = given.position[:, -1]
+    later = given.followed_by(last)
     assert later.body_force is not None
     assert_close(later.body_force, force[:, 1:])
 
@@ -74,12 +84,19 @@ def test_a_users_model_is_given_the_force_of_all_frames(root: Path) -> None:
         return given.position[:, -1]
 
     first, *_ = predict(step, SPLIT, size="tiny", root=root, history=2)
-    with read_scenario(SIZE.path(root, first[0])) as file:
+    scenario, _ = first
+    with read_scenario(SIZE.path(root, scenario)) as file:
         force = file.read("body_force")
     task = SIZE.task
-    frames = slice(task.input_frames, task.input_frames + task.horizon)
-    rows = torch.stack(seen[: task.horizon]).numpy()
-    np.testing.assert_array_equal(rows, force[frames])
+    frame_count = task.input_frames + task.horizon
+    expected = force[task.input_frames : frame_count]
+    rows = torch.stack(seen[: task.horizon])
+    np.testing.assert_array_equal(rows.numpy(), expected)
+
+
+def for_both_windows(matrix: list[list[float]]) -> torch.Tensor:
+    """Return one matrix for each of two windows."""
+    return torch.tensor(matrix).expand(2, 2, 2)
 
 
 def test_images_of_the_force_fit_the_images_of_the_particles(batch: Batch) -> None:
@@ -88,26 +105,28 @@ def test_images_of_the_force_fit_the_images_of_the_particles(batch: Batch) -> No
     """
     force = batch.body_force
     assert force is not None
-    across_x = torch.diag(torch.tensor([-1.0, 1.0])).expand(2, 2, 2)
+    across_x = for_both_windows([[-1.0, 0.0], [0.0, 1.0]])
     image = mirror_batch(batch, across_x, SIZE.bounds)
     assert image.body_force is not None
     assert_close(image.body_force, -force)
 
-    across_y = torch.diag(torch.tensor([1.0, -1.0])).expand(2, 2, 2)
+    across_y = for_both_windows([[1.0, 0.0], [0.0, -1.0]])
     image = mirror_batch(batch, across_y, SIZE.bounds)
     assert image.body_force is not None
     assert_close(image.body_force, force.flip(2))
 
-    swap = torch.tensor([[0.0, 1.0], [1.0, 0.0]]).expand(2, 2, 2)
+    swap = for_both_windows([[0.0, 1.0], [1.0, 0.0]])
     with pytest.raises(UsageError) as caught:
         mirror_batch(batch, swap, SIZE.bounds)
     assert caught.value.where == "symmetry"
 
     box = TensorBox(SIZE.box)
-    moved = shift_batch(batch, box, torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(1)
+    moved = shift_batch(batch, box, generator)
     way = box.displacement(batch.position, moved.position)
-    assert float(way[..., 0].abs().min()) > 1e-3
-    assert float(way[..., 1].abs().max()) == 0.0
+    x_way, y_way = way.abs().unbind(dim=-1)
+    assert float(x_way.min()) > 1e-3
+    assert float(y_way.max()) == 0.0
 
 
 def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) -> None:
@@ -120,29 +139,28 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
         "width": 8,
         "velocities": 2,
         "bundle": 3,
+        "body_force": True,
     }
-    model = NeuralMPM.build({**options, "body_force": True}, info)
+    model = NeuralMPM.build(options, info)
     given = batch.part(slice(GIVEN))
     state = model.start(given)
     assert state.body_force is not None
     fields = model.encoder.force(state.body_force)
     assert fields.shape == (2, 6, 12, 12)
     assert batch.body_force is not None
-    unit = info.frame_interval**2 / model.change
+    square_interval = info.frame_interval**2
+    unit = square_interval / model.change
     coming = unit * batch.body_force[:, GIVEN : GIVEN + 3]
-    for layer, rows in enumerate((slice(0, 6), slice(6, 12))):
-        expected = coming[:, :, layer].flatten(1)[..., None, None]
-        assert_close(
-            fields[..., rows],
-            expected.expand(-1, -1, 12, 6),
-            atol=1e-6,
-            rtol=1e-5,
-        )
+    halves = [fields[..., :6], fields[..., 6:]]
+    for layer, half in enumerate(halves):
+        of_layer = coming[:, :, layer].flatten(1)
+        expected = of_layer[..., None, None].expand(-1, -1, 12, 6)
+        assert_close(half, expected, atol=1e-6, rtol=1e-5)
     state, _ = model.call(state)
     assert state.body_force is not None
-    assert_close(
-        state.body_force[:, 0], info.frame_interval**2 * batch.body_force[:, GIVEN + 2]
-    )
+    next_force = state.body_force[:, 0]
+    assert_close(next_force, square_interval * batch.body_force[:, GIVEN + 2])
 
+    without_force = replace(given, body_force=None)
     with pytest.raises(DataError):
-        model.start(replace(given, body_force=None))
+        model.start(without_force)

@@ -30,9 +30,10 @@ from lagbench.errors import WorkFailedError
 from lagbench.generators import fluid, multimaterial
 from lagbench.generators.split import InitialState, Material
 
+SPLITS = ("fluid", "multimaterial")
 DECLARED = [
     (split, name)
-    for split in ("fluid", "multimaterial")
+    for split in SPLITS
     for name in registry.load().split(split).parameters
 ]
 
@@ -72,16 +73,25 @@ def test_every_parameter_decides_bits(split: str, name: str) -> None:
     state.
     """
     # only the larger sizes have scenarios of shift
-    shift_only = registry.load().split(split).parameters[name].subset == "shift"
-    size_name = "mini" if shift_only else "tiny"
+    parameter = registry.load().split(split).parameters[name]
+    shift_only = parameter.subset == "shift"
+    size_name = "tiny"
+    if shift_only:
+        size_name = "mini"
     size = registry.load().size(split, size_name)
-    ids = size.subsets["shift"] if shift_only else size.scenarios
-    other = changed(size, **{name: other_value(name, size.value(name))})
+    ids = size.scenarios
+    if shift_only:
+        ids = size.subsets["shift"]
+    new_value = other_value(name, size.value(name))
+    other = changed(size, **{name: new_value})
     constants = importlib.import_module(size.generator).solver_parameters
     if repr(constants(other)) != repr(constants(size)):
         return
-    before = [digest(state_of(split, size_name, i)) for i in ids]
-    after = [digest(draw(other, i)) for i in ids]
+    before = []
+    after = []
+    for i in ids:
+        before.append(digest(state_of(split, size_name, i)))
+        after.append(digest(draw(other, i)))
     assert after != before
 
 
@@ -90,12 +100,15 @@ def test_no_number_in_the_source_decides_bits(module: ModuleType) -> None:
     """What is drawn has its ranges in datasets.yaml: the source holds 0, 1, 2, halves
     and a limit.
     """
-    tree = ast.parse(Path(str(module.__file__)).read_text())
+    source = Path(str(module.__file__)).read_text()
+    tree = ast.parse(source)
     numbers = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        is_constant = isinstance(node, ast.Constant)
+        if is_constant and type(node.value) in (int, float):
             numbers.add(node.value)
-    assert numbers <= {0, 0.5, 1, 2, getattr(module, "_ATTEMPTS", 0)}
+    attempts = getattr(module, "_ATTEMPTS", 0)
+    assert numbers <= {0, 0.5, 1, 2, attempts}
 
 
 @pytest.mark.parametrize(
@@ -105,7 +118,11 @@ def test_no_number_in_the_source_decides_bits(module: ModuleType) -> None:
         ("multimaterial", "pair", PAIRS),
     ],
 )
-def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None:
+def test_kinds_follow_the_id(
+    split: str,
+    kind: str,
+    expected: list[str],
+) -> None:
     """The id modulo 4 or 6, in the order of Table 4.8, whose 0 and 26 are a rectangle
     and a circle.
     """
@@ -113,8 +130,10 @@ def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None
         entry = registry.load().size(split, size)
         kinds = {}
         for i in usual_ids(entry):
-            kinds[i] = state_of(split, size, i).parameters[kind]
-            assert kinds[i] == expected[i % len(expected)]
+            state = state_of(split, size, i)
+            kinds[i] = state.parameters[kind]
+            number = i % len(expected)
+            assert kinds[i] == expected[number]
         if (split, size) != ("fluid", "tiny"):
             test_kinds = {kinds[i] for i in entry.subsets["test"]}
             assert test_kinds == set(expected)
@@ -123,7 +142,8 @@ def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None
 @pytest.mark.parametrize("size", SIZES)
 def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
     """Areas 0.04-0.06; velocities per family; a margin of 0.02 to every wall."""
-    (low, high), _ = registry.load().size("fluid", size).bounds
+    described = registry.load().size("fluid", size)
+    (low, high), _ = described.bounds
     for state in all_of("fluid", size):
         assert 0.04 <= state.area <= 0.06
         assert low + 0.02 - 1e-5 <= state.position.min()
@@ -131,13 +151,14 @@ def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
         assert (state.material == Material.LIQUID).all()
         family = state.parameters["family"]
         velocity = state.velocity
+        height = state.position[:, 1]
         if family == "thrown":
             assert (velocity >= [1.0, 0.0]).all()
             assert (velocity <= [2.0, 1.0]).all()
         elif family != "splash":
             assert np.abs(velocity).max() <= 0.3
             assert velocity[:, 1].max() <= 0.0
-            assert state.position[:, 1].min() >= 0.35
+            assert height.min() >= 0.35
         if family != "splash":
             assert (velocity == velocity[0]).all()
 
@@ -145,7 +166,8 @@ def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
 @pytest.mark.parametrize("size", ["full", "mini"])
 def test_shifted_liquid_lies_outside_train(size: str) -> None:
     """Half has about twice the liquid; half is a column on the floor beside a wall."""
-    (low, high), _ = registry.load().size("fluid", size).bounds
+    described = registry.load().size("fluid", size)
+    (low, high), _ = described.bounds
     states = shifted("fluid", size)
     for state in states[::2]:
         assert 0.09 <= state.area <= 0.11
@@ -153,11 +175,14 @@ def test_shifted_liquid_lies_outside_train(size: str) -> None:
         assert state.parameters["family"] == "column"
         assert 0.04 <= state.area <= 0.06
         assert not state.velocity.any()
-        width, height = np.ptp(state.position, axis=0)
+        x, y = state.position.T
+        width = np.ptp(x)
+        height = np.ptp(y)
         assert 1.4 <= height / width <= 2.6
-        assert state.position[:, 1].min() < low + 0.02
-        gaps = (state.position[:, 0].min() - low, high - state.position[:, 0].max())
-        assert 0.0 <= min(gaps) < 0.01
+        assert y.min() < low + 0.02
+        left_gap = x.min() - low
+        right_gap = high - x.max()
+        assert 0.0 <= min(left_gap, right_gap) < 0.01
         assert low <= state.position.min()
         assert state.position.max() <= high
 
@@ -172,8 +197,10 @@ def test_shifted_scenes_have_three_bodies_apart() -> None:
         names = str(state.parameters["pair"]).split("-")
         assert len(names) == 3
         for kind in materials:
-            tree = cKDTree(state.position[state.material == kind])
-            distance, _ = tree.query(state.position[state.material != kind])
+            is_own = state.material == kind
+            own = state.position[is_own]
+            others = state.position[~is_own]
+            distance, _ = cKDTree(own).query(others)
             assert distance.min() >= 0.04 - 2 * 2.0**-20
 
 
@@ -182,15 +209,18 @@ def test_fluid_bodies_cover_their_area_in_one_piece() -> None:
     count right.
     """
     for state in all_of("fluid")[:16]:
-        spacing = math.sqrt(state.area / len(state.position))
+        particle_area = state.area / len(state.position)
+        spacing = math.sqrt(particle_area)
         tree = cKDTree(state.position)
         pairs = tree.sparse_distance_matrix(tree, 1.8 * spacing)
         piece_count, _ = connected_components(pairs)
         assert piece_count == 1
         cell = 1.6 * spacing
-        cells = np.unique(np.floor(state.position / cell), axis=0)
+        cell_numbers = np.floor(state.position / cell)
+        cells = np.unique(cell_numbers, axis=0)
         # Occupied cells overcount by about half the outline's: 5 to 30 % here.
-        assert 1.0 < len(cells) * cell**2 / state.area < 1.3
+        occupied_area = len(cells) * cell**2
+        assert 1.0 < occupied_area / state.area < 1.3
 
 
 def test_fluid_splash_has_blobs_and_noise() -> None:
@@ -201,29 +231,40 @@ def test_fluid_splash_has_blobs_and_noise() -> None:
     speeds = []
     for state in all_of("fluid")[3::4]:
         _, nearest = neighbours(state.position, 60)
-        differences.append(state.velocity - state.velocity[nearest[:, 1]])
-        speeds.append(state.velocity[nearest].mean(axis=1) - [0.0, 0.5])
+        partner = nearest[:, 1]
+        difference = state.velocity - state.velocity[partner]
+        mean = state.velocity[nearest].mean(axis=1)
+        differences.append(difference)
+        speeds.append(mean - [0.0, 0.5])
     # Variance of a difference of two: 2 x 0.25, plus a little of the blend.
     deviation = np.std(np.concatenate(differences))
-    assert deviation == pytest.approx(math.sqrt(0.5), rel=0.03)
+    expected = math.sqrt(0.5)
+    assert deviation == pytest.approx(expected, rel=0.03)
     # Where discs of N(0, 0.7) meet, their velocities are blended.
-    assert 0.3 < np.std(np.concatenate(speeds)) < 0.8
+    blended = np.std(np.concatenate(speeds))
+    assert 0.3 < blended < 0.8
+
+
+Positions = NDArray[np.float64]
 
 
 def halves(
-    state: InitialState, size: registry.Size
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    state: InitialState,
+    size: registry.Size,
+) -> tuple[Positions, Positions]:
     """Split a state's particles into its two bodies by their recorded areas."""
     first = float(state.parameters["first_area"])
-    first_count = round(size.particles * first / state.area)
-    return state.position[:first_count], state.position[first_count:]
+    share = first / state.area
+    first_count = round(size.particles * share)
+    position = state.position
+    return position[:first_count], position[first_count:]
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_multimaterial_bodies_keep_apart(size: str) -> None:
     """No particle of one body within 0.038 of the other's; both inside the margin."""
     entry = registry.load().size("multimaterial", size)
-    (low, high), _ = entry.bounds
+    low, high = entry.bounds[0]
     for state in all_of("multimaterial", size):
         first, second = halves(state, entry)
         gaps, _ = neighbours(second, 1, among=first)
@@ -238,18 +279,23 @@ def test_multimaterial_shares_particles_and_areas() -> None:
     for state in all_of("multimaterial"):
         first, second = halves(state, entry)
         words = str(state.parameters["pair"]).split("-")
+        first_material, second_material = np.split(state.material, [len(first)])
         expected = [Material[word.upper()] for word in words]
-        assert (state.material[: len(first)] == expected[0]).all()
-        assert (state.material[len(first) :] == expected[1]).all()
-        areas = [
-            float(state.parameters[f"{name}_area"]) for name in ("first", "second")
-        ]
+        assert (first_material == expected[0]).all()
+        assert (second_material == expected[1]).all()
+        first_area = float(state.parameters["first_area"])
+        second_area = float(state.parameters["second_area"])
+        areas = [first_area, second_area]
+        bodies = [first, second]
         assert math.fsum(areas) == pytest.approx(state.area)
-        for word, area, body in zip(words, areas, (first, second), strict=True):
+        for number, word in enumerate(words):
+            area = areas[number]
             if word == "rope":
-                narrow, wide = np.linalg.eigvalsh(np.cov(body.T, bias=True))
-                assert math.sqrt(12 * narrow) == pytest.approx(0.05, rel=0.04)
-                assert 0.54 < math.sqrt(12 * wide) < 0.76
+                covariance = np.cov(bodies[number].T, bias=True)
+                moments = np.linalg.eigvalsh(covariance)
+                width, length = np.sqrt(12 * moments)
+                assert width == pytest.approx(0.05, rel=0.04)
+                assert 0.54 < length < 0.76
                 assert 0.55 * 0.05 <= area <= 0.75 * 0.05
             else:
                 assert 0.045 <= area <= 0.06
@@ -262,8 +308,9 @@ def test_multimaterial_bodies_move_towards_one_point() -> None:
     body is liquid.
     """
     for state in all_of("multimaterial"):
-        dry = "liquid" not in str(state.parameters["pair"])
-        friction = 0.05 if dry else 0.0
+        friction = 0.05
+        if "liquid" in str(state.parameters["pair"]):
+            friction = 0.0
         assert state.friction == friction
         assert state.parameters["friction"] == friction
         p = {}
@@ -271,10 +318,15 @@ def test_multimaterial_bodies_move_towards_one_point() -> None:
             if not isinstance(value, str):
                 p[name] = float(value)
         for axis in ("x", "y"):
-            approach = p[f"first_velocity_{axis}"] - p[f"second_velocity_{axis}"]
-            apart = p[f"second_centre_{axis}"] - p[f"first_centre_{axis}"]
-            assert approach == pytest.approx(p["attraction"] * apart, abs=4 * 2.0**-20)
-        assert np.abs(state.velocity).max() < 2.5
+            first_velocity = p[f"first_velocity_{axis}"]
+            second_velocity = p[f"second_velocity_{axis}"]
+            first_centre = p[f"first_centre_{axis}"]
+            second_centre = p[f"second_centre_{axis}"]
+            approach = first_velocity - second_velocity
+            expected = p["attraction"] * (second_centre - first_centre)
+            assert approach == pytest.approx(expected, abs=4 * 2.0**-20)
+        speed = np.abs(state.velocity)
+        assert speed.max() < 2.5
 
 
 def test_multimaterial_gives_up_when_there_is_no_room() -> None:

@@ -23,7 +23,8 @@ def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201
     base: ti.types.ndarray(),  # type: ignore[valid-type]
 ):
     for p in range(x.shape[0]):
-        row = transfer.stencil(ti.Vector([x[p, 0], x[p, 1], 0.0, 0.0]), 32.0, 33)
+        place = ti.Vector([x[p, 0], x[p, 1], 0.0, 0.0])
+        row = transfer.stencil(place, 32.0, 33)
         base[p] = ti.bit_cast(row[0][3], ti.i32)
         for i, j in ti.static(ti.ndrange(3, 4)):
             rows[p, i, j] = row[i][j]
@@ -52,23 +53,27 @@ def test_weights_are_the_quadratic_b_spline() -> None:
     rest fits.
     """
     count = 500
-    unit = np.random.default_rng(0).random((count, 2))
-    x = (unit * 0.9 + 0.05).astype(np.float32)
+    rng = np.random.default_rng(0)
+    share = rng.random((count, 2))
+    x = (share * 0.9 + 0.05).astype(np.float32)
     rows = np.zeros((count, 3, 4), np.float32)
     base = np.zeros(count, np.int32)
     evaluate_stencil(x, rows, base)
 
     # distance of each of the three nodes per axis [cells], shape [point, 3, 2]
     node = np.stack(np.divmod(base, 33), axis=-1)
-    nodes = node[:, None, :] + np.arange(3)[None, :, None]
-    scaled = x[:, None, :].astype(np.float64) / DX
-    distance = nodes - scaled
+    step = np.arange(3)[:, None]
+    nodes = node[:, None] + step
+    scaled = x.astype(np.float64) / DX
+    distance = nodes - scaled[:, None]
     assert np.abs(distance).max() <= 1.5
 
     knots = [-1.5, -0.5, 0.5, 1.5]
     basis = BSpline.basis_element(knots, extrapolate=False)
     spline = basis(distance)
-    expected = spline[:, :, None, 0] * spline[:, None, :, 1]
+    along_x = spline[:, :, None, 0]
+    along_y = spline[:, None, :, 1]
+    expected = along_x * along_y
     weight = rows[:, :, :3]
     assert_allclose(weight, expected, rtol=0, atol=2e-6)
     total = weight.sum(axis=(1, 2))
@@ -77,11 +82,13 @@ def test_weights_are_the_quadratic_b_spline() -> None:
         along = weight.sum(axis=2 - axis)
         offset = distance[:, :, axis]
         first_moment = (along * offset).sum(axis=1)
-        second_moment = (along * offset**2).sum(axis=1)
+        square = along * offset**2
+        second_moment = square.sum(axis=1)
         assert_allclose(first_moment, 0.0, rtol=0, atol=4e-6)
         assert_allclose(second_moment, 0.25, rtol=0, atol=4e-6)
         stated_offset = rows[:, axis + 1, 3]
-        assert_allclose(stated_offset, -offset[:, 1], rtol=0, atol=1e-6)
+        from_middle = -offset[:, 1]
+        assert_allclose(stated_offset, from_middle, rtol=0, atol=1e-6)
 
 
 def test_fixed_point_is_numpys_rint() -> None:
@@ -105,11 +112,13 @@ def test_fixed_point_is_numpys_rint() -> None:
     mantissa = rng.random(count) - 0.5
     exponent = rng.integers(-5, 51, count)
     drawn = mantissa * 2.0**exponent
-    value = np.concatenate([list(by_hand), drawn]).astype(np.float32)
+    value = np.concatenate([list(by_hand), drawn])
+    value = value.astype(np.float32)
     fixed = np.zeros(len(value), np.int64)
     bounds = np.zeros((len(value), 2), np.float32)
     evaluate(value, fixed, bounds)
-    assert fixed[: len(by_hand)].tolist() == list(by_hand.values())
+    fixed_by_hand = fixed[: len(by_hand)]
+    assert fixed_by_hand.tolist() == list(by_hand.values())
     expected = np.rint(value.astype(np.float64))
     np.testing.assert_array_equal(fixed, expected.astype(np.int64))
 
@@ -119,13 +128,20 @@ def test_bounds_and_extremes_meet_nan() -> None:
     an extreme.
     """
     value = np.array([-3.0, 0.5, 7.0, np.nan, np.inf], np.float32)
+    fixed = np.zeros(5, np.int64)
     out = np.zeros((5, 2), np.float32)
-    evaluate(value, np.zeros(5, np.int64), out)
-    np.testing.assert_array_equal(out[:, 0], [-1.0, 0.5, 2.0, -1.0, 2.0])
-    np.testing.assert_array_equal(out[:, 1], [1.0, 1.0, 7.0, np.nan, np.inf])
+    evaluate(value, fixed, out)
+    bounded, extreme = out.T
+    expected_bounded = [-1.0, 0.5, 2.0, -1.0, 2.0]
+    expected_extreme = [1.0, 1.0, 7.0, np.nan, np.inf]
+    np.testing.assert_array_equal(bounded, expected_bounded)
+    np.testing.assert_array_equal(extreme, expected_extreme)
 
 
-@given(particles=st.integers(1, 2**22), bound=st.floats(1e-6, 1e6))
+@given(
+    particles=st.integers(1, 2**22),
+    bound=st.floats(1e-6, 1e6),
+)
 def test_sums_cannot_overflow(particles: int, bound: float) -> None:
     """The scale is a power of two, N bounds fit in 62 bits, and one step is far below
     float32's.
