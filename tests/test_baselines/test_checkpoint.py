@@ -5,6 +5,7 @@ a file is run.
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
 import struct
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from simple_models import INFO, Drift, install
 
 from lagbench.baselines import checkpoint
@@ -36,13 +38,15 @@ from lagbench.make.generate import GenerationResult
 
 def example(**changes: Any) -> Checkpoint:
     """Return a checkpoint of a Drift whose parameter needs all bits of a float32."""
-    model = Drift.build({"start": 1 / 3}, INFO)
+    options = {"start": 1 / 3}
+    model = Drift.build(options, INFO)
+    recipe = {"training": {"seed": 4}}
     fields = {
         "baseline": "drift",
-        "options": {"start": 1 / 3},
+        "options": options,
         "info": INFO,
         "weights": model.state_dict(),
-        "training": {"step": 3, "recipe": {"training": {"seed": 4}}},
+        "training": {"step": 3, "recipe": recipe},
     }
     return Checkpoint(**{**fields, **changes})
 
@@ -62,9 +66,14 @@ def test_round_trip(tmp_path: Path) -> None:
     assert loaded.training == stored.training
     assert torch.equal(loaded.weights["a"], stored.weights["a"])
     # Adam's first moment after one step: (1 - 0.9) x gradient.
-    assert loaded.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx(
-        [0.05, 0.2]
-    )
+    state = loaded.optimizer["state"][0]
+    first_moment = state["exp_avg"].tolist()
+    assert first_moment == pytest.approx([0.05, 0.2])
+
+
+def bits_of(tensor: torch.Tensor) -> NDArray[np.uint32]:
+    """Return the bits of float32 numbers."""
+    return tensor.detach().numpy().view(np.uint32)
 
 
 def test_rounding() -> None:
@@ -72,15 +81,18 @@ def test_rounding() -> None:
     bit.
     """
     model = torch.nn.BatchNorm1d(1000)
-    torch.nn.init.normal_(model.weight, generator=torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(
-        model.running_mean, generator=torch.Generator().manual_seed(1)
-    )
-    bits = model.weight.detach().numpy().view(np.uint32)
-    expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
+    generator = torch.Generator()
+    generator.manual_seed(0)
+    torch.nn.init.normal_(model.weight, generator=generator)
+    generator.manual_seed(1)
+    torch.nn.init.normal_(model.running_mean, generator=generator)
+    bits = bits_of(model.weight)
+    last_kept_bit = (bits >> 16) & 1
+    upper = (bits + 0x7FFF + last_kept_bit) >> 16
     loaded = round_weights(model)
     assert loaded["weight"].dtype is torch.bfloat16
-    assert np.array_equal(loaded["weight"].float().numpy().view(np.uint32), expected)
+    rounded_bits = bits_of(loaded["weight"].float())
+    assert np.array_equal(rounded_bits, upper << 16)
     assert torch.equal(loaded["running_mean"], model.running_mean)
 
 
@@ -95,7 +107,10 @@ class Bomb:
         return os.mkdir, (str(self.path),)
 
 
-@pytest.mark.parametrize("writer", ["pickle", "torch", "torch, old layout", "inside"])
+WRITERS = ["pickle", "torch", "torch, old layout", "inside"]
+
+
+@pytest.mark.parametrize("writer", WRITERS)
 def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
     """A file that would run code when unpickled is refused, and the code is not run."""
     file = tmp_path / "bomb.pt"
@@ -104,18 +119,21 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
     if writer == "pickle":
         file.write_bytes(pickle.dumps(bomb))
     elif writer == "inside":
-        torch.save(
-            {"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb},
-            file,
-        )
+        content = {
+            "lagbench_checkpoint": 1,
+            "about": "{}",
+            "weights": {},
+            "optimizer": bomb,
+        }
+        torch.save(content, file)
     else:
-        torch.save(bomb, file, _use_new_zipfile_serialization=writer == "torch")
+        is_new = writer == "torch"
+        torch.save(bomb, file, _use_new_zipfile_serialization=is_new)
     with pytest.raises(UnreadableFileError) as caught:
         load(file)
     assert caught.value.where.endswith("bomb.pt")
-    assert "weights_only" not in str(
-        caught.value
-    )  # torch's own words advise to load it unsafely
+    # torch's own words advise to load it unsafely
+    assert "weights_only" not in str(caught.value)
     assert not target.exists()
     pickle.loads(pickle.dumps(bomb))  # the bomb is a real one
     assert target.exists()
@@ -139,10 +157,25 @@ def test_text_is_no_pickle(tmp_path: Path) -> None:
 
 def test_scripts_are_refused(tmp_path: Path) -> None:
     """A TorchScript archive, which holds code too, is refused."""
+    module = torch.nn.ReLU()
+    file = tmp_path / "script.pt"
     with pytest.warns(DeprecationWarning, match="torch.jit"):
-        torch.jit.save(torch.jit.script(torch.nn.ReLU()), tmp_path / "script.pt")
+        torch.jit.save(torch.jit.script(module), file)
     with pytest.raises(UnreadableFileError):
-        load(tmp_path / "script.pt")
+        load(file)
+
+
+def plain_content(
+    *,
+    number: int = 1,
+    about: object = "{}",
+) -> dict[str, object]:
+    """Return a file's content without weights."""
+    return {
+        "lagbench_checkpoint": number,
+        "about": about,
+        "weights": {},
+    }
 
 
 @pytest.mark.parametrize(
@@ -153,10 +186,10 @@ def test_scripts_are_refused(tmp_path: Path) -> None:
         b"PK\x03\x04 broken",
         {"weights": {}},
         torch.zeros(3),
-        {"lagbench_checkpoint": 2, "about": "{}", "weights": {}},
-        {"lagbench_checkpoint": 1, "about": "{", "weights": {}},
-        {"lagbench_checkpoint": 1, "about": "{}", "weights": {}},
-        {"lagbench_checkpoint": 1, "about": 5, "weights": {}},
+        plain_content(number=2),
+        plain_content(about="{"),
+        plain_content(),
+        plain_content(about=5),
     ],
 )
 def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
@@ -169,6 +202,9 @@ def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
     with pytest.raises(UnreadableFileError) as caught:
         load(file)
     assert caught.value.where.endswith("other.pt")
+
+
+ONE = torch.ones(1)
 
 
 @pytest.mark.parametrize(
@@ -184,19 +220,20 @@ def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
         ("facts", "split", "../curl-noise"),
         ("facts", "size", "../tiny"),
         ("facts", "particles", -3),
-        ("facts", "radius", float("inf")),
-        ("facts", "statistics", "velocity_std", [float("nan"), 1.0]),
+        ("facts", "radius", math.inf),
+        ("facts", "statistics", "velocity_std", [math.nan, 1.0]),
         {"about": "[" * 10**5},
         {"lagbench_checkpoint": torch.ones(2)},
         {"lagbench_checkpoint": True},
-        {"weights": {"a": torch.zeros(1).expand(10**12)}},
-        {"weights": {"a": torch.ones(1).to_sparse()}},
-        {"weights": {"a": torch.zeros(1, dtype=torch.complex64)}},
-        {"weights": {"a": torch.zeros(1, device="meta")}},
+        {"weights": {"a": ONE.expand(10**12)}},
+        {"weights": {"a": ONE.to_sparse()}},
+        {"weights": {"a": ONE.to(torch.complex64)}},
+        {"weights": {"a": ONE.to("meta")}},
     ],
 )
 def test_strange_words_and_tensors_are_refused(
-    tmp_path: Path, change: tuple[Any, ...] | dict[str, Any]
+    tmp_path: Path,
+    change: tuple[Any, ...] | dict[str, Any],
 ) -> None:
     """A stranger's words are what they should be, or nothing; weights are numbers that
     the file holds.
@@ -224,7 +261,8 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.pt")
     save(tmp_path / "cut.pt", example())
     whole = (tmp_path / "cut.pt").read_bytes()
-    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+    half = len(whole) // 2
+    (tmp_path / "cut.pt").write_bytes(whole[:half])
     for name, words in (
         ("none.pt", "No such file"),
         ("cut.pt", None),
@@ -235,21 +273,34 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
         assert caught.value.where == str(tmp_path / name)
 
 
+NO_CALLS = torch.tensor(0)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         (
-            {"weights": {"a": torch.tensor([float("nan")]), "calls": torch.tensor(0)}},
+            {"weights": {"a": math.nan * ONE, "calls": NO_CALLS}},
             "not finite",
         ),
         (
-            {"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}},
+            {"weights": {"a": torch.zeros(2), "calls": NO_CALLS}},
             "do not fit the model",
         ),
-        ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
-        ({"options": {"sart": 1}}, "sart"),
         (
-            {"baseline": "mlp", "options": {}, "info": replace(INFO, statistics={})},
+            {"weights": {"a": torch.zeros(1)}},
+            "do not fit the model",
+        ),
+        (
+            {"options": {"sart": 1}},
+            "sart",
+        ),
+        (
+            {
+                "baseline": "mlp",
+                "options": {},
+                "info": replace(INFO, statistics={}),
+            },
             "position_mean",
         ),
         (
@@ -280,7 +331,6 @@ def test_unknown_baseline() -> None:
     with pytest.raises(UsageError) as caught:
         restore(example(), where="a.pt")
     assert caught.value.where == "a.pt"
-    assert caught.value.where == "a.pt"
 
 
 def test_data_of_another_version(
@@ -293,7 +343,8 @@ def test_data_of_another_version(
         ("curl-noise", root / "nowhere", "lagbench generate"),
         ("my-river", root, "where: a.pt"),  # a local split of another root
     ):
-        loaded = example(info=replace(INFO, split=split))
+        info = replace(INFO, split=split)
+        loaded = example(info=info)
         with pytest.raises(DataError, match=words):
             check_data(loaded, root=there, registry=unmeasured, where="a.pt")
 
@@ -332,11 +383,11 @@ def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
         for member in archive.infolist():
             if not member.file_size:
                 continue
-            name, extra = struct.unpack_from("<HH", data, member.header_offset + 26)
+            start = member.header_offset
+            lengths = struct.unpack_from("<HH", data, start + 26)
+            content = start + 30 + sum(lengths)
             flipped = bytearray(data)
-            flipped[
-                member.header_offset + 30 + name + extra + member.file_size // 2
-            ] ^= 1
+            flipped[content + member.file_size // 2] ^= 1
             (tmp_path / "b.pt").write_bytes(flipped)
             with pytest.raises(UnreadableFileError):
                 load(tmp_path / "b.pt")
@@ -349,9 +400,18 @@ KINDS = [
 ]
 WHOLE = replace(INFO, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
 
-GRAPH_NETWORK: dict[str, Any] = {"latent": 4, "layers": 2}
-SMALL_MODELS: dict[str, dict[str, Any]] = {
-    "neuralmpm": {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
+Options = dict[str, Any]
+
+GRAPH_NETWORK: Options = {
+    "latent": 4,
+    "layers": 2,
+}
+SMALL_MODELS: dict[str, Options] = {
+    "neuralmpm": {
+        "cells": 8,
+        "width": 4,
+        "materials": [0, 1, 2, 3],
+    },
     "mlp": {"widths": [4]},
     "lstm": {"latent": 4, "decoder": [4]},
     "lstm-mlp": {"latent": 4, "decoder": [4]},
@@ -365,23 +425,29 @@ SMALL_MODELS: dict[str, dict[str, Any]] = {
 def stored(baseline: str) -> Checkpoint:
     """Return the checkpoint of a small model."""
     options = SMALL_MODELS.get(baseline, GRAPH_NETWORK)
-    weights = find(baseline).model.build(options, WHOLE).state_dict()
-    return Checkpoint(baseline=baseline, options=options, info=WHOLE, weights=weights)
+    model = find(baseline).model.build(options, WHOLE)
+    return Checkpoint(
+        baseline=baseline,
+        options=options,
+        info=WHOLE,
+        weights=model.state_dict(),
+    )
 
 
 @pytest.mark.parametrize("baseline", list_names())
 def test_what_the_weights_fill_is_built(baseline: str) -> None:
     """Every baseline comes back with the numbers of its weights."""
     loaded = stored(baseline)
-    model = restore(loaded)
+    state = restore(loaded).state_dict()
     for name, value in loaded.weights.items():
-        assert torch.equal(model.state_dict()[name], value), name
+        assert torch.equal(state[name], value), name
 
 
 def test_a_model_beyond_all_memory_is_refused() -> None:
     """Options for 10^12 numbers and more are those of an unreadable file."""
     checkpoint_of_var = stored("var")
-    larger = replace(checkpoint_of_var, options={"lags": 10**13})
+    too_many = {"lags": 10**13}
+    larger = replace(checkpoint_of_var, options=too_many)
     with pytest.raises(UnreadableFileError) as caught:
         restore(larger, where="theirs.pt")
     assert caught.value.where == "theirs.pt"
@@ -391,9 +457,10 @@ def test_weights_of_the_board_can_be_run() -> None:
     """Every file that stands beside an entry is one that today's models are built
     from.
     """
-    files = sorted(
-        (Path(__file__).parents[2] / "leaderboard" / "weights").rglob("*.pt")
-    )
+    root = Path(__file__).parents[2]
+    weights = root / "leaderboard" / "weights"
+    files = sorted(weights.rglob("*.pt"))
     assert len(files) > 30
     for file in files:
-        assert restore(load(file), where=str(file)).method
+        model = restore(load(file), where=str(file))
+        assert model.method

@@ -20,6 +20,8 @@ from lagbench.references import projection
 from lagbench.references.predictor import Given
 from lagbench.tensors import TensorWindow, collate
 
+Array = NDArray[np.float64]
+
 SIDE = 0.875
 VISCOSITY = 2e-3
 INTERVAL = 0.1
@@ -43,25 +45,34 @@ def cavity_info(**changes: object) -> DatasetInfo:
     return info(**(values | changes))
 
 
-def turning(frames: int, *, decay: float = 0.0) -> NDArray[np.float64]:
+def rounded(values: Array) -> Array:
+    """Return numbers that float32 holds."""
+    return values.astype(np.float32).astype(np.float64)
+
+
+def turning(frames: int, *, decay: float = 0.0) -> Array:
     """Return particles in one vortex that fades, shape [frame, particle, 2].
 
     The stream function is sin(pi x)^2 sin(pi y)^2 in units of the box.
     """
     low = np.array([bound[0] for bound in cavity().bounds])
     axis = (np.arange(24) + 0.5) / 24
-    place = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    columns, rows = np.meshgrid(axis, axis, indexing="ij")
+    place = np.stack([columns, rows], axis=-1).reshape(-1, 2)
     path = [low + SIDE * place]
     for frame in range(frames - 1):
-        sine = np.sin(np.pi * place)
-        twice = np.sin(2 * np.pi * place)
-        flow = np.stack([sine[:, 0] ** 2 * twice[:, 1], -twice[:, 0] * sine[:, 1] ** 2])
-        place = place + 0.004 * np.exp(-decay * frame) * flow.T
+        sine_x, sine_y = np.sin(np.pi * place).T
+        twice_x, twice_y = np.sin(2 * np.pi * place).T
+        u = sine_x**2 * twice_y
+        v = -twice_x * sine_y**2
+        flow = np.stack([u, v], axis=1)
+        speed = 0.004 * np.exp(-decay * frame)
+        place = place + speed * flow
         path.append(low + SIDE * place)
     return np.array(path)
 
 
-def moving_lid(frames: int) -> NDArray[np.float64]:
+def moving_lid(frames: int) -> Array:
     """Return wall velocities of a lid that slides [length/s], [frame, wall, 2]."""
     walls = np.zeros((frames, 4, 2))
     walls[:, 3, 0] = 0.1
@@ -69,14 +80,16 @@ def moving_lid(frames: int) -> NDArray[np.float64]:
 
 
 def batch_of(
-    path: NDArray[np.float64],
-    walls: NDArray[np.float64],
+    path: Array,
+    walls: Array,
     viscosity: float | None,
 ) -> Batch:
     """Return one window of liquid."""
+    particle_count = path.shape[1]
+    position = path.transpose(1, 0, 2)
     window = TensorWindow(
-        position=torch.from_numpy(path.transpose(1, 0, 2)).float(),
-        material=torch.zeros(path.shape[1], dtype=torch.int64),
+        position=torch.from_numpy(position).float(),
+        material=torch.zeros(particle_count, dtype=torch.int64),
         wall_velocity=torch.from_numpy(walls).float(),
         scenario=0,
         frame=0,
@@ -89,22 +102,25 @@ def test_without_a_closure_it_is_the_reference_solver() -> None:
     """Positions agree to the rounding of float32, with a lid that moves."""
     size = cavity()
     frames = size.task.input_frames + size.task.horizon
-    path = turning(size.task.input_frames).astype(np.float32).astype(np.float64)
-    walls = moving_lid(frames).astype(np.float32).astype(np.float64)
+    path = rounded(turning(size.task.input_frames))
+    walls = rounded(moving_lid(frames))
+    particle_count = path.shape[1]
     given = Given(
         size=size,
         root=Path(),
         position=path,
-        material=np.zeros(path.shape[1], np.int8),
+        material=np.zeros(particle_count, np.int8),
         walls=walls * size.frame_interval,
         area=SIDE**2,
         parameters={"viscosity": VISCOSITY},
     )
-    expected = np.array(list(projection.predict(given, 2)))
+    positions = projection.predict(given, 2)
+    expected = np.array(list(positions))
     model = HybridProjection.build({}, cavity_info())
     window = batch_of(path, walls, VISCOSITY)
     (rollout,) = roll_out(model, window, size.task.horizon)
-    np.testing.assert_allclose(rollout.position.numpy(), expected, rtol=0, atol=2e-7)
+    predicted = rollout.position.numpy()
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
 
 
 def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
@@ -114,20 +130,30 @@ def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
     """
     nu = 1e-3
     mu = 2e-5
-    box = Box.from_bounds(((0.0, 1.0), (0.0, 1.0)), (True, True))
-    grid = ClosedGrid(box, cells=(16, 16), no_slip=False, hyperviscosity=mu)
+    unit = (0.0, 1.0)
+    box = Box.from_bounds((unit, unit), (True, True))
+    grid = ClosedGrid(
+        box,
+        cells=(16, 16),
+        no_slip=False,
+        hyperviscosity=mu,
+    )
     y = (np.arange(16) + 0.5) / 16
     k = 2 * np.pi
-    u = np.tile(1e-3 * np.cos(k * y), (16, 1))
+    wave = 1e-3 * np.cos(k * y)
+    u = np.tile(wave, (16, 1))
+    v = np.zeros((16, 16))
     later = grid.advance(
-        [u, np.zeros((16, 16))],
+        [u, v],
         duration=4.0,
         viscosity=nu,
         wall_velocity=np.zeros((4, 2)),
     )
     q_squared = (2 - 2 * np.cos(k / 16)) * 16**2
-    expected = np.exp(-(nu * q_squared + mu * q_squared**2) * 4.0)
-    assert later[0][0, 0] / u[0, 0] == pytest.approx(expected, rel=1e-4)
+    rate = nu * q_squared + mu * q_squared**2
+    expected = np.exp(-rate * 4.0)
+    ratio = later[0][0, 0] / u[0, 0]
+    assert ratio == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_fit_finds_a_damping_that_the_data_show() -> None:
@@ -140,7 +166,8 @@ def test_a_fit_finds_a_damping_that_the_data_show() -> None:
     }
     model = HybridProjection.build(options, cavity_info())
     path = turning(20, decay=0.06)
-    window = batch_of(path, np.zeros((20, 4, 2)), 1e-3)
+    walls = np.zeros((20, 4, 2))
+    window = batch_of(path, walls, 1e-3)
     numbers = model.fit([window])
     assert numbers["relative"] > 0.0
     assert numbers["error"] < numbers["error_without"]
@@ -148,5 +175,6 @@ def test_a_fit_finds_a_damping_that_the_data_show() -> None:
 
 def test_a_viscosity_that_is_not_known_is_refused() -> None:
     model = HybridProjection.build({}, cavity_info())
+    window = batch_of(turning(6), moving_lid(6), None)
     with pytest.raises(DataError):
-        model.start(batch_of(turning(6), moving_lid(6), None))
+        model.start(window)

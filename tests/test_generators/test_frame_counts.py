@@ -25,11 +25,12 @@ def _share_left(size: Size, scenario: int) -> float:
         device=Device.CPU,
     )
     batch = ScenarioBatch(job, lambda _: None, frames=[300])
-    energy = [
-        float((batch.frame(i)[1].astype(np.float64) ** 2).sum())
-        for i, _ in batch.recordings()
-    ]
-    return float(np.mean(energy[270:]) / max(energy))
+    energy = []
+    for i, _ in batch.recordings():
+        velocity = batch.frame(i)[1].astype(np.float64)
+        energy.append(np.sum(velocity**2))
+    last = np.mean(energy[270:])
+    return float(last / max(energy))
 
 
 def test_counts_sum_to_the_thesis() -> None:
@@ -37,8 +38,10 @@ def test_counts_sum_to_the_thesis() -> None:
     (Table 4.8).
     """
     size = load().size("fluid", "full")
-    assert sum(size.frame_count(i) for i in range(40)) == 19_200
-    assert [size.frame_count(i) for i in FIXED] == [600, 600]
+    counts = [size.frame_count(i) for i in range(40)]
+    fixed_counts = [size.frame_count(i) for i in FIXED]
+    assert sum(counts) == 19_200
+    assert fixed_counts == [600, 600]
 
 
 @pytest.mark.slow
@@ -47,9 +50,14 @@ def test_longer_scenarios_are_those_that_still_move() -> None:
     train in turn.
     """
     size = load().size("fluid", "full")
-    known = [i for i in size.subsets["train"] if i not in FIXED]
+    free = [i for i in size.subsets["train"] if i not in FIXED]
     # other neighbours at every turn
-    judged = random.Random(turn()).sample(known, len(known) // 3)
-    ranked = sorted(judged, key=lambda i: _share_left(size, i), reverse=True)
+    generator = random.Random(turn())
+    judged = generator.sample(free, len(free) // 3)
+
+    def share_left(scenario: int) -> float:
+        return _share_left(size, scenario)
+
+    ranked = sorted(judged, key=share_left, reverse=True)
     counts = [size.frame_count(i) for i in ranked]
     assert counts == sorted(counts, reverse=True)

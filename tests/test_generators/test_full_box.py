@@ -21,12 +21,17 @@ from lagbench.generators.split import InitialState
 
 # x repeats itself, y and z end at walls; not as long along every axis
 MIXED_BOX = Box.from_bounds(
-    [(0.0, 1.0), (0.125, 0.875), (0.0, 0.75)], periodic=[True, False, False]
+    [(0.0, 1.0), (0.125, 0.875), (0.0, 0.75)],
+    periodic=[True, False, False],
 )
 COUNTS = (16, 12, 12)  # particles along each axis: eight in a cell
 
 
-def constants(box: Box, particles: int, **changes: float) -> FullBoxParameters:
+def constants(
+    box: Box,
+    particles: int,
+    **changes: float,
+) -> FullBoxParameters:
     """Return the constants of a small box."""
     values: dict[str, float] = {
         "grid": 8,
@@ -39,19 +44,28 @@ def constants(box: Box, particles: int, **changes: float) -> FullBoxParameters:
         "shift": 0.01,
         **changes,
     }
-    return FullBoxParameters(box=box, no_slip=True, particles=particles, **values)
+    return FullBoxParameters(
+        box=box,
+        no_slip=True,
+        particles=particles,
+        **values,
+    )
 
 
-SOLID = constants(MIXED_BOX, int(np.prod(COUNTS)), force_layers=2)
+PARTICLES = int(np.prod(COUNTS))
+SOLID = constants(MIXED_BOX, PARTICLES, force_layers=2)
 
 
 def solid_state() -> InitialState:
     """Return a stirred fluid in the mixed box: two walls move, a force acts."""
     rng = np.random.default_rng(7)
     cell = np.indices(COUNTS).reshape(3, -1).T
-    jitter = 0.5 * (rng.random(cell.shape) - 0.5)
+    share = rng.random(cell.shape)
+    jitter = 0.5 * (share - 0.5)
     low = np.array(MIXED_BOX.low)
-    position = low + MIXED_BOX.lengths * (cell + 0.5 + jitter) / COUNTS
+    place = (cell + 0.5 + jitter) / COUNTS
+    position = low + MIXED_BOX.lengths * place
+    velocity = 0.2 * (rng.random(cell.shape) - 0.5)
     walls = np.zeros((6, 3))
     walls[3] = (0.2, 0.0, -0.1)  # top
     walls[4] = (0.0, 0.15, 0.0)  # front
@@ -60,9 +74,9 @@ def solid_state() -> InitialState:
     force[0, 1] = (-0.05, 0.0, 0.0)
     return InitialState(
         position=quantise(position),
-        velocity=quantise(0.2 * (rng.random(cell.shape) - 0.5)),
-        affine=np.zeros((len(cell), 3, 3)),
-        material=np.zeros(len(cell), np.int8),
+        velocity=quantise(velocity),
+        affine=np.zeros((PARTICLES, 3, 3)),
+        material=np.zeros(PARTICLES, np.int8),
         area=MIXED_BOX.volume,
         viscosity=1e-3,
         wall_velocity=walls,
@@ -76,7 +90,10 @@ def solid_solver() -> FullBox:
     return FullBox(SOLID)
 
 
-def advanced(state: InitialState, substeps: int) -> dict[str, NDArray[np.float32]]:
+Arrays = dict[str, NDArray[np.float32]]
+
+
+def advanced(state: InitialState, substeps: int) -> Arrays:
     """Return position, velocity and J in the solid box after some substeps."""
     solver = solid_solver()
     solver.load([state])
@@ -93,9 +110,17 @@ def test_a_square_with_four_walls_has_the_bits_of_the_fast_solver() -> None:
     low, high = box(NO_SLIP)
     values = dataclasses.asdict(NO_SLIP)
     del values["wall"]
-    square = Box.from_bounds([(low, high), (low, high)])
-    state = scenario(NO_SLIP, seed=1, speed=0.5, walls=ALL_LIDS, frames=10)
-    solver = FullBox(FullBoxParameters(box=square, **values))
+    side = (low, high)
+    square = Box.from_bounds([side, side])
+    state = scenario(
+        NO_SLIP,
+        seed=1,
+        speed=0.5,
+        walls=ALL_LIDS,
+        frames=10,
+    )
+    square_constants = FullBoxParameters(box=square, **values)
+    solver = FullBox(square_constants)
     solver.load([state])
     solver.advance(60)
     expected = after(NO_SLIP, [state], 60)
@@ -115,21 +140,31 @@ def test_numpy_agrees_in_three_dimensions_and_in_any_order() -> None:
     reference.step(30)
     way = MIXED_BOX.displacement(reference.x, result["position"])
     assert np.abs(way).max() < 2e-6
-    assert np.abs(reference.v - state.velocity).max() > 0.05
-    assert_allclose(result["velocity"], reference.v, rtol=0, atol=5e-6)
-    assert_allclose(result["jacobian"], reference.j, rtol=0, atol=2e-5)
+    change = np.abs(reference.v - state.velocity)
+    assert change.max() > 0.05
+    velocity = result["velocity"]
+    jacobian = result["jacobian"]
+    assert_allclose(velocity, reference.v, rtol=0, atol=5e-6)
+    assert_allclose(jacobian, reference.j, rtol=0, atol=2e-5)
 
-    order = np.random.default_rng(3).permutation(len(state.position))
+    rng = np.random.default_rng(3)
+    order = rng.permutation(len(state.position))
     shuffled = dataclasses.replace(
         state,
         position=state.position[order],
         velocity=state.velocity[order],
     )
-    for name, values in advanced(shuffled, 30).items():
-        np.testing.assert_array_equal(values, result[name][order])
+    shuffled_result = advanced(shuffled, 30)
+    for name, values in shuffled_result.items():
+        expected = result[name][order]
+        np.testing.assert_array_equal(values, expected)
 
 
-@pytest.mark.parametrize("wall", [0, 2], ids=["periodic axis", "along its normal"])
+@pytest.mark.parametrize(
+    "wall",
+    [0, 2],
+    ids=["periodic axis", "along its normal"],
+)
 def test_walls_that_cannot_move_are_refused(wall: int) -> None:
     """A wall moves along itself only, and a periodic axis has none."""
     walls = np.zeros((6, 3))

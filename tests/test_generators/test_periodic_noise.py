@@ -19,7 +19,10 @@ STEP = 1e-5
 PERIODIC = ("decaying-vortices", "poiseuille", "curl-noise-3d")
 
 
-def slopes(function: Callable[[Array], Array], points: Array) -> Array:
+Field = Callable[[Array], Array]
+
+
+def slopes(function: Field, points: Array) -> Array:
     """Return central differences along each axis of the periodic unit box, last."""
     result = []
     for axis in range(points.shape[1]):
@@ -27,7 +30,8 @@ def slopes(function: Callable[[Array], Array], points: Array) -> Array:
         step[axis] = STEP
         ahead = function((points + step) % 1.0)
         behind = function((points - step) % 1.0)
-        result.append((ahead - behind) / (2.0 * STEP))
+        rise = ahead - behind
+        result.append(rise / (2.0 * STEP))
     return np.stack(result, axis=-1)
 
 
@@ -39,7 +43,9 @@ def test_noise_repeats_itself_with_exact_derivatives(dimension: int) -> None:
     rng = np.random.default_rng(5)
     lattice = periodic_noise.draw_lattice(rng, 3, dimension)
     points = rng.random((100, dimension))
-    points[:20] = np.rint(points[:20] * 3.0) / 3.0 % 1.0  # on faces of the lattice
+    # on faces of the lattice
+    cell = np.rint(points[:20] * 3.0)
+    points[:20] = cell / 3.0 % 1.0
 
     def at(position: Array) -> Smooth:
         return periodic_noise.noise(position, lattice)
@@ -60,21 +66,21 @@ def test_a_vortex_ring_is_a_flow_without_divergence() -> None:
     normal = np.array([0.6, 0.0, 0.8])
 
     def at(position: Array) -> Flow:
-        return periodic_noise.curl(
-            curl_noise_3d.ring_potential(
-                position,
-                centre=centre,
-                normal=normal,
-                radius=0.4,
-            )
+        potential = curl_noise_3d.ring_potential(
+            position,
+            centre=centre,
+            normal=normal,
+            radius=0.4,
         )
+        return periodic_noise.curl(potential)
 
-    points = np.concatenate(
-        [centre[None], (centre[None] + 0.5) % 1.0, rng.random((60, 3))]
-    )
+    outside = (centre + 0.5) % 1.0
+    anywhere = rng.random((60, 3))
+    points = np.vstack([centre, outside, anywhere])
     flow = at(points)
     # curl(n x r) = 2 n
-    assert_allclose(flow.velocity[0], 2.0 * normal, rtol=0, atol=1e-12)
+    at_centre = flow.velocity[0]
+    assert_allclose(at_centre, 2.0 * normal, rtol=0, atol=1e-12)
     assert not flow.velocity[1].any()
     trace = np.trace(flow.affine, axis1=1, axis2=2)
     assert_allclose(trace, 0.0, rtol=0, atol=1e-12)
@@ -93,14 +99,18 @@ def test_scenarios_begin_with_the_speed_that_was_drawn(split: str) -> None:
     for scenario in (0, 3, 40):
         state = draw(size, scenario)
         for values in (state.position, state.velocity, state.affine):
-            assert (values * 2**20 == np.rint(values * 2**20)).all()
+            multiples = values * 2**20
+            assert (multiples == np.rint(multiples)).all()
         assert state.position.min() >= 0.0
         assert state.position.max() < 1.0
         trace = np.trace(state.affine, axis1=1, axis2=2)
         assert np.abs(trace).max() <= 2.0**-19
-        speed = np.sqrt((state.velocity**2).sum(axis=1).mean())
-        assert speed == pytest.approx(state.parameters["speed_rms"], rel=1e-4)
-        assert np.abs(state.velocity.mean(axis=0)).max() < 0.02 * speed
+        square_speed = np.sum(state.velocity**2, axis=1)
+        speed = np.sqrt(square_speed.mean())
+        drawn_speed = state.parameters["speed_rms"]
+        assert speed == pytest.approx(drawn_speed, rel=1e-4)
+        momentum = state.velocity.mean(axis=0)
+        assert np.abs(momentum).max() < 0.02 * speed
         assert state.area == box.volume == 1.0
         flows.append(state.velocity.tobytes())
     assert len(set(flows)) == len(flows)
