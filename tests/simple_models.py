@@ -4,6 +4,7 @@ tests of baselines.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import EntryPoint
@@ -333,6 +334,12 @@ def greatest_difference(first: Tensor, second: Tensor) -> float:
     """Return the greatest difference of two tensors, in absolute value."""
     difference = first - second
     return float(difference.abs().max())
+
+
+def read_training_log(folder: Path) -> dict[str, Any]:
+    """Return what a training wrote beside its weights."""
+    content = (folder / "training.json").read_text()
+    return dict(json.loads(content))
 
 
 def share_of_persistence(

@@ -82,7 +82,6 @@ def drift(
 ) -> NDArray[np.float64]:
     """Return a cloud that moves as one, shape [frame, particle, 2]."""
     cloud = jittered(seed, low=0.35, high=0.65)
-    cloud = jittered(seed, low=0.35, high=0.65)
     velocity = np.array(speed)
     return move_straight(cloud, velocity, frames)
 

@@ -76,7 +76,8 @@ class Several(Drift):
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        self.a = torch.nn.Parameter(torch.full((options.count,), options.start))
+        start = torch.full((options.count,), options.start)
+        self.a = torch.nn.Parameter(start)
 
 
 @pytest.fixture
@@ -112,14 +113,16 @@ def run(
             "curl-noise", "tiny", root=root, registry=unmeasured
         )
         info = info or tiny_info
-        drift = Drift.build({"start": start, **(model or {})}, info)
+        all_options = {"start": start, **(model or {})}
+        drift = Drift.build(all_options, info)
+        record = {"step": 9, "recipe": RECIPE, **(training or {})}
         weights = tmp_path / "weights.pt"
         checkpoint = Checkpoint(
             baseline=baseline,
             options=drift.options.model_dump(),
             info=info,
             weights=drift.state_dict(),
-            training={"step": 9, "recipe": RECIPE, **(training or {})},
+            training=record,
         )
         save(weights, checkpoint)
         return predict(
@@ -143,14 +146,16 @@ def read_variable(path: Path, name: str = "position") -> np.ndarray:
 def read_attributes(path: Path) -> dict[str, Any]:
     """Return the attributes of a file."""
     with netCDF4.Dataset(path) as data:
-        return {name: data.getncattr(name) for name in data.ncattrs()}
+        names = data.ncattrs()
+        return {name: data.getncattr(name) for name in names}
 
 
 def read_truth(folder: Path) -> dict[int, np.ndarray]:
     """Return the positions of the test scenarios by id."""
     truth = {}
     for path in sorted(folder.glob("test/*.nc")):
-        truth[int(path.stem)] = read_variable(path).astype(float)
+        scenario = int(path.stem)
+        truth[scenario] = read_variable(path).astype(float)
     return truth
 
 
@@ -158,11 +163,13 @@ def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> No
     """With a = 1/2 the k-th position is x + (1 - 2^-k) u, u the last input velocity."""
     predicted = read_variable(run(start=0.5).path)
     shares = 1 - 0.5 ** np.arange(1, 21)
-    for row, position in enumerate(read_truth(generated.folder).values()):
+    truth = read_truth(generated.folder)
+    for row, position in enumerate(truth.values()):
         last = position[5]
-        velocity = position[5] - position[4]
+        velocity = last - position[4]
         expected = last + shares[:, None, None] * velocity
-        assert np.abs(predicted[row] - expected).max() < 1e-6
+        error = np.abs(predicted[row] - expected)
+        assert error.max() < 1e-6
 
 
 def test_the_file_is_valid(
@@ -186,7 +193,8 @@ def test_the_file_describes_method_and_cost(run: Predict) -> None:
     assert "1 thread" in attributes["device"]
     assert result.seconds_per_frame > 0
     assert attributes["seconds_per_frame"] == result.seconds_per_frame
-    cost = json.loads(result.path.with_suffix(".json").read_text())
+    cost_file = result.path.with_suffix(".json")
+    cost = json.loads(cost_file.read_text())
     assert cost["seconds_without_search"] == result.seconds_per_frame
 
 
@@ -206,11 +214,15 @@ def test_a_rollout_is_frozen_where_it_diverges(
     """From frame 6 + 4 on, positions are those of frame 9, and the file says so."""
     result = run(model={"explode_at": 5})
     position = read_variable(result.path)
-    assert result.diverged == dict.fromkeys(read_truth(generated.folder), 10)
-    assert read_variable(result.path, "diverged_at").tolist() == [10, 10]
+    diverged_at = read_variable(result.path, "diverged_at")
+    truth = read_truth(generated.folder)
+    assert result.diverged == dict.fromkeys(truth, 10)
+    assert diverged_at.tolist() == [10, 10]
     assert np.isfinite(position).all()
-    assert (position[:, 4:] == position[:, 3:4]).all()
-    assert (position[:, 3] != position[:, 2]).any()
+    last_finite = position[:, 3]
+    frozen = position[:, 4:]
+    assert (frozen == last_finite[:, None]).all()
+    assert (last_finite != position[:, 2]).any()
 
 
 def test_a_rollout_that_diverges_at_once_stays_at_the_last_input_frame(
@@ -218,8 +230,10 @@ def test_a_rollout_that_diverges_at_once_stays_at_the_last_input_frame(
 ) -> None:
     result = run(model={"explode_at": 1})
     predicted = read_variable(result.path)
-    for row, position in enumerate(read_truth(generated.folder).values()):
-        assert (predicted[row] == position[5].astype(np.float32)).all()
+    truth = read_truth(generated.folder)
+    for row, position in enumerate(truth.values()):
+        last = position[5].astype(np.float32)
+        assert (predicted[row] == last).all()
     assert set(result.diverged.values()) == {6}
 
 
@@ -281,8 +295,8 @@ def test_frozen_frames_are_not_timed(
     Side by side 4 s in vain come before.
     """
     advance = Mock(side_effect=Drift.advance)
-    monkeypatch.setattr(Drift, "advance", lambda self, state: advance(self, state))
     clock = SimpleNamespace(process_time=lambda: float(advance.call_count))
+    monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
     monkeypatch.setattr(prediction, "time", clock)
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
@@ -295,8 +309,10 @@ def make_windows(first_x: list[float]) -> Batch:
     """Return windows of two frames of three particles, with x of the first particle."""
     count = len(first_x)
     generator = torch.Generator().manual_seed(0)
-    position = torch.rand((3 * count, 2, 2), generator=generator)
-    position[::3, :, 0] = torch.tensor(first_x)[:, None]
+    shape = (3 * count, 2, 2)
+    position = torch.rand(shape, generator=generator)
+    x = torch.tensor(first_x)
+    position[::3, :, 0] = x[:, None]
     return Batch(
         position=position,
         sample=torch.arange(count).repeat_interleave(3),
@@ -316,7 +332,8 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     assert good.diverged_at is None
     assert bad.scenario == 11
     assert bad.diverged_at == 9  # frames 4 and 5 are input, 6 to 8 finite
-    (alone,) = roll_out(model, select_window(batch, 0), 8)
+    first_window = select_window(batch, 0)
+    (alone,) = roll_out(model, first_window, 8)
     assert torch.equal(good.position, alone.position)
     assert good.position.shape == (8, 3, 2)
     assert bad.position.shape == (8, 3, 2)
@@ -344,9 +361,11 @@ def test_a_rollout_is_frozen_before_it_is_too_far(
 
     monkeypatch.setattr(Wrong, "change_output", staticmethod(flee))
     model = Wrong.build({"start": 0.0}, INFO)
-    (rollout,) = roll_out(model, make_windows([0.9]), 30)
+    window = make_windows([0.9])
+    (rollout,) = roll_out(model, window, 30)
     assert rollout.diverged_at is not None
-    assert 8.0 < float(rollout.position.max()) < 10.6
+    farthest = float(rollout.position.max())
+    assert 8.0 < farthest < 10.6
     assert torch.isfinite(rollout.position).all()
 
 
@@ -379,10 +398,12 @@ def test_a_rollout_leaves_the_mode_of_the_model() -> None:
 
 def test_rounded_parameters_come_back_to_the_bit() -> None:
     model = torch.nn.Linear(8, 8)
-    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state = model.state_dict()
+    before = {name: value.clone() for name, value in state.items()}
+    weight = before["weight"]
     with round_parameters(model):
-        assert torch.equal(model.weight, before["weight"].bfloat16().float())
-        assert not torch.equal(model.weight, before["weight"])
+        assert torch.equal(model.weight, weight.bfloat16().float())
+        assert not torch.equal(model.weight, weight)
     for name, value in model.state_dict().items():
         assert torch.equal(value, before[name])
 
@@ -392,12 +413,14 @@ def test_only_the_input_frames_are_read(
 ) -> None:
     """With all later frames of test overwritten the predictions are the same."""
     root = copied()
-    expected = read_variable(run(name="a.nc", root=root).path)
+    result = run(name="a.nc", root=root)
+    expected = read_variable(result.path)
     for path in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
         path.chmod(0o644)
         with netCDF4.Dataset(path, "r+") as data:
             data["position"][6:] = 0.5
-    predicted = read_variable(run(name="b.nc", root=root).path)
+    result = run(name="b.nc", root=root)
+    predicted = read_variable(result.path)
     np.testing.assert_array_equal(predicted, expected)
 
 
@@ -468,11 +491,13 @@ def test_a_model_of_any_size_predicts_another_size(
 
     position = read_variable(result.path)
     same_size = run(start=0.5, name="same.nc")
-    np.testing.assert_array_equal(position, read_variable(same_size.path))
+    expected = read_variable(same_size.path)
+    np.testing.assert_array_equal(position, expected)
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
     attributes = read_attributes(result.path)
-    assert json.loads(attributes["budget"]) == {"cpu_hours": 0.1, "steps": 9}
+    budget = json.loads(attributes["budget"])
+    assert budget == {"cpu_hours": 0.1, "steps": 9}
     assert attributes["training"].startswith("curl-noise mini train")
 
 
@@ -484,13 +509,15 @@ def test_sizes_that_do_not_fit_are_refused(
     """A model of one size, another frame interval, an unknown size, another version."""
     with pytest.raises(UsageError):
         run("drift", size="tiny", info=mini_info)
-    other_interval = replace(mini_info, frame_interval=2.0 * tiny_info.frame_interval)
+    twice_as_long = 2.0 * tiny_info.frame_interval
+    other_interval = replace(mini_info, frame_interval=twice_as_long)
+    older_version = replace(mini_info, version="0.9.0")
     with pytest.raises(UsageError):
         run("scaled", size="tiny", info=other_interval)
     with pytest.raises(UsageError):
         run("scaled", size="small", info=mini_info)
     with pytest.raises(DataError):
-        run("scaled", size="tiny", info=replace(mini_info, version="0.9.0"))
+        run("scaled", size="tiny", info=older_version)
 
 
 def test_at_its_own_size_the_radius_of_the_training_counts(
@@ -506,14 +533,17 @@ def test_options_of_a_model_may_change(run: Predict) -> None:
 
     It tells the ``--set`` of the training from that of the prediction.
     """
-    recipe = recipe_for(
-        find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]
+    settings = ["training.steps=77"]
+    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=settings)
+    result = run(
+        training={"recipe": recipe.as_json()},
+        settings=["model.explode_at=3"],
     )
-    result = run(training={"recipe": recipe.as_json()}, settings=["model.explode_at=3"])
     assert set(result.diverged.values()) == {8}
     trained = run(model={"explode_at": 3}, name="trained.nc")
     position = read_variable(result.path)
-    np.testing.assert_array_equal(position, read_variable(trained.path))
+    expected = read_variable(trained.path)
+    np.testing.assert_array_equal(position, expected)
     text = read_attributes(result.path)["training"]
     of_training, _, of_prediction = text.partition("predicted with")
     assert "training.steps=77" in of_training
@@ -560,7 +590,10 @@ def test_no_image_falls_sideways(
 
 def test_models_of_any_size() -> None:
     """MLPs and the like are not among them."""
-    names = {name for name, entry in load_all().items() if entry.model.any_size}
+    names = set()
+    for name, entry in load_all().items():
+        if entry.model.any_size:
+            names.add(name)
     assert {"neuralmpm", "gns", "supergat"} <= names
     assert not names & {"mlp", "lstm", "var"}
 
@@ -572,9 +605,15 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         statistics[f"{name}_mean"] = (0.5, 0.5)
         statistics[f"{name}_std"] = (0.5, 0.5)
     small = replace(INFO, statistics=statistics)
-    large = replace(small, size="full", particles=12, radius=0.05)
+    large = replace(
+        small,
+        size="full",
+        particles=12,
+        radius=0.05,
+    )
+    Shapes = dict[str, torch.Size]
 
-    def parameter_shapes(model: Any, info: DatasetInfo) -> dict[str, torch.Size]:
+    def parameter_shapes(model: Any, info: DatasetInfo) -> Shapes:
         state = model.build({}, info).state_dict()
         return {name: value.shape for name, value in state.items()}
 
@@ -599,7 +638,8 @@ def test_only_predictions_are_replaced(
 
     The cost has the name of the predictions, so that both names must be free.
     """
-    scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
+    first_file = next(generated.folder.glob("test/*.nc"))
+    scenario = first_file.read_bytes()
     (tmp_path / "scenario.nc").write_bytes(scenario)
     (tmp_path / "taken.json").mkdir()
     log = tmp_path / "training.json"
@@ -664,7 +704,8 @@ def test_weights_of_an_unfinished_training_are_a_warning(
     The weights of the best step say 'running' for good.
     """
     log = tmp_path / "training.json"
-    log.write_text(json.dumps(UNFINISHED | {"state": state}))
+    content = UNFINISHED | {"state": state}
+    log.write_text(json.dumps(content))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run(training={"state": "running"})
@@ -676,14 +717,19 @@ def test_weights_of_an_unfinished_training_are_a_warning(
         assert "step 9 of 70" in str(warning.message)
 
 
+def unfinished_log(**changes: object) -> bytes:
+    """Return the log of a training that is not finished."""
+    return json.dumps(UNFINISHED | changes).encode()
+
+
 @pytest.mark.parametrize(
     "content",
     [
         b"not JSON",
         b"[" * 100_000,
-        json.dumps(UNFINISHED | {"step": "9", "steps": {}}).encode(),
-        json.dumps(UNFINISHED | {"recipe": {"name": "another"}}).encode(),
-        json.dumps(UNFINISHED).encode() + b" " * LARGEST_LOG,
+        unfinished_log(step="9", steps={}),
+        unfinished_log(recipe={"name": "another"}),
+        unfinished_log() + b" " * LARGEST_LOG,
     ],
     ids=["no JSON", "deep", "wrong types", "another training", "too long"],
 )

@@ -4,7 +4,7 @@ refused.
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import Drift, trainer
+from simple_models import Drift, read_training_log, trainer
 
 from lagbench.baselines.baseline import DatasetInfo
 from lagbench.baselines.checkpoint import Checkpoint, load, save
@@ -64,7 +64,8 @@ class AnySize(Drift):
     def advance(self, state: Any) -> Any:
         """Drift by a share of what is usual."""
         state, position = super().advance(state)
-        return state, position + self.options.share * self.speed * self.a
+        distance = self.options.share * self.speed * self.a
+        return state, position + distance
 
 
 @pytest.fixture
@@ -104,16 +105,23 @@ def stored(
         here = read_dataset_info(
             "curl-noise", "tiny", root=generated.root, registry=unmeasured
         )
-        built = AnySize.build({"start": 0.5, **(model or {})}, here)
+        options = {"start": 0.5, **(model or {})}
+        built = AnySize.build(options, here)
+        training = {
+            "step": 9,
+            "recipe": {"name": "curl-noise/mini-made-up"},
+            **more,
+        }
         checkpoint = Checkpoint(
             baseline=baseline,
             options=built.options.model_dump(),
             info=replace(here, **(info or {})),
             weights=weights or built.state_dict(),
-            training={"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **more},
+            training=training,
         )
-        save(tmp_path / "start.pt", checkpoint)
-        return tmp_path / "start.pt"
+        path = tmp_path / "start.pt"
+        save(path, checkpoint)
+        return path
 
     return call
 
@@ -129,16 +137,18 @@ def test_it_goes_on_where_the_weights_are(
     """A step that changes nothing predicts what the weights do, also in units of
     another size.
     """
-    units = dict.fromkeys(
-        ("velocity_std", "acceleration_std", "position_std"), (1e-3, 1e-3)
-    )
+    kinds = ("velocity_std", "acceleration_std", "position_std")
+    units = dict.fromkeys(kinds, (1e-3, 1e-3))
     other = {
         "size": "mini",
         "dataset_sha256": "0" * 64,
         "statistics": units,
         "radius": 0.5,
     }
-    start = stored(info=other if size == "mini" else None, model={"share": 0.5})
+    info = None
+    if size == "mini":
+        info = other
+    start = stored(info=info, model={"share": 0.5})
     result = run("any", *STILL, start=start)  # the recipe's share is another
     options: dict[str, Any] = {
         "root": generated.root,
@@ -146,13 +156,13 @@ def test_it_goes_on_where_the_weights_are(
         "threads": 1,
         "size": "tiny",
     }
-    found = []
+    positions = []
     for weights in (start, result.weights):
-        with netCDF4.Dataset(
-            predict(weights, result.folder / "made.nc", **options).path
-        ) as data:
-            found.append(np.asarray(data["position"][:]))
-    assert np.array_equal(*found)
+        prediction = predict(weights, result.folder / "made.nc", **options)
+        with netCDF4.Dataset(prediction.path) as data:
+            positions.append(np.asarray(data["position"][:]))
+    of_start, of_result = positions
+    assert np.array_equal(of_start, of_result)
 
 
 def test_it_learns_from_there(run: Run) -> None:
@@ -160,14 +170,16 @@ def test_it_learns_from_there(run: Run) -> None:
     do not.
     """
     first = run("gns", "steps=30", "validate_every=0", to="first")
-    further, anew = (
-        run("gns", "steps=1", "validate_every=0", start=start, to=to)
-        for start, to in ((first.weights, "further"), (None, "anew"))
-    )
+    one_step = ("steps=1", "validate_every=0")
+    further = run("gns", *one_step, start=first.weights, to="further")
+    anew = run("gns", *one_step, to="anew")
     assert further.loss["total"] < 0.95 * anew.loss["total"]
 
 
-def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) -> None:
+def test_nothing_worse_takes_their_place(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
     """Where every step leads away, the best weights are those that it started from.
 
     What fails early can be tried again: a checkpoint lies beside the weights that were
@@ -175,12 +187,18 @@ def test_nothing_worse_takes_their_place(run: Run, stored: Callable[..., Path]) 
     """
     start = stored()
     result = run(
-        "any", "steps=4", "learning_rate=100.0", "validate_every=2", start=start
+        "any",
+        "steps=4",
+        "learning_rate=100.0",
+        "validate_every=2",
+        start=start,
     )
     assert result.best_step == 0
-    assert float(load(result.weights).weights["a"]) == 0.5
-    record = json.loads((result.folder / "training.json").read_text())
-    assert [entry["step"] for entry in record["validation"]] == [0, 2, 4]
+    best = load(result.weights).weights["a"]
+    assert float(best) == 0.5
+    record = read_training_log(result.folder)
+    validated_steps = [entry["step"] for entry in record["validation"]]
+    assert validated_steps == [0, 2, 4]
     for _ in range(2):
         with pytest.raises(WorkFailedError):
             run(
@@ -210,7 +228,7 @@ def test_what_came_before_is_told(
     }
     start = stored(budget=spent)
     result = run("any", *STILL, start=start)
-    record = json.loads((tmp_path / "run/training.json").read_text())
+    record = read_training_log(tmp_path / "run")
     budget = record["budget"]
     assert 2.0 < budget["cpu_hours"] < 2.1
     assert budget["gpu_hours"] == 0.5
@@ -218,75 +236,130 @@ def test_what_came_before_is_told(
     assert budget["steps"] == 1
     assert budget["start_steps"] == 9
     assert budget["windows"] == 2
-    assert record["recipe"]["start"]["sha256"] == file_sha256(start)
-    assert file_sha256(start)[:12] in result.start
-    words = training_provenance(load(result.weights)).describe()
-    assert words.endswith(f"curl-noise/mini-made-up, weights {file_sha256(start)[:12]}")
-    again = load(run("any", *STILL, start=result.weights, to="again").weights).training[
-        "budget"
-    ]
-    assert 2.0 < again["cpu_hours"] < 2.1
-    assert again["start_steps"] == 10
+    sha256 = file_sha256(start)
+    assert record["recipe"]["start"]["sha256"] == sha256
+    assert sha256[:12] in result.start
+    provenance = training_provenance(load(result.weights))
+    words = provenance.describe()
+    assert words.endswith(f"curl-noise/mini-made-up, weights {sha256[:12]}")
+    again = run("any", *STILL, start=result.weights, to="again")
+    next_budget = load(again.weights).training["budget"]
+    assert 2.0 < next_budget["cpu_hours"] < 2.1
+    assert next_budget["start_steps"] == 10
 
 
-def test_hours_that_nobody_knows(run: Run, stored: Callable[..., Path]) -> None:
+@pytest.mark.parametrize(
+    "spent",
+    [
+        None,
+        {"cpu_hours": 0.1, "validation_hours": 0.0},
+        {"cpu_hours": 9.9e11, "gpu_hours": 0.0},
+    ],
+)
+def test_hours_that_nobody_knows(
+    run: Run,
+    stored: Callable[..., Path],
+    spent: dict[str, float] | None,
+) -> None:
     """Weights without a budget that can be believed leave the sum unknown: it is of no
     equal compute.
     """
-    doubtful = (
-        {"cpu_hours": 0.1, "validation_hours": 0.0},
-        {"cpu_hours": 9.9e11, "gpu_hours": 0.0},
-    )
-    for number, spent in enumerate((None, *doubtful)):
-        result = run("any", *STILL, start=stored(budget=spent), to=f"run{number}")
-        budget = Budget.model_validate(load(result.weights).training["budget"])
-        assert budget.cpu_hours is track_of("mini", budget) is None
+    start = stored(budget=spent)
+    result = run("any", *STILL, start=start)
+    training = load(result.weights).training
+    budget = Budget.model_validate(training["budget"])
+    assert budget.cpu_hours is None
+    assert track_of("mini", budget) is None
 
 
-def test_what_came_before_counts_for_convergence() -> None:
+@pytest.mark.parametrize(
+    ("start_steps", "track"),
+    [
+        (None, "converged"),
+        (2, None),
+        (0, "converged"),
+        (100, None),
+    ],
+)
+def test_what_came_before_counts_for_convergence(
+    start_steps: int | None,
+    track: str | None,
+) -> None:
     """Steps that bring nothing converge only where they are half of all."""
-    flat = Budget(steps=4, cpu_hours=9.0, best=0.5, validations=((2, 0.5), (4, 0.5)))
-    for start, track in ((None, "converged"), (2, None), (0, "converged"), (100, None)):
-        assert track_of("mini", flat.model_copy(update={"start_steps": start})) == track
-    long = flat.model_copy(
-        update={"start_steps": 10, "steps": 30, "validations": ((9, 0.5), (30, 0.5))}
+    flat = Budget(
+        steps=4,
+        cpu_hours=9.0,
+        best=0.5,
+        validations=((2, 0.5), (4, 0.5)),
+        start_steps=start_steps,
+    )
+    assert track_of("mini", flat) == track
+
+
+def test_a_long_training_without_progress_converges() -> None:
+    """Two thirds of all steps brought nothing."""
+    long = Budget(
+        steps=30,
+        cpu_hours=9.0,
+        best=0.5,
+        validations=((9, 0.5), (30, 0.5)),
+        start_steps=10,
     )
     assert track_of("mini", long) == "converged"
 
 
-def test_nothing_is_lost(run: Run, stored: Callable[..., Path]) -> None:
+def test_nothing_is_lost(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
     """A start that is refused leaves what the folder holds; none may lie in the folder
     that is emptied.
     """
     first = run("any", "steps=2")
-    held = first.weights.read_bytes(), first.checkpoint.read_bytes()
+    weights_before = first.weights.read_bytes()
+    checkpoint_before = first.checkpoint.read_bytes()
     odd = {"a": torch.zeros(2), "calls": torch.zeros(())}
     link = first.folder.with_name("link.pt")
     link.symlink_to(first.checkpoint)
-    for baseline, start in (
-        *(("any", first.weights), ("any", link)),
-        *(("any", {"weights": odd}), ("drift", {}), ("any", {"model": {"unit": 2.0}})),
-    ):
-        path = stored(**start) if isinstance(start, dict) else start
+    refused = [
+        ("any", first.weights),
+        ("any", link),
+        ("any", {"weights": odd}),
+        ("drift", {}),
+        ("any", {"model": {"unit": 2.0}}),
+    ]
+    for baseline, start in refused:
+        path = start
+        if isinstance(start, dict):
+            path = stored(**start)
         with pytest.raises(LagbenchError):
             run(baseline, "steps=2", "model.unit=1", start=path, fresh=True)
-        assert (first.weights.read_bytes(), first.checkpoint.read_bytes()) == held
+        assert first.weights.read_bytes() == weights_before
+        assert first.checkpoint.read_bytes() == checkpoint_before
 
 
-def test_facts_are_those_of_the_data(run: Run, stored: Callable[..., Path]) -> None:
+def test_facts_are_those_of_the_data(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
     """What a file says of frames, box and cells does not bound what is validated on."""
-    plain = run("any", "steps=2", start=stored(), to="plain")
+    plain_start = stored()
+    plain = run("any", "steps=2", start=plain_start, to="plain")
     told = {
         "horizon": 1,
         "score_cells": 10**6,
         "score_placement": "odd",
         "bounds": ((0.4, 0.6), (0.4, 0.6)),
     }
-    odd = run("any", "steps=2", start=stored(info=told), to="odd")
+    odd_start = stored(info=told)
+    odd = run("any", "steps=2", start=odd_start, to="odd")
     assert odd.best_value == plain.best_value
 
 
-def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
+def test_it_can_be_interrupted(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
     """It goes on with its own weights, and only from the same start; the bits are those
     of one run.
     """
@@ -305,8 +378,19 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
         assert "--start" in str(told.value.where)
     parts = run("any", "steps=4", start=stored())
     assert 0 < parts.first_step < 4
-    one, two = (load(result.checkpoint).weights for result in (whole, parts))
-    assert all(torch.equal(one[name], two[name]) for name in one)
+    whole_weights = load(whole.checkpoint).weights
+    weights = load(parts.checkpoint).weights
+    for name, value in whole_weights.items():
+        assert torch.equal(weights[name], value)
+
+
+def weights_of(value: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return weights of a Drift with another parameter."""
+    return {"a": value, "calls": torch.zeros(())}
+
+
+NAN = torch.full((1,), math.nan)
+STRANGE_START = {"sha256": "../x", "recipe": "x"}
 
 
 @pytest.mark.parametrize(
@@ -317,24 +401,15 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
         ("any", {"info": {"dataset_sha256": "0" * 64}}, DataError),
         ("any", {"info": {"size": "mini", "version": "0.9.0"}}, DataError),
         ("any", {"info": {"size": "mini", "frame_interval": 9.0}}, UsageError),
-        (
-            "drift",
-            {"baseline": "drift", "info": {"size": "mini"}},
-            UsageError,
-        ),  # for one size only
+        # for one size only
+        ("drift", {"baseline": "drift", "info": {"size": "mini"}}, UsageError),
         ("any", {"info": {"statistics": {}}}, UnreadableFileError),
-        *(
-            (
-                "any",
-                {"weights": {"a": a, "calls": torch.zeros(())}},
-                UnreadableFileError,
-            )
-            for a in (torch.zeros(2), torch.full((1,), float("nan")))
-        ),
+        ("any", {"weights": weights_of(torch.zeros(2))}, UnreadableFileError),
+        ("any", {"weights": weights_of(NAN)}, UnreadableFileError),
         ("var", {"baseline": "var"}, UsageError),  # fitted, not trained
         (
             "any",
-            {"recipe": {"name": "x", "start": {"sha256": "../x", "recipe": "x"}}},
+            {"recipe": {"name": "x", "start": STRANGE_START}},
             UnreadableFileError,
         ),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -22,7 +21,7 @@ import pytest
 import torch
 from file_size_limit import largest_file
 from scipy.special import comb
-from simple_models import INFO, Drift, trainer
+from simple_models import INFO, Drift, read_training_log, trainer
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load, save
@@ -136,11 +135,6 @@ def have_same_weights(first: Path, second: Path) -> bool:
         if not torch.equal(value, second_weights[name]):
             return False
     return True
-
-
-def read_training_log(folder: Path) -> dict[str, Any]:
-    """Return the content of training.json."""
-    return dict(json.loads((folder / "training.json").read_text()))
 
 
 def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> None:

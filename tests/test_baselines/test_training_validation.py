@@ -4,7 +4,6 @@ training then says.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import Drift, trainer
+from simple_models import Drift, read_training_log, trainer
 
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.dataset_info import read_dataset_info
@@ -38,7 +37,13 @@ def run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Run:
     """Train on tiny curl-noise data."""
-    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift)
+    return trainer(
+        generated.root,
+        unmeasured,
+        tmp_path,
+        monkeypatch,
+        drift=Drift,
+    )
 
 
 def validated_on_test(
@@ -56,10 +61,16 @@ def validated_on_test(
         with task.opened(scenario) as opened:
             frames[scenario] = len(opened.scenario.moving_frames)
     torch.set_num_threads(1)
-    return Validation(task=task, frames=frames).measure(restore(load(weights)))
+    model = restore(load(weights))
+    return Validation(task=task, frames=frames).measure(model)
 
 
-def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
+def scored(
+    weights: Path,
+    registry: Registry,
+    root: Path,
+    name: str,
+) -> float:
     """Return what the score card says of the predictions of stored weights."""
     predict(
         weights,
@@ -104,8 +115,9 @@ def test_digits_of_the_scorer_on_the_free_surface(
     root = tiny_split("fluid").root
     result = run("neuralmpm", "steps=2", root=root, split="fluid")
     assert result.metric == "cloud_distance"
-    there = (result.weights, unmeasured, root)
-    assert validated_on_test(*there, "fluid") == scored(*there, "cloud_distance")
+    weights = result.weights
+    validated = validated_on_test(weights, unmeasured, root, "fluid")
+    assert validated == scored(weights, unmeasured, root, "cloud_distance")
 
 
 def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None:
@@ -113,46 +125,64 @@ def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None
     scenario is told.
     """
     root = copied()
-    for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
+    dataset = root / "curl-noise/tiny/v2"
+    for file in (dataset / "test").glob("*.nc"):
         file.unlink()
-    assert run("drift", "steps=1", root=root).best_value is not None
-    files = sorted((root / "curl-noise/tiny/v2/valid").glob("*.nc"))
+    result = run("drift", "steps=1", root=root)
+    assert result.best_value is not None
+    files = sorted((dataset / "valid").glob("*.nc"))
     with netCDF4.Dataset(files[-1]) as data:
-        assert np.isfinite(data["position"][:]).all()
+        position = data["position"][:]
+    assert np.isfinite(position).all()
     files[-1].unlink()
     with pytest.raises(DataError) as caught:
         run("drift", "steps=1", root=root, fresh=True)
     assert caught.value.where.endswith("root/curl-noise/tiny/v2/valid")
 
 
-def test_how_often() -> None:
-    """Validations share a training evenly, the last step among them, and take at most
-    15 % of it.
+def validated_steps(
+    options: TrainingOptions,
+    *,
+    steps: int,
+    validations: int,
+) -> list[int]:
+    """Return the steps after which a training validates."""
+    validated = []
+    for step in range(1, steps + 1):
+        if options.is_validated(step, steps=steps, validations=validations):
+            validated.append(step)
+    return validated
 
-    What a recipe names in `validate_every` wins; 0 means never.
-    """
-    options = TrainingOptions()
-    for steps, trained, rolled, expected in (
+
+@pytest.mark.parametrize(
+    ("steps", "trained", "rolled", "expected"),
+    [
         (5000, 64, 720, 8),  # NeuralMPM: four windows of 16 frames a step
         (6500, 1, 720, 2),  # GNS: 0.15 * 1.5 * 6500 / 720 = 2.03
         (6300, 1, 720, 1),
         (10, 1, 720, 1),
-    ):
-        count = options.count_validations(steps, trained=trained, rolled=rolled)
-        at = [
-            s
-            for s in range(1, steps + 1)
-            if options.is_validated(s, steps=steps, validations=count)
-        ]
-        assert len(at) == count == expected
-        assert at[-1] == steps
-        assert at[count // 2 - 1] == steps // 2 or count == 1
-    options = TrainingOptions(validate_every=4)
+    ],
+)
+def test_how_often(steps: int, trained: int, rolled: int, expected: int) -> None:
+    """Validations share a training evenly, the last step among them, and take at most
+    15 % of it.
+    """
+    options = TrainingOptions()
+    count = options.count_validations(steps, trained=trained, rolled=rolled)
+    validated = validated_steps(options, steps=steps, validations=count)
+    assert count == expected
+    assert len(validated) == count
+    assert validated[-1] == steps
+    if count > 1:
+        assert validated[count // 2 - 1] == steps // 2
+
+
+def test_a_recipe_may_say_how_often() -> None:
+    """What it names in `validate_every` wins; 0 means never."""
+    every_fourth = TrainingOptions(validate_every=4)
     never = TrainingOptions(validate_every=0)
-    assert [
-        s for s in range(1, 11) if options.is_validated(s, steps=10, validations=1)
-    ] == [4, 8, 10]
-    assert not any(never.is_validated(s, steps=10, validations=8) for s in range(1, 11))
+    assert validated_steps(every_fourth, steps=10, validations=1) == [4, 8, 10]
+    assert validated_steps(never, steps=10, validations=8) == []
 
 
 def test_what_a_training_says(run: Run) -> None:
@@ -161,7 +191,7 @@ def test_what_a_training_says(run: Run) -> None:
     """
     settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
     result = run("drift", *settings, "learning_rate=0.5")
-    record = json.loads((result.folder / "training.json").read_text())
+    record = read_training_log(result.folder)
     stored = load(result.weights).training
     assert record["budget"] == stored["budget"]
     budget = record["budget"]
@@ -172,25 +202,28 @@ def test_what_a_training_says(run: Run) -> None:
     assert result.windows_seen == 24
     assert result.epochs == 0.5
     assert result.threads == 1
-    told = [[entry["step"], entry["vorticity_nrmse"]] for entry in record["validation"]]
+    told = []
+    for entry in record["validation"]:
+        told.append([entry["step"], entry["vorticity_nrmse"]])
+    validated = [step for step, _ in told]
+    best_step, best = min(told, key=lambda one: one[1])
     assert budget["validations"] == told
-    assert [step for step, _ in told] == [2, 4, 6, 8]
-    assert (budget["best_step"], budget["best"]) == tuple(
-        min(told, key=lambda one: one[1])
-    )
+    assert validated == [2, 4, 6, 8]
+    assert budget["best_step"] == best_step
+    assert budget["best"] == best
     assert stored["step"] == result.best_step == budget["best_step"] < 8
     assert budget["gpu_hours"] == 0.0
     assert result.gpu_seconds == 0.0
-    spent = 3600 * (budget["cpu_hours"] + budget["validation_hours"])
-    assert 0 < spent == pytest.approx(record["cpu_seconds"], rel=1e-4)
+    hours = budget["cpu_hours"] + budget["validation_hours"]
+    assert hours > 0
+    assert 3600 * hours == pytest.approx(record["cpu_seconds"], rel=1e-4)
 
 
 def test_long_records_are_thinned(run: Run) -> None:
     """Of 22 validations a budget tells at most 20, the last one among them."""
     result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
-    told = json.loads((result.folder / "training.json").read_text())["budget"][
-        "validations"
-    ]
+    budget = read_training_log(result.folder)["budget"]
+    told = budget["validations"]
     assert len(told) <= 20
     assert told[-1][0] == 22
 
@@ -210,17 +243,19 @@ def test_fewer_frames_for_tests(
         generated.root,
         subset="valid",
     )
-    short = replace(task, config=replace(task.config, horizon=4))
-    model = Drift.build(
-        {},
-        read_dataset_info(
-            "curl-noise", "tiny", root=generated.root, registry=unmeasured
-        ),
+    config = replace(task.config, horizon=4)
+    short = replace(task, config=config)
+    info = read_dataset_info(
+        "curl-noise",
+        "tiny",
+        root=generated.root,
+        registry=unmeasured,
     )
+    model = Drift.build({}, info)
     model.load_state_dict(dict(load(result.checkpoint).weights))
-    whole = dict.fromkeys(task.scenarios, 20)
-    assert (
-        Validation(task=short, frames=dict.fromkeys(task.scenarios, 4)).measure(model)
-        == result.best_value
-    )
-    assert Validation(task=task, frames=whole).measure(model) != result.best_value
+    four_frames = dict.fromkeys(task.scenarios, 4)
+    all_frames = dict.fromkeys(task.scenarios, 20)
+    of_short = Validation(task=short, frames=four_frames).measure(model)
+    of_whole = Validation(task=task, frames=all_frames).measure(model)
+    assert of_short == result.best_value
+    assert of_whole != result.best_value
