@@ -452,8 +452,8 @@ GATED_FOR_TRAINING: dict[str, Any] = {
     ("kind", "options", "steps", "share"),
     [
         (MLP, {"widths": [64, 64]}, 300, 0.1),
-        (LSTM, GATED_FOR_TRAINING, 400, 0.2),
-        (LSTMWithMLP, GATED_FOR_TRAINING, 400, 0.2),
+        (LSTM, GATED_FOR_TRAINING, 150, 0.2),
+        (LSTMWithMLP, GATED_FOR_TRAINING, 150, 0.2),
     ],
 )
 def test_it_learns_a_rotation(

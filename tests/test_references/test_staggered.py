@@ -181,7 +181,7 @@ def test_a_driven_channel_comes_to_poiseuille_flow() -> None:
     viscosity = 0.05
     flow = grid.advance(
         flow,
-        duration=20.0,
+        duration=10.0,
         viscosity=viscosity,
         wall_velocity=NO_WALLS,
         force=(0.1, 0.0),
