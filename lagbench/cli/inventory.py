@@ -123,10 +123,7 @@ def _print_references(
     from lagbench.references.table import CLASSICAL, REFERENCES
 
     if not any(references.values()):
-        line = "references: not measured yet"
-        if not sizes[0].simulated:
-            line = "references: they are measured with each score"
-        print_line(line)
+        print_line("references: none recorded; they are measured with each score")
         return
     rows = []
     for name in REFERENCES:
