@@ -225,7 +225,7 @@ def shrink(text: Text, width: float) -> None:
     assert drawn is not None  # the text stands in a figure
     length = text.get_window_extent().width / drawn.dpi
     if length > width:
-        text.set_fontsize(text.get_fontsize() * width / length)
+        text.set_fontsize(float(text.get_fontsize()) * width / length)
 
 
 def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
