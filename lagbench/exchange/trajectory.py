@@ -318,14 +318,15 @@ class Description:
             )
 
     def _check_bounds(self) -> None:
-        for low, high in self.bounds or ():
+        bounds = self.bounds or ()
+        for low, high in bounds:
             if not -MOST <= low < high <= MOST:
                 raise UsageError(
                     "bounds run from low to high",
                     where="--bounds",
                     expected=f"low < high along each axis, from {-MOST:g} to {MOST:g}",
-                    got=self.bounds,
-                    fix=f"give them as in {bounds_example(len(self.bounds))}",
+                    got=bounds,
+                    fix=f"give them as in {bounds_example(len(bounds))}",
                 )
 
     def _check_periodic(self) -> None:
