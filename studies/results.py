@@ -96,8 +96,8 @@ HOW_TO_READ = """\
   better, ↑ that more is better, and ◎ that the value behind it is best.
 - **Comparisons** have two models. `means` and `seeds` give both, the first one first.
   `lead` is how much better the first mean is, in the units of the metric; a negative
-  lead means that the second is better. `won` counts the scenarios where the first one is
-  better.
+  lead means that the second is better. `won` counts the scenarios where the first one
+  is better.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
