@@ -259,9 +259,10 @@ def locate_split(
 ) -> SplitLocation:
     """Return the split that a user means by ``--split``.
 
-    The option is a name, or the path of a local split's folder. A text with a separator
-    (``path/to/own``, ``./own``, ``own/``) is a path, and so is any ``Path``. A name of
-    no split is a path where the current folder holds a local split of that name.
+    The option is a name, or the path of a local split's folder, or of the split.yaml
+    in it. A text with a separator (``path/to/own``, ``./own``, ``own/``) is a path, and
+    so is any ``Path``. A name of no split is a path where the current folder holds a
+    local split of that name.
 
     Args:
         split: name or path.
@@ -276,6 +277,8 @@ def locate_split(
     text = os.fspath(split)
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
+    if path.name == DESCRIPTION and path.is_file():
+        return _locate_folder(path.parent, root, registry)
     if has_separator or not isinstance(split, str):
         return _locate_folder(path, root, registry)
     folder = resolve_root(root)

@@ -24,7 +24,7 @@ from typer.testing import Result
 
 import lagbench
 from lagbench.data.checksums import dataset_hash, subset_hash
-from lagbench.data.local import locate
+from lagbench.data.local import locate, locate_split
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import (
@@ -176,6 +176,16 @@ def test_a_local_split_is_verified_templated_and_scored(
     at_rest = card.scores["persistence"]["position_rmse"]
     assert np.min(at_rest.per_frame) > 1e-3
     assert card.header.split == "mine"
+
+
+def test_a_local_split_is_named_by_its_description_too(
+    own: LocalSplit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    description = own.folder / "split.yaml"
+    assert locate_split(str(description)).name == "mine"
+    assert locate_split(description).root == own.folder.parent
+    monkeypatch.chdir(own.folder)
+    assert locate_split("split.yaml").root == own.folder.parent
 
 
 def test_predictions_for_a_local_split_are_compared(
