@@ -20,6 +20,7 @@ Float = np.float32
 Floats = NDArray[np.float32]
 Nodes = NDArray[np.int32]
 Sums = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Components = tuple[Floats, Floats, Floats, Floats]
 
 ZERO = Float(0.0)
@@ -122,6 +123,96 @@ class Stencil:
             yield node_i, node_k, weight, offset_x, offset_y
 
 
+@dataclass
+class Materials:
+    """What the particles are made of: their moduli and viscosity, shape [particle]."""
+
+    liquid: Mask
+    snow: Mask
+    mu: Floats
+    la: Floats
+    viscosity: Floats
+
+    @classmethod
+    def of(cls, p: FreeSurfaceParameters, material: NDArray[np.int8]) -> Materials:
+        """Look the constants up in float64, then round them once."""
+        moduli = {
+            Material.LIQUID: (0.0, 0.0),
+            Material.JELLY: lame(p.jelly_modulus, p.jelly_poisson),
+            Material.SNOW: lame(p.snow_modulus, p.snow_poisson),
+            Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
+        }
+        constants = [moduli[Material(m)] for m in material]
+        mu, la = np.array(constants, Float).T
+        liquid = material == Material.LIQUID
+        snow = material == Material.SNOW
+        damping = np.where(snow, 0.0, p.elastic_damping)
+        kinematic = np.where(liquid, p.liquid_viscosity, damping)
+        viscosity = p.density * kinematic
+        return cls(liquid, snow, mu, la, viscosity.astype(Float))
+
+
+def velocity_scale(p: FreeSurfaceParameters, count: int, most_cells: int) -> float:
+    """Return the fixed-point scale of velocities up to some cells per substep.
+
+    Their sums have 62 bits less those of the particle count.
+    """
+    count_bits = (count - 1).bit_length()
+    bits = min(50, 62 - count_bits)
+    greatest_speed = most_cells / (p.grid * p.dt)
+    speed_bits = int(np.ceil(np.log2(greatest_speed)))
+    return 2.0 ** (bits - speed_bits)
+
+
+def hardening(p: FreeSurfaceParameters, ratio: Floats) -> Floats:
+    """Return the factor of the moduli of snow."""
+    exponent = Float(p.snow_hardening) * (ONE - ratio)
+    exponent = np.clip(exponent, Float(-4), Float(4))
+    softest = Float(p.snow_hardening_min)
+    hardest = Float(p.snow_hardening_max)
+    return np.clip(exp(exponent), softest, hardest)
+
+
+def mirror_counts(count: Sums, low: int, high: int) -> None:
+    """Add what lies behind both walls to what lies before them, and mirror that."""
+    for wall, inwards in ((low, 1), (high, -1)):
+        inside = wall + inwards
+        outside = wall - inwards
+        count[wall] *= 2
+        count[inside] += count[outside]
+        count[outside] = count[inside]
+
+
+def stay_inside(p: FreeSurfaceParameters, position: Floats) -> Floats:
+    """Clamp positions just inside the walls."""
+    dx = 1 / p.grid
+    last_cell = p.grid - p.wall
+    low = Float((p.wall + 1e-3) * dx)
+    high = Float((last_cell - 1e-3) * dx)
+    return np.clip(position, low, high)
+
+
+def volume_ratio(
+    p: FreeSurfaceParameters,
+    old: Floats,
+    *,
+    divergence: Floats,
+    smooth: Floats,
+    density: Floats,
+) -> Floats:
+    """Return the J of liquid after a substep.
+
+    J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J); limits.
+    """
+    j = old + Float(p.dt) * divergence * old
+    j = j + Float(p.jacobian_relaxation) * (smooth - old)
+    volume = ONE / np.maximum(density, ONE)
+    j = j + Float(p.density_coupling) * (volume - j)
+    least = Float(p.jacobian_min)
+    most = Float(p.jacobian_max)
+    return np.clip(j, least, most)
+
+
 class FreeSurfaceReference:
     """One scenario of the free-surface solver."""
 
@@ -143,32 +234,11 @@ class FreeSurfaceReference:
         zeros = np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
         self.ratio = ones  # J of liquid, Jp of snow, 1 elsewhere [1], shape [particle]
-        self.liquid = state.material == Material.LIQUID
-        self.snow = state.material == Material.SNOW
-        moduli = {
-            Material.LIQUID: (0.0, 0.0),
-            Material.JELLY: lame(p.jelly_modulus, p.jelly_poisson),
-            Material.SNOW: lame(p.snow_modulus, p.snow_poisson),
-            Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
-        }
-        constants = [moduli[Material(m)] for m in state.material]
-        mu, la = np.array(constants, Float).T
-        self.mu = mu
-        self.la = la
-        damping = np.where(self.snow, 0.0, p.elastic_damping)
-        kinematic = np.where(self.liquid, p.liquid_viscosity, damping)
-        viscosity = p.density * kinematic
-        self.viscosity = viscosity.astype(Float)
+        self.materials = Materials.of(p, state.material)
         self.friction = Float(state.friction)
         share = state.area / count * p.grid**2
         self.node_share = Float(share)
-        # Velocities up to 64 cells per substep, in 62 bits less those of the particle
-        # count.
-        count_bits = (count - 1).bit_length()
-        bits = min(50, 62 - count_bits)
-        greatest_speed = 64 / (p.grid * p.dt)
-        speed_bits = int(np.ceil(np.log2(greatest_speed)))
-        self.velocity_scale = 2.0 ** (bits - speed_bits)
+        self.velocity_scale = velocity_scale(p, count, 64)
 
     def advance(self, substeps: int) -> None:
         """Run substeps."""
@@ -182,14 +252,11 @@ class FreeSurfaceReference:
         """Kirchhoff stress (xx, xy, yy)."""
         p = self.p
         f = PolarParts.of(self.deformation)
-        exponent = Float(p.snow_hardening) * (ONE - self.ratio)
-        exponent = np.clip(exponent, Float(-4), Float(4))
-        softest = Float(p.snow_hardening_min)
-        hardest = Float(p.snow_hardening_max)
-        stiff = np.clip(exp(exponent), softest, hardest)
-        factor = np.where(self.snow, stiff, ONE)
-        mu = self.mu * factor
-        la = self.la * factor
+        materials = self.materials
+        stiff = hardening(p, self.ratio)
+        factor = np.where(materials.snow, stiff, ONE)
+        mu = materials.mu * factor
+        la = materials.la * factor
         square = f.h * f.h + f.k * f.k
         jacobian = f.q * f.q - square
         volumetric = la * (jacobian - ONE) * jacobian
@@ -204,13 +271,14 @@ class FreeSurfaceReference:
         yy = mean - normal
         pressure = Float(p.liquid_modulus) * (self.ratio - ONE)
         cxx, cxy, cyx, cyy = self.affine
-        elastic_xx = np.where(self.liquid, pressure, xx)
-        elastic_xy = np.where(self.liquid, ZERO, xy)
-        elastic_yy = np.where(self.liquid, pressure, yy)
+        viscosity = materials.viscosity
+        elastic_xx = np.where(materials.liquid, pressure, xx)
+        elastic_xy = np.where(materials.liquid, ZERO, xy)
+        elastic_yy = np.where(materials.liquid, pressure, yy)
         return (
-            elastic_xx + TWO * self.viscosity * cxx,
-            elastic_xy + self.viscosity * (cxy + cyx),
-            elastic_yy + TWO * self.viscosity * cyy,
+            elastic_xx + TWO * viscosity * cxx,
+            elastic_xy + viscosity * (cxy + cyx),
+            elastic_yy + TWO * viscosity * cyy,
         )
 
     def to_grid(self, stencil: Stencil) -> Sums:
@@ -228,7 +296,7 @@ class FreeSurfaceReference:
         slopes_x = (cxx * dx - s * xx, cyx * dx - s * xy)
         slopes_y = (cxy * dx - s * xy, cyy * dx - s * yy)
         x, y = (stencil.distance - ONE).T
-        jacobian = np.where(self.liquid, self.ratio, ONE)
+        jacobian = np.where(self.materials.liquid, self.ratio, ONE)
         for component in range(2):
             a = slopes_x[component]
             b = slopes_y[component]
@@ -274,32 +342,18 @@ class FreeSurfaceReference:
         v, u = self.wall_contact(v, u, bottom, top)
         mirrored = sums[2].copy()
         for count in (mirrored, mirrored.T):
-            self.mirror_counts(count, wall=low, inside=low + 1, outside=low - 1)
-            self.mirror_counts(count, wall=high, inside=high - 1, outside=high + 1)
+            mirror_counts(count, low, high)
         counts = mirrored.astype(Float) / Float(WEIGHT_SCALE)
         density = counts * self.node_share
         jacobian = np.where(filled, mj / n, ONE)
         return u, v, density, jacobian
 
-    def mirror_counts(
-        self,
-        count: Sums,
-        *,
-        wall: int,
-        inside: int,
-        outside: int,
-    ) -> None:
-        """Add what lies behind a wall to what lies before it, and mirror that."""
-        count[wall] *= 2
-        count[inside] += count[outside]
-        count[outside] = count[inside]
-
     def wall_contact(
         self,
         normal: Floats,
         tangential: Floats,
-        below: NDArray[np.bool_],
-        above: NDArray[np.bool_],
+        below: Mask,
+        above: Mask,
     ) -> tuple[Floats, Floats]:
         """Remove the outward normal velocity; friction brakes the tangential one."""
         hits_low = below & (normal < 0)
@@ -345,26 +399,17 @@ class FreeSurfaceReference:
             scale * cyy,
         )
         self.velocity = np.stack([vx, vy], 1)
-        dx = 1 / self.p.grid
-        first_cell = self.p.wall
-        last_cell = self.p.grid - self.p.wall
-        low = Float((first_cell + 1e-3) * dx)
-        high = Float((last_cell - 1e-3) * dx)
         step = Float(self.p.dt) * self.velocity
-        self.position = np.clip(self.position + step, low, high)
-        # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J);
-        # limits.
-        p = self.p
+        self.position = stay_inside(self.p, self.position + step)
         old = self.ratio
-        divergence = self.affine[0] + self.affine[3]
-        j = old + Float(p.dt) * divergence * old
-        j = j + Float(p.jacobian_relaxation) * (smooth - old)
-        volume = ONE / np.maximum(r, ONE)
-        j = j + Float(p.density_coupling) * (volume - j)
-        least = Float(p.jacobian_min)
-        most = Float(p.jacobian_max)
-        j = np.clip(j, least, most)
-        self.ratio = np.where(self.liquid, j, old)
+        j = volume_ratio(
+            self.p,
+            old,
+            divergence=self.affine[0] + self.affine[3],
+            smooth=smooth,
+            density=r,
+        )
+        self.ratio = np.where(self.materials.liquid, j, old)
         self.deform()
 
     def deform(self) -> None:
@@ -402,7 +447,7 @@ class FreeSurfaceReference:
         plastic_min = Float(self.p.snow_jp_min)
         plastic_max = Float(self.p.snow_jp_max)
         plastic = np.clip(self.ratio * factor, plastic_min, plastic_max)
-        self.ratio = np.where(self.snow, plastic, self.ratio)
+        self.ratio = np.where(self.materials.snow, plastic, self.ratio)
         elastic = (
             e + h,
             k - g,
@@ -411,7 +456,7 @@ class FreeSurfaceReference:
         )
         components = []
         for number, old in enumerate(self.deformation):
-            solid = np.where(self.snow, elastic[number], trial[number])
-            component = np.where(self.liquid, old, solid)
+            solid = np.where(self.materials.snow, elastic[number], trial[number])
+            component = np.where(self.materials.liquid, old, solid)
             components.append(component)
         self.deformation = tuple(components)  # type: ignore[assignment]
