@@ -54,12 +54,19 @@ def server(packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[M
 
 def fetch_own(url: str, root: Path, subset: str | None = None) -> DownloadResult:
     """Download and simulate nothing."""
-    return download("own", mirror=url, root=root, subset=subset, or_generate=False)
+    return download(
+        "own",
+        mirror=url,
+        root=root,
+        subset=subset,
+        or_generate=False,
+    )
 
 
 def is_right(root: Path) -> bool:
     """Return whether the data set is complete, and has the recorded hash."""
-    return lagbench.verify("own", root=root, complete=True).warnings == ()
+    result = lagbench.verify("own", root=root, complete=True)
+    return result.warnings == ()
 
 
 def list_data_files(root: Path) -> set[str]:
@@ -67,7 +74,8 @@ def list_data_files(root: Path) -> set[str]:
     names = set()
     for path in root.rglob("*"):
         if path.name.endswith((".nc", ".partial")):
-            names.add(path.relative_to(root).as_posix())
+            relative = path.relative_to(root)
+            names.add(relative.as_posix())
     return names
 
 
@@ -75,7 +83,8 @@ def read_scenarios(root: Path) -> dict[Path, bytes]:
     """Return the content of all scenario files below a folder."""
     content = {}
     for path in root.rglob("*.nc"):
-        content[path.relative_to(root)] = path.read_bytes()
+        relative = path.relative_to(root)
+        content[relative] = path.read_bytes()
     return content
 
 
@@ -86,7 +95,10 @@ def flip_bit(data: bytes) -> bytes:
     return bytes(changed)
 
 
-def rewrite_archive(path: Path, change: Callable[[Members], Members]) -> None:
+Change = Callable[[Members], Members]
+
+
+def rewrite_archive(path: Path, change: Change) -> None:
     """Write an archive anew with other members."""
     with tarfile.open(path) as tar:
         members: Members = []
@@ -101,15 +113,18 @@ def rewrite_archive(path: Path, change: Callable[[Members], Members]) -> None:
 
 
 def test_the_same_files_give_the_same_bytes(
-    generated: GenerationResult, copied: Callable[[], Path], tmp_path: Path
+    generated: GenerationResult,
+    copied: Callable[[], Path],
+    tmp_path: Path,
 ) -> None:
     """Times and modes of files do not matter; the name is that of the content."""
     root = copied()
     for path in (root / DATA).rglob("*.nc"):
         path.chmod(0o600)
         os.utime(path, (1, 1))
+    output = tmp_path / "new"
     first = archive.write_archive(SPLIT, SIZE, root=generated.root, output=tmp_path)
-    second = archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
+    second = archive.write_archive(SPLIT, SIZE, root=root, output=output)
     assert second.read_bytes() == first.read_bytes()
     assert generated.dataset_sha256 is not None
     name = f"{SPLIT}-{SIZE}-{generated.dataset_sha256[:16]}.tar"
@@ -132,9 +147,12 @@ def test_an_archive_has_the_files_in_order(
             assert member.mtime == 0
             assert member.mode == 0o644
         tar.extractall(unpacked, filter="data")
-    assert names == ["manifest.json", *sorted(names[1:])]
+    manifest, *scenarios = names
+    assert manifest == "manifest.json"
+    assert scenarios == sorted(scenarios)
+    folder = generated.root / DATA
     for name in names:
-        expected = (generated.root / DATA / name).read_bytes()
+        expected = (folder / name).read_bytes()
         assert (unpacked / name).read_bytes() == expected
 
 
@@ -149,10 +167,11 @@ def test_only_right_data_are_packed(
     path.unlink()
     if damage == "flipped":
         path.write_bytes(flip_bit(data))
+    output = tmp_path / "new"
     with pytest.raises(LagbenchError) as caught:
-        archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
+        archive.write_archive(SPLIT, SIZE, root=root, output=output)
     assert caught.value.exit_code in (3, 4)
-    assert not list(tmp_path.glob("new/*"))
+    assert not list(output.glob("*"))
 
 
 def test_releases_have_one_address(
@@ -162,12 +181,9 @@ def test_releases_have_one_address(
     releases = tmp_path / "releases"
     root = tmp_path / "root"
     arguments = [
-        "--root",
-        str(generated.root),
-        "--output",
-        str(releases),
-        "--size",
-        SIZE,
+        *("--root", str(generated.root)),
+        *("--output", str(releases)),
+        *("--size", SIZE),
         "--split",
     ]
     assert archive.main([*arguments, SPLIT]) == 0
@@ -206,7 +222,8 @@ def test_no_server_is_asked_for_a_local_split(
 
 
 def test_an_archive_is_read_through_fsspec(server: Mirror, here: Path) -> None:
-    assert fetch_own(server.folder.as_uri(), here).complete
+    url = server.folder.as_uri()
+    assert fetch_own(url, here).complete
     assert is_right(here)
 
 
@@ -219,7 +236,11 @@ def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) ->
 
 def requested_ranges(server: Mirror) -> list[str | None]:
     """Return the ranges of the archive that were asked for."""
-    return [ranges for path, ranges in server.asked if path.endswith(".tar")]
+    ranges_of_archive = []
+    for path, ranges in server.asked:
+        if path.endswith(".tar"):
+            ranges_of_archive.append(ranges)
+    return ranges_of_archive
 
 
 @pytest.mark.parametrize("fault", ["", "no ranges"])
@@ -231,14 +252,23 @@ def test_only_missing_members_are_asked_for(
     if fault:
         server.faults = {".tar": fault}
     last = fetch_own(server.url, here)
-    assert {*first.downloaded, *last.downloaded} == {0, 1, 2, 3}
+    downloaded = {*first.downloaded, *last.downloaded}
+    assert downloaded == {0, 1, 2, 3}
     assert last.kept == first.downloaded
     assert last.complete
     if not fault:
         assert any(requested_ranges(server))
 
 
-@pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once", "wrong range"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "drops",
+        "no ranges",
+        "busy once",
+        "wrong range",
+    ],
+)
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
     """Broken connections go on by range, or from the start without ranges."""
     server.faults = {".tar": fault}
@@ -296,11 +326,13 @@ def foreign_link(name: str) -> Member:
     return member, b""
 
 
-def insert(index: int, member: Member) -> Callable[[Members], Members]:
+def insert(index: int, member: Member) -> Change:
     """Return a change that puts a member at a place."""
 
     def change(members: Members) -> Members:
-        return [*members[:index], member, *members[index:]]
+        before = members[:index]
+        after = members[index:]
+        return [*before, member, *after]
 
     return change
 
@@ -313,12 +345,14 @@ def append_foreign_file(members: Members) -> Members:
 def insert_link(members: Members) -> Members:
     """Put a link under the name of the first scenario before it."""
     manifest, first, *others = members
-    return [manifest, foreign_link(first[0].name), first, *others]
+    name = first[0].name
+    return [manifest, foreign_link(name), first, *others]
 
 
 def reverse_order(members: Members) -> Members:
     """Give the scenarios another order."""
-    return [members[0], *reversed(members[1:])]
+    manifest, *scenarios = members
+    return [manifest, *reversed(scenarios)]
 
 
 def drop_last(members: Members) -> Members:
@@ -329,24 +363,28 @@ def drop_last(members: Members) -> Members:
 def flip_second_scenario(members: Members) -> Members:
     """Change a bit of the second scenario."""
     manifest, first, (member, data), *others = members
-    return [manifest, first, (member, flip_bit(data)), *others]
+    changed = (member, flip_bit(data))
+    return [manifest, first, changed, *others]
 
 
 def lengthen_first_scenario(members: Members) -> Members:
     """Add bytes to the first scenario."""
     manifest, (member, data), *others = members
-    return [manifest, (member, data + bytes(9)), *others]
+    longer = (member, data + bytes(9))
+    return [manifest, longer, *others]
 
 
 def change_all_hashes(members: Members) -> Members:
     """Give all scenarios another content hash."""
     (member, text), *others = members
     manifest = Manifest.model_validate_json(text)
+    other_hash = {"content_sha256": "0" * 64}
     entries = []
     for entry in manifest.files:
-        entries.append(entry.model_copy(update={"content_sha256": "0" * 64}))
+        entries.append(entry.model_copy(update=other_hash))
     changed = manifest.model_copy(update={"files": tuple(entries)})
-    return [(member, changed.model_dump_json().encode()), *others]
+    changed_text = changed.model_dump_json()
+    return [(member, changed_text.encode()), *others]
 
 
 def empty_manifest(members: Members) -> Members:
@@ -395,7 +433,7 @@ def test_archives_that_lie_are_refused(
     server: Mirror,
     packed: Path,
     here: Path,
-    change: Callable[[Members], Members],
+    change: Change,
     error: type[LagbenchError],
 ) -> None:
     """Only right files of the data set stay, and no file lies elsewhere."""
