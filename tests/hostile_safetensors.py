@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +26,8 @@ def small_model(generated: GenerationResult) -> Any:
         options=SMALL,
         root=generated.root,
     )
-    torch.nn.init.normal_(model.network.decoder[-1].weight, std=0.1)
+    last_layer = model.network.decoder[-1]
+    torch.nn.init.normal_(last_layer.weight, std=0.1)
     return model
 
 
@@ -34,35 +36,61 @@ def sound_file(path: Path, generated: GenerationResult) -> Path:
     return export_safetensors(small_model(generated), path, baseline="gns")
 
 
-def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+Header = dict[str, Any]
+
+
+def split_file(path: Path) -> tuple[Header, bytes]:
+    """Return the header and the numbers of a file."""
+    content = path.read_bytes()
+    end = 8 + int.from_bytes(content[:8], "little")
+    return json.loads(content[8:end]), content[end:]
+
+
+def write_file(path: Path, header: bytes, numbers: bytes = b"") -> None:
+    """Write a header, after its length, and numbers."""
+    length = len(header).to_bytes(8, "little")
+    path.write_bytes(length + header + numbers)
+
+
+def rewrite(path: Path, change: Callable[[Header], object]) -> None:
     """Change the header; the numbers stay."""
-    data = path.read_bytes()
-    end = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:end])
+    header, numbers = split_file(path)
     change(header)
-    text = json.dumps(header).encode()
-    path.write_bytes(len(text).to_bytes(8, "little") + text + data[end:])
+    text = json.dumps(header)
+    write_file(path, text.encode(), numbers)
 
 
-def rewrite_recipe(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+def state(path: Path, **values: object) -> None:
+    """Change what the file states beside its tensors."""
+    rewrite(path, lambda header: header["__metadata__"].update(values))
+
+
+def rewrite_recipe(path: Path, change: Callable[[Header], object]) -> None:
     """Change the recipe."""
 
-    def change_header(header: dict[str, Any]) -> None:
-        recipe = json.loads(header["__metadata__"]["lagbench"])
+    def change_header(header: Header) -> None:
+        metadata = header["__metadata__"]
+        recipe = json.loads(metadata["lagbench"])
         change(recipe)
-        header["__metadata__"]["lagbench"] = json.dumps(recipe)
+        metadata["lagbench"] = json.dumps(recipe)
 
     rewrite(path, change_header)
 
 
-def first_name(header: dict[str, Any]) -> str:
+def first_name(header: Header) -> str:
     """Return the name of the first tensor."""
-    return min(name for name in header if name != "__metadata__")
+    return min(tensors_of(header))
+
+
+def tensors_of(header: Header) -> Header:
+    """Return the tensors that a header describes, by name."""
+    return {name: value for name, value in header.items() if name != "__metadata__"}
 
 
 def a_pickle(path: Path) -> None:
     """A pickle under that suffix."""
-    path.write_bytes(pickle.dumps({"weights": [1.0]}))
+    weights = pickle.dumps({"weights": [1.0]})
+    path.write_bytes(weights)
 
 
 def an_archive(path: Path) -> None:
@@ -72,7 +100,8 @@ def an_archive(path: Path) -> None:
 
 def cut_short(path: Path) -> None:
     """The last numbers are missing."""
-    path.write_bytes(path.read_bytes()[:-100])
+    content = path.read_bytes()
+    path.write_bytes(content[:-100])
 
 
 def an_empty_file(path: Path) -> None:
@@ -82,18 +111,20 @@ def an_empty_file(path: Path) -> None:
 
 def header_beyond_the_file(path: Path) -> None:
     """A header of 2^62 bytes."""
-    path.write_bytes((2**62).to_bytes(8, "little") + path.read_bytes()[8:])
+    content = path.read_bytes()
+    length = (2**62).to_bytes(8, "little")
+    path.write_bytes(length + content[8:])
 
 
 def header_of_megabytes(path: Path) -> None:
     """A header that holds three million blanks."""
-    rewrite(path, lambda header: header["__metadata__"].update(more=" " * 3_000_000))
+    state(path, more=" " * 3_000_000)
 
 
 def header_without_end(path: Path) -> None:
     """A header of nothing but opened lists, after one brace."""
-    text = b'{"a":' + b"[" * 500_000
-    path.write_bytes(len(text).to_bytes(8, "little") + text)
+    lists = b"[" * 500_000
+    write_file(path, b'{"a":' + lists)
 
 
 def file_without_end(path: Path) -> None:
@@ -105,8 +136,9 @@ def file_without_end(path: Path) -> None:
 def overlapping_tensors(path: Path) -> None:
     """Two names for the same bytes."""
 
-    def change(header: dict[str, Any]) -> None:
-        header["twin"] = header[first_name(header)]
+    def change(header: Header) -> None:
+        name = first_name(header)
+        header["twin"] = header[name]
 
     rewrite(path, change)
 
@@ -114,8 +146,9 @@ def overlapping_tensors(path: Path) -> None:
 def numbers_beyond_the_file(path: Path) -> None:
     """A tensor of 2^60 numbers."""
 
-    def change(header: dict[str, Any]) -> None:
-        header[first_name(header)]["shape"] = [2**30, 2**30]
+    def change(header: Header) -> None:
+        name = first_name(header)
+        header[name]["shape"] = [2**30, 2**30]
 
     rewrite(path, change)
 
@@ -127,20 +160,20 @@ def without_a_recipe(path: Path) -> None:
 
 def recipe_that_is_no_json(path: Path) -> None:
     """Words where JSON should stand."""
-    rewrite(path, lambda header: header["__metadata__"].update(lagbench="gns"))
+    state(path, lagbench="gns")
 
 
 def nested_recipe(path: Path) -> None:
     """JSON that is nested deeper than a parser goes."""
-    deep = "[" * 100_000
-    rewrite(path, lambda header: header["__metadata__"].update(lagbench=deep))
+    state(path, lagbench="[" * 100_000)
 
 
 def another_name(path: Path) -> None:
     """A tensor that the architecture does not have, instead of one that it has."""
 
-    def change(header: dict[str, Any]) -> None:
-        header["other"] = header.pop(first_name(header))
+    def change(header: Header) -> None:
+        name = first_name(header)
+        header["other"] = header.pop(name)
 
     rewrite(path, change)
 
@@ -148,26 +181,25 @@ def another_name(path: Path) -> None:
 def another_shape(path: Path) -> None:
     """A tensor with its axes merged."""
 
-    def change(header: dict[str, Any]) -> None:
-        tensor = next(
-            value
-            for name, value in header.items()
-            if name != "__metadata__" and len(value["shape"]) == 2
-        )
-        tensor["shape"] = [tensor["shape"][0] * tensor["shape"][1]]
+    def change(header: Header) -> None:
+        for tensor in tensors_of(header).values():
+            if len(tensor["shape"]) == 2:
+                rows, columns = tensor["shape"]
+                tensor["shape"] = [rows * columns]
+                return
 
     rewrite(path, change)
 
 
 def _last_number(path: Path, value: float) -> None:
     number = torch.tensor(value, dtype=torch.float32).numpy().tobytes()
-    data = path.read_bytes()
-    end = 8 + int.from_bytes(data[:8], "little")
-    header = json.loads(data[8:end])
-    for name, tensor in header.items():
-        if name != "__metadata__" and tensor["dtype"] == "F32":
-            start = end + tensor["data_offsets"][0]
-            path.write_bytes(data[:start] + number + data[start + len(number) :])
+    header, numbers = split_file(path)
+    for tensor in tensors_of(header).values():
+        if tensor["dtype"] == "F32":
+            start, _ = tensor["data_offsets"]
+            with path.open("r+b") as stream:
+                stream.seek(start - len(numbers), os.SEEK_END)
+                stream.write(number)
             return
 
 

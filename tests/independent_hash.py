@@ -15,7 +15,12 @@ import numpy as np
 
 def dumps(value: Any) -> bytes:
     """Return canonical JSON."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    text = json.dumps(
+        value,
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+    )
     return text.encode()
 
 
@@ -37,8 +42,10 @@ def value_bytes(data: Any) -> bytes:
     little_endian = data.dtype.newbyteorder("<")
     values = data[()].astype(little_endian)
     if data.dtype.kind == "f":
-        values = np.where(values == 0, np.array(0, values.dtype), values)
-        values = np.where(np.isnan(values), np.array(np.nan, values.dtype), values)
+        zero = np.array(0, values.dtype)
+        nan = np.array(np.nan, values.dtype)
+        values = np.where(values == 0, zero, values)
+        values = np.where(np.isnan(values), nan, values)
     return values.astype(little_endian).tobytes()
 
 
@@ -50,7 +57,12 @@ def variable_hash(name: str, data: Any) -> str:
     dtype = "string"
     if data.dtype.kind != "O":
         dtype = data.dtype.newbyteorder("=").name
-    header = {"name": name, "dtype": dtype, "dims": dims, "shape": list(data.shape)}
+    header = {
+        "name": name,
+        "dtype": dtype,
+        "dims": dims,
+        "shape": list(data.shape),
+    }
     text = dumps(header) + b"\n" + value_bytes(data)
     return hashlib.sha256(text).hexdigest()
 
@@ -64,7 +76,8 @@ def content_hash(path: Path) -> str:
         whole = {}
         for name in ("split", "size", "subset", "seed", "scenario"):
             whole[name] = attributes[name]
-        whole["major"] = int(attributes["version"].split(".")[0])
+        major, *_ = attributes["version"].split(".")
+        whole["major"] = int(major)
         whole["parameters"] = {}
         for name in attributes["hashed_parameters"].split():
             whole["parameters"][name] = attributes[name]

@@ -44,17 +44,20 @@ class ScoreBench:
 
     def submit(self, path: Path, predict: Predict, **labels: Any) -> Path:
         """Write the submission of a method."""
-        n = self.size.task.input_frames
-        h = self.size.task.horizon
-        guesses = {i: predict(self.truth(i), n, h) for i in self.size.subsets["test"]}
+        task = self.size.task
+        predictions = {}
+        for scenario in self.size.subsets["test"]:
+            truth = self.truth(scenario)
+            predictions[scenario] = predict(truth, task.input_frames, task.horizon)
+        default_labels: dict[str, Any] = {"method": "guess"}
         return write(
             path,
-            guesses,
+            predictions,
             split=self.size.split,
             size=self.size.name,
             root=self.root,
             registry=self.registry,
-            **{"method": "guess", **labels},
+            **(default_labels | labels),
         )
 
     def evaluate(self, path: Path, **options: Any) -> ScoreCard:
@@ -70,14 +73,18 @@ class ScoreBench:
     def score(self, path: Path, **options: Any) -> ScoreCard:
         """Score a submission and write the card beside it."""
         folder = {"output_dir": path.parent}
-        return score(path, root=self.root, registry=self.registry, **(folder | options))
+        return score(
+            path,
+            root=self.root,
+            registry=self.registry,
+            **(folder | options),
+        )
 
 
 def bench_of(generated: GenerationResult, registry: Registry) -> ScoreBench:
     """Return the bench of a generated data set."""
-    return ScoreBench(
-        generated.root, registry, registry.size(generated.split, generated.size)
-    )
+    size = registry.size(generated.split, generated.size)
+    return ScoreBench(generated.root, registry, size)
 
 
 def right(truth: Floats, n: int, h: int) -> Floats:
@@ -87,14 +94,17 @@ def right(truth: Floats, n: int, h: int) -> Floats:
 
 def still(truth: Floats, n: int, h: int) -> Floats:
     """Predict the last given frame."""
-    return np.broadcast_to(truth[n - 1], truth[n : n + h].shape)
+    last = truth[n - 1]
+    future = truth[n : n + h]
+    return np.broadcast_to(last, future.shape)
 
 
 def straight(truth: Floats, n: int, h: int) -> Floats:
     """Predict motion at the last given velocity."""
     last = truth[n - 1].astype(np.float64)
     steps = np.arange(1, h + 1)[:, None, None]
-    return np.asarray(last + steps * (last - truth[n - 2]))
+    velocity = last - truth[n - 2]
+    return np.asarray(last + steps * velocity)
 
 
 def late(truth: Floats, n: int, h: int) -> Floats:
@@ -104,6 +114,7 @@ def late(truth: Floats, n: int, h: int) -> Floats:
 
 def half_right(truth: Floats, n: int, h: int) -> Floats:
     """Predict the truth for half the horizon, then stand still."""
-    guess = np.array(truth[n : n + h])
-    guess[h // 2 :] = guess[h // 2 - 1]
-    return guess
+    half = h // 2
+    prediction = np.array(truth[n : n + h])
+    prediction[half:] = prediction[half - 1]
+    return prediction

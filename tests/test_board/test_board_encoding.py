@@ -22,10 +22,14 @@ GAP = st.just(float("nan"))
 
 def restore(store: ArrayStore, reference: dict[str, float | bool]) -> NDArray:
     """Return an array as the page's script reads it."""
-    return read_array(read_levels(store.to_bytes()), reference)
+    levels = read_levels(store.to_bytes())
+    return read_array(levels, reference)
 
 
-@given(st.lists(NUMBERS | GAP, min_size=1, max_size=40), st.booleans())
+@given(
+    st.lists(NUMBERS | GAP, min_size=1, max_size=40),
+    st.booleans(),
+)
 @example([sys.float_info.min], True)
 def test_numbers_come_back_within_half_a_step(
     values: list[float], prefer_logarithmic: bool
@@ -36,13 +40,15 @@ def test_numbers_come_back_within_half_a_step(
     reference = store.add(array, prefer_logarithmic=prefer_logarithmic)
     restored = restore(store, reference)[:, 0]
 
-    assert_array_equal(np.isnan(restored), np.isnan(array))
-    is_known = ~np.isnan(array)
+    is_gap = np.isnan(array)
+    assert_array_equal(np.isnan(restored), is_gap)
+    is_known = ~is_gap
     half_step = 0.5 * float(reference["step"])
     zero = float(reference["zero"])
     if reference["log"]:
         is_inside = is_known & (array >= np.exp(zero))
-        error = np.abs(np.log(restored[is_inside] / array[is_inside]))
+        ratio = restored[is_inside] / array[is_inside]
+        error = np.abs(np.log(ratio))
         assert np.all(error <= half_step + 1e-5)
     else:
         error = np.abs(restored[is_known] - array[is_known])
@@ -50,13 +56,19 @@ def test_numbers_come_back_within_half_a_step(
         assert np.all(error <= half_step + 1e-5 * scale)
 
 
-@given(st.integers(1, 20), st.integers(1, 6), st.integers(0, 2**32))
+@given(
+    st.integers(1, 20),
+    st.integers(1, 6),
+    st.integers(0, 2**32),
+)
 def test_rows_and_columns_keep_their_places(rows: int, columns: int, seed: int) -> None:
     """Steps between rows may be as long as the whole range."""
-    values = np.random.default_rng(seed).random((rows, columns))
+    rng = np.random.default_rng(seed)
+    values = rng.random((rows, columns))
     store = ArrayStore()
     store.add([1.0, 2.0, 4.0])
-    restored = restore(store, store.add(values))
+    reference = store.add(values)
+    restored = restore(store, reference)
     assert_allclose(restored, values, atol=0.51 / LEVELS)
 
 
@@ -69,7 +81,8 @@ def test_whole_numbers_are_exact_and_stand_once() -> None:
     second = store.add_whole(frames)
     assert first == second
     assert len(store.to_bytes()) == length
-    assert restore(store, first)[:, 0].tolist() == frames
+    restored = restore(store, first)
+    assert restored[:, 0].tolist() == frames
 
 
 @given(st.binary(max_size=200))
@@ -80,7 +93,15 @@ def test_bytes_survive_as_text_without_markup(data: bytes) -> None:
     assert decode(text, longest=len(data)) == data
 
 
-@pytest.mark.parametrize("text", ["", "AAAA", "not base64!", encode(bytes(10_000))])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "AAAA",
+        "not base64!",
+        encode(bytes(10_000)),
+    ],
+)
 def test_text_that_is_too_long_or_none_is_refused(text: str) -> None:
     """A short text may encode a long content: it is not decompressed whole."""
     with pytest.raises(ValueError):  # noqa: PT011
@@ -92,5 +113,10 @@ def test_coarse_field_keeps_its_mean() -> None:
     field = np.arange(16.0).reshape(4, 4)
     field[0, 0] = np.nan
     # upper left block: 1, 4, 5 are known, mean 10/3
-    assert_allclose(coarsen(field, 2), [[10 / 3, 4.5], [10.5, 12.5]])
+    coarse = coarsen(field, 2)
+    expected = [
+        [10 / 3, 4.5],
+        [10.5, 12.5],
+    ]
+    assert_allclose(coarse, expected)
     assert_array_equal(coarsen(field, 4), field)

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,11 +61,16 @@ def twins(tmp_path_factory: pytest.TempPathFactory, master: ModelBoard) -> Model
     root = folder / "data"
     shutil.copytree(master.root, root)
     bench = replace(master, folder=folder / "board", root=root)
-    for path in (Path(PATH), Path(f"scores/{NAME}.nc")):
-        target = bench.folder / path
-        shutil.copy(target, target.with_stem("twin"))
-    twin = bench.folder / Path(PATH).with_stem("twin")
-    bench.edit(twin, lambda content: content.update(method="twin"))
+    scores = bench.folder / f"scores/{NAME}.nc"
+    entry = bench.folder / PATH
+    twin = entry.with_stem("twin")
+    shutil.copy(scores, scores.with_stem("twin"))
+    shutil.copy(entry, twin)
+
+    def rename(content: dict[str, Any]) -> None:
+        content["method"] = "twin"
+
+    bench.edit(twin, rename)
     simulate(bench, close_season(bench, "twins"))
     return bench
 
@@ -119,8 +125,10 @@ def test_the_seed_is_a_hash_that_anybody_can_form() -> None:
     )
     expected = hashlib.sha256(text.encode()).hexdigest()
     names = ("may", "cavity", "mini", "2.1.0")
-    assert draw_seed(*names, models=models, value="17") == expected
-    assert draw_seed(*names, models=models[::-1], value="17") == expected
+    seed = draw_seed(*names, models=models, value="17")
+    assert seed == expected
+    in_another_order = draw_seed(*names, models=models[::-1], value="17")
+    assert in_another_order == expected
     others = {
         draw_seed(*names, models=models),
         draw_seed(*names, models=models[:1], value="17"),
@@ -133,11 +141,18 @@ def test_the_whole_seed_enters_the_draws() -> None:
     """A change of its last digit leads to other numbers, and the text to the same."""
     names = ("cavity", "mini", 2, 1000)
     seed = 64 * "0"
-    numbers = generator(*names, seed).random(4).tolist()
-    assert numbers != generator(*names, f"{seed[:-1]}1").random(4).tolist()
-    assert numbers != generator(*names).random(4).tolist()
+
+    def first_numbers(*words: str) -> list[float]:
+        numbers: list[float] = generator(*words).random(4).tolist()
+        return numbers
+
+    other_seed = f"{seed[:-1]}1"
+    numbers = first_numbers(*names, seed)
+    assert numbers != first_numbers(*names, other_seed)
+    assert numbers != first_numbers(*names)
     words = [int(word) for word in seed_text(*names, seed).split(", ")]
-    again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    sequence = np.random.SeedSequence(words)
+    again = np.random.Generator(np.random.PCG64(sequence))
     assert again.random(4).tolist() == numbers
 
 
@@ -146,13 +161,17 @@ def test_blind_scenarios_are_new(master: ModelBoard) -> None:
     season = read_season(Folder(master.folder), SEASON)
     (data_set,) = season.data_sets
     size = load().size("curl-noise", "tiny")
-    assert not set(data_set.ids) & set(size.scenarios)
+    assert set(data_set.ids).isdisjoint(size.scenarios)
     starts = set()
-    for folder in (size.folder(master.root), season_root(SEASON, master.root)):
+    public = size.folder(master.root)
+    blind = season_root(SEASON, master.root)
+    for folder in (public, blind):
         for path in folder.rglob("*.nc"):
             with read_scenario(path) as file:
-                starts.add(file.read("position", 0).tobytes())
-    assert len(starts) == len(size.scenarios) + len(data_set.ids)
+                start = file.read("position", 0)
+                starts.add(start.tobytes())
+    scenario_count = len(size.scenarios) + len(data_set.ids)
+    assert len(starts) == scenario_count
 
 
 def test_a_repeated_season_has_the_same_bytes(
@@ -171,13 +190,15 @@ def test_a_repeated_season_has_the_same_bytes(
     result = run_season(folder, SEASON, root=root)
     assert result.predicted == [f"{NAME}, seed 0"]
     scores = "seasons/trial/scores.yaml"
-    assert (folder / scores).read_bytes() == (master.folder / scores).read_bytes()
+    expected = (master.folder / scores).read_bytes()
+    assert (folder / scores).read_bytes() == expected
 
 
 def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     """Unless that is asked for; the scores are the same."""
     saved = run_again(master)
-    assert (saved.predicted, saved.exit_code) == ([], 0)
+    assert saved.predicted == []
+    assert saved.exit_code == 0
     anew = run_again(master, again=True)
     assert anew.predicted == [f"{NAME}, seed 0"]
     assert anew.comparison is not None
@@ -199,13 +220,16 @@ def test_the_line_of_a_reproduced_entry_becomes_blind(own: ModelBoard) -> None:
     (row,) = season_rows(result.season, result.scores)
     # two public scenarios are too few for an interval, and nothing is recorded
     assert np.isnan(row.low)
-    assert record_blind(own.folder, result.season, [row]) == ()
+    recorded = record_blind(own.folder, result.season, [row])
+    assert recorded == ()
     assert read_verified(Folder(own.folder)) == {}
 
     rows = [replace(row, low=row.gap - 0.1, high=row.gap + 0.1)]
-    assert record_blind(own.folder, result.season, rows) == ()
+    recorded = record_blind(own.folder, result.season, rows)
+    assert recorded == ()
     reproduce(own.folder, [NAME], root=own.root, costs=False)
-    assert record_blind(own.folder, result.season, rows) == (NAME,)
+    recorded = record_blind(own.folder, result.season, rows)
+    assert recorded == (NAME,)
     line = read_verified(Folder(own.folder))[PATH]
     assert line.level is Level.BLIND
     assert line.blind is not None
@@ -252,9 +276,12 @@ def test_an_edited_season_is_found(
     text = path.read_text().replace(old, new)
     if new == "draw_seed: 0":
         start = text.index(new) + len(new)
-        text = text[: start + 63] + text[start + 64 :]
+        before = text[: start + 63]
+        after = text[start + 64 :]
+        text = before + after
     path.write_text(text)
-    assert [issue.check for issue in own.find().findings] == ["season"]
+    checks = [issue.check for issue in own.find().findings]
+    assert checks == ["season"]
 
 
 def test_other_models_and_other_scenarios_are_refused(
@@ -272,7 +299,8 @@ def test_other_models_and_other_scenarios_are_refused(
     shutil.rmtree(root / f"season.{SEASON}")
     with pytest.raises(DataError):
         run_again(replace(own, root=root))
-    shutil.copytree(season_root("twins", twins.root), root / f"season.{SEASON}")
+    season_of_twins = season_root("twins", twins.root)
+    shutil.copytree(season_of_twins, root / f"season.{SEASON}")
     with pytest.raises(DataError):
         run_again(replace(own, root=root))
 
@@ -289,7 +317,8 @@ def test_the_commands_say_what_is_wrong(
         ("season", "run", "nobody"),
         ("generate", "--season", "nobody"),
     ):
-        assert run(*words, *board).exit_code == 2, words
+        result = run(*words, *board)
+        assert result.exit_code == 2, words
     shown = run("season", "show", SEASON, "--markdown", "--board", own.folder)
     assert shown.exit_code == 0
     assert "gns" in shown.stdout

@@ -38,7 +38,8 @@ def run_board(
 ) -> ModelBoard:
     """A leaderboard of a set with shift, whose only model was run there."""
     folder = tmp_path_factory.mktemp("shift-board")
-    bench = make_bench(folder, tiny_split(SPLIT).root, SPLIT)
+    root = tiny_split(SPLIT).root
+    bench = make_bench(folder, root, SPLIT)
     result = score_on_shift(bench.folder, [NAME], root=bench.root)
     assert result.predicted == [f"{NAME}, seed 0"]
     return bench
@@ -66,10 +67,12 @@ def test_the_values_are_those_of_predict_and_score(
     )
     card = lagbench.score(path, root=run_board.root, workers=1)
     expected = card.scores[SUBMISSION][card.ranking]
-    (one,) = read_shift(Folder(run_board.folder))[PATH].models
+    line = read_shift(Folder(run_board.folder))[PATH]
+    (one,) = line.models
     assert one.model == file_sha256(run_board.weights)
     assert tuple(one.values) == expected.scenarios
-    assert list(one.values.values()) == pytest.approx(expected.values, rel=1e-6)
+    values = list(one.values.values())
+    assert values == pytest.approx(expected.values, rel=1e-6)
 
 
 def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:
@@ -77,12 +80,14 @@ def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:
     0.
     """
     (tab,) = collect(run_board.folder).tabs
-    references = shipped(load().size(SPLIT, "tiny").scored_on("shift"))
+    size = load().size(SPLIT, "tiny")
+    references = shipped(size.scored_on("shift"))
     assert references is not None
     best = None
     for row in tab.references:
         assert row.on_shift is not None
-        mean = references[row.name].scores[tab.ranking].mean
+        scores = references[row.name].scores
+        mean = scores[tab.ranking].mean
         assert row.on_shift.score.mean == pytest.approx(mean)
         if row.kind == "naive" and (best is None or mean < best):
             best = mean
@@ -103,7 +108,8 @@ def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:
 def test_the_command_runs_no_model_twice(own: ModelBoard) -> None:
     """What is recorded stays as it is, unless it is asked for again."""
     before = (own.folder / "shift.yaml").read_bytes()
-    assert score_on_shift(own.folder, root=own.root).predicted == []
+    result = score_on_shift(own.folder, root=own.root)
+    assert result.predicted == []
     assert (own.folder / "shift.yaml").read_bytes() == before
     again = score_on_shift(own.folder, [NAME], root=own.root, again=True)
     assert again.predicted == [f"{NAME}, seed 0"]
@@ -112,54 +118,73 @@ def test_the_command_runs_no_model_twice(own: ModelBoard) -> None:
     assert own.find(page=True).findings == ()
 
 
-def change_model(line: dict[str, Any]) -> None:
+Content = dict[str, Any]
+
+
+def change_model(line: Content) -> None:
     line["models"][0]["model"] = "0" * 64
 
 
-def change_data(line: dict[str, Any]) -> None:
+def change_data(line: Content) -> None:
     line["subset_sha256"] = "0" * 64
 
 
-def change_metric(line: dict[str, Any]) -> None:
+def change_metric(line: Content) -> None:
     line["metric"] = "position_rmse"
 
 
-def drop_scenario(line: dict[str, Any]) -> None:
+def drop_scenario(line: Content) -> None:
     line["models"][0]["values"].popitem()
 
 
-def repeat_seed(line: dict[str, Any]) -> None:
-    line["models"].append(line["models"][0])
+def repeat_seed(line: Content) -> None:
+    models = line["models"]
+    models.append(models[0])
 
 
-def add_key(line: dict[str, Any]) -> None:
+def add_key(line: Content) -> None:
     line["comment"] = "better"
+
+
+def checks_of(own: ModelBoard) -> list[str]:
+    """Return the names of the checks that find something."""
+    return [issue.check for issue in own.find().findings]
 
 
 @pytest.mark.parametrize(
     "change",
-    [change_model, change_data, change_metric, drop_scenario, repeat_seed, add_key],
+    [
+        change_model,
+        change_data,
+        change_metric,
+        drop_scenario,
+        repeat_seed,
+        add_key,
+    ],
 )
 def test_a_line_holds_for_its_models_and_data_only(
-    own: ModelBoard, change: Callable[[dict[str, Any]], None]
+    own: ModelBoard, change: Callable[[Content], None]
 ) -> None:
     """The check reports each other line."""
     own.edit(own.folder / "shift.yaml", lambda content: change(content[PATH]))
-    assert [issue.check for issue in own.find().findings] == ["shift"]
+    assert checks_of(own) == ["shift"]
 
 
 def test_a_line_of_no_entry_is_reported(own: ModelBoard) -> None:
     """An entry that is not there has no scores."""
-    own.edit(
-        own.folder / "shift.yaml",
-        lambda content: content.update({PATH.replace("gns", "gone"): content[PATH]}),
-    )
-    assert [issue.check for issue in own.find().findings] == ["shift"]
+
+    def copy_line(content: Content) -> None:
+        gone = PATH.replace("gns", "gone")
+        content[gone] = content[PATH]
+
+    own.edit(own.folder / "shift.yaml", copy_line)
+    assert checks_of(own) == ["shift"]
 
 
 def test_an_entry_that_is_replaced_loses_its_line(own: ModelBoard) -> None:
     """Predictions without the model have no scores on shift; the check is silent."""
-    own.submit(own.shifted(0.01), replace=True)
+    predictions = own.shifted(0.01)
+    own.submit(predictions, replace=True)
     assert read_shift(Folder(own.folder)) == {}
     assert own.find().findings == ()
 
@@ -168,8 +193,9 @@ def test_what_cannot_be_run_is_refused(
     own: ModelBoard, model_board: ModelBoard, tmp_path: Path
 ) -> None:
     """An unknown entry, a set without shift, and data that are not there."""
+    nobody = f"{SPLIT}/tiny/nobody"
     with pytest.raises(UsageError):
-        score_on_shift(own.folder, [f"{SPLIT}/tiny/nobody"], root=own.root)
+        score_on_shift(own.folder, [nobody], root=own.root)
     with pytest.raises(UsageError):
         score_on_shift(
             model_board.folder, ["curl-noise/tiny/gns"], root=model_board.root
@@ -178,7 +204,8 @@ def test_what_cannot_be_run_is_refused(
     with pytest.raises(DataError):
         score_on_shift(own.folder, [NAME], root=tmp_path / "nowhere")
     result = score_on_shift(own.folder, root=tmp_path / "nowhere")
-    assert [failure.entry for failure in result.failures] == [PATH]
+    entries = [failure.entry for failure in result.failures]
+    assert entries == [PATH]
     assert result.exit_code == DataError.exit_code
 
 
@@ -192,5 +219,6 @@ def test_the_command_writes_the_file(
     assert run(*words, NAME, "--all").exit_code == 2
     result = run(*words, NAME)
     assert result.exit_code == 0, result.output
-    content = yaml.safe_load((own.folder / "shift.yaml").read_text())
+    text = (own.folder / "shift.yaml").read_text()
+    content = yaml.safe_load(text)
     assert list(content) == [PATH]

@@ -38,7 +38,16 @@ IDENTITY = {
     "subset": "test",
     "seed": "s",
 }
-IDENTITY["parameters"] = {"dt": 0.002, "grid": 16, "name": "ä"}
+IDENTITY["parameters"] = {
+    "dt": 0.002,
+    "grid": 16,
+    "name": "ä",
+}
+
+
+def letters(count: int) -> tuple[str, ...]:
+    """Return names of dimensions."""
+    return tuple("abcdef"[:count])
 
 
 def digest(
@@ -52,10 +61,21 @@ def digest(
     hasher = VariableHasher(
         name,
         values.dtype,
-        dims or tuple("abcdef"[: values.ndim]),
+        dims or letters(values.ndim),
         values.shape,
     )
     hasher.update(values)
+    return hasher.hexdigest()
+
+
+def sha256(content: bytes) -> str:
+    """Return the hash of bytes."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def identity_hash(**changes: object) -> str:
+    """Return the hash of no variables under an identity with some changes."""
+    hasher = ContentHasher(IDENTITY | changes)
     return hasher.hexdigest()
 
 
@@ -66,30 +86,29 @@ def test_hashes_of_variables_by_hand() -> None:
     """
     header = b'{"dims":["frame"],"dtype":"float32","name":"x","shape":[2]}\n'
     data = bytes.fromhex("0000803f00000000")  # 1.0f, and 0.0f for -0.0f
-    expected = hashlib.sha256(header + data).hexdigest()
-    assert (
-        digest(np.array([1.0, -0.0], np.float32), name="x", dims=("frame",)) == expected
-    )
+    values = np.array([1.0, -0.0], np.float32)
+    assert digest(values, name="x", dims=("frame",)) == sha256(header + data)
     header = b'{"dims":["space"],"dtype":"string","name":"s","shape":[2]}\n'
-    expected = hashlib.sha256(header + "x\0ä".encode()).hexdigest()
+    expected = sha256(header + "x\0ä".encode())
     for kind in (None, object, np.dtypes.StringDType()):
-        assert digest(np.array(["x", "ä"], kind), name="s", dims=("space",)) == expected
+        texts = np.array(["x", "ä"], kind)
+        assert digest(texts, name="s", dims=("space",)) == expected
 
 
 def test_content_hash_by_hand() -> None:
     """The content hash is the SHA-256 of one JSON text."""
     values = np.array([1, 2], np.int32)
-    inner = hashlib.sha256(
-        b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n' + values.tobytes()
-    )
+    header = b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n'
+    variable_hash = sha256(header + values.tobytes())
     text = (
         '{"major":1,"parameters":{"dt":0.002,"grid":16,"name":"ä"},"scenario":3,"seed":"s","size":"tiny",'
-        f'"split":"cavity","subset":"test","variables":{{"v":"{inner.hexdigest()}"}}}}'
+        f'"split":"cavity","subset":"test","variables":{{"v":"{variable_hash}"}}}}'
     )
     hasher = ContentHasher(IDENTITY)
     hasher.declare("v", values.dtype, ("a",), values.shape)
     hasher.update("v", values)
-    assert hasher.hexdigest() == hashlib.sha256(text.encode()).hexdigest()
+    assert hasher.hexdigest() == sha256(text.encode())
+    # another one is another scenario
     for key in (
         "split",
         "size",
@@ -97,11 +116,8 @@ def test_content_hash_by_hand() -> None:
         "scenario",
         "subset",
         "seed",
-    ):  # another one is another scenario
-        assert (
-            ContentHasher({**IDENTITY, key: 7}).hexdigest()
-            != ContentHasher(IDENTITY).hexdigest()
-        )
+    ):
+        assert identity_hash(**{key: 7}) != identity_hash()
 
 
 @given(FLOATS, st.data())
@@ -110,7 +126,7 @@ def test_pieces_order_and_endianness_do_not_matter(
 ) -> None:
     """Any cut into pieces, memory order and byte order gives the hash of the whole."""
     cut = data.draw(st.integers(0, values.shape[0]))
-    dims = tuple("abcdef"[: values.ndim])
+    dims = letters(values.ndim)
     hasher = VariableHasher("position", values.dtype, dims, values.shape)
     hasher.update(values[:cut])
     big_endian = values.dtype.newbyteorder(">")
@@ -125,8 +141,10 @@ def test_any_change_of_a_value_changes_the_hash(
 ) -> None:
     """One flipped bit matters, except the sign of zero and what a NaN carries."""
     flat = values.reshape(-1).copy()
-    place = data.draw(st.integers(0, flat.size - 1))
-    bit = data.draw(st.integers(0, 8 * flat.itemsize - 1))
+    last_place = flat.size - 1
+    last_bit = 8 * flat.itemsize - 1
+    place = data.draw(st.integers(0, last_place))
+    bit = data.draw(st.integers(0, last_bit))
     before = flat[place].copy()
     bits = flat.view(f"<u{flat.itemsize}")
     unsigned = bits.dtype.type
@@ -134,12 +152,14 @@ def test_any_change_of_a_value_changes_the_hash(
     after = flat[place]
     are_zeros = before == 0 and after == 0
     are_nans = np.isnan(before) and np.isnan(after)
-    has_same_hash = digest(flat.reshape(values.shape)) == digest(values)
+    changed = flat.reshape(values.shape)
+    has_same_hash = digest(changed) == digest(values)
     assert has_same_hash == (are_zeros or are_nans)
     # The smallest integer is a value like any other, not a zero.
     whole = np.zeros((2, 3), np.int32)
     least = np.full((2, 3), -(2**31), np.int32)
-    assert len({digest(whole), digest(least), digest(whole + 1)}) == 3
+    hashes = {digest(whole), digest(least), digest(whole + 1)}
+    assert len(hashes) == 3
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
@@ -164,28 +184,38 @@ def test_name_type_dims_and_shape_matter(values: NDArray[Any]) -> None:
     with np.errstate(all="ignore"):
         wider = values.astype(np.float64)
     longer = values[None]
+    as_integers = values.reshape(-1).view(np.int32)
+    dims = letters(values.ndim)
     others = {
         digest(values, name="velocity"),
         digest(values, dims=tuple("zyxwvu"[: values.ndim])),
+        digest(wider),
+        digest(longer, dims=(*dims, "g")),
+        digest(as_integers.reshape(values.shape)),
     }
-    others |= {digest(wider), digest(longer, dims=(*"abcdef"[: values.ndim], "g"))}
-    others |= {digest(values.reshape(-1).view(np.int32).reshape(values.shape))}
     assert base not in others
     assert len(others) == 5
 
 
-@given(
-    st.lists(
-        st.text(st.characters(codec="utf-8", exclude_characters="\0")),
-        min_size=2,
-        max_size=5,
-    )
-)
+TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))
+
+
+@given(st.lists(TEXTS, min_size=2, max_size=5))
 def test_string_borders_matter(texts: list[str]) -> None:
     """Moving a letter from one string to the next changes the hash."""
-    moved = [texts[0] + texts[1], "", *texts[2:]]
-    same = moved == texts
-    assert (digest(np.array(moved, object)) == digest(np.array(texts, object))) == same
+    first, second, *others = texts
+    moved = [first + second, "", *others]
+    is_same = moved == texts
+    hash_of_moved = digest(np.array(moved, object))
+    hash_of_texts = digest(np.array(texts, object))
+    assert (hash_of_moved == hash_of_texts) == is_same
+
+
+NUMBERS = st.floats(
+    allow_nan=False,
+    allow_infinity=False,
+    allow_subnormal=False,
+)
 
 
 @given(
@@ -193,7 +223,7 @@ def test_string_borders_matter(texts: list[str]) -> None:
         st.text("abc", min_size=1, max_size=3),
         st.one_of(
             st.integers(-9, 9),
-            st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
+            NUMBERS,
             st.text("xyz", max_size=3),
         ),
         min_size=1,
@@ -204,36 +234,33 @@ def test_any_change_of_a_parameter_matters(
     parameters: dict[str, Any], data: st.DataObject
 ) -> None:
     """Name and value of each parameter enter; their order does not."""
-    hashed = ContentHasher({**IDENTITY, "parameters": parameters}).hexdigest()
+    expected = identity_hash(parameters=parameters)
     backwards = dict(reversed(parameters.items()))
-    assert ContentHasher({**IDENTITY, "parameters": backwards}).hexdigest() == hashed
-    name = data.draw(st.sampled_from(sorted(parameters)))
+    assert identity_hash(parameters=backwards) == expected
+    names = sorted(parameters)
+    name = data.draw(st.sampled_from(names))
     renamed = {**parameters, name + "d": parameters[name]}
     del renamed[name]
-    assert ContentHasher({**IDENTITY, "parameters": renamed}).hexdigest() != hashed
-    assert (
-        ContentHasher(
-            {**IDENTITY, "parameters": {**parameters, name: "other"}}
-        ).hexdigest()
-        != hashed
-    )
+    assert identity_hash(parameters=renamed) != expected
+    other_value = {**parameters, name: "other"}
+    assert identity_hash(parameters=other_value) != expected
 
 
 def test_variables_can_arrive_side_by_side() -> None:
     """Frames of two variables in turn hash as one variable after the other."""
     position = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
-    hashed = []
+    dims = ("frame", "particle", "space")
+    hashes = []
     for pieces in (position, position[None]):
         hasher = ContentHasher(IDENTITY)
         for name in ("velocity", "position"):
-            hasher.declare(
-                name, np.float32, ("frame", "particle", "space"), position.shape
-            )
+            hasher.declare(name, np.float32, dims, position.shape)
         for piece in pieces:
             hasher.update("position", piece)
             hasher.update("velocity", -piece)
-        hashed.append(hasher.hexdigest())
-    assert hashed[0] == hashed[1]
+        hashes.append(hasher.hexdigest())
+    first, second = hashes
+    assert first == second
 
 
 def test_values_must_fit_what_was_declared() -> None:
@@ -257,7 +284,15 @@ def test_values_must_fit_what_was_declared() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [float("nan"), float("inf"), "a\0b", None, {1, 2}, [float("nan")]]
+    "bad",
+    [
+        float("nan"),
+        float("inf"),
+        "a\0b",
+        None,
+        {1, 2},
+        [float("nan")],
+    ],
 )
 def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
     """Values that JSON cannot hold, or would hold ambiguously; those of NumPy become
@@ -274,9 +309,9 @@ def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
         -0.0,
         [np.float64(2)],
     ]
-    assert repr([to_plain(value) for value in given_values]) == repr(
-        [0.5, 3, "a", 1, -1, 0.0, [2.0]]
-    )
+    plain = [to_plain(value) for value in given_values]
+    expected = [0.5, 3, "a", 1, -1, 0.0, [2.0]]
+    assert repr(plain) == repr(expected)
 
 
 def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
@@ -287,20 +322,24 @@ def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
     known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert file_sha256(tmp_path / "f") == known
     lines = f"0002 {'a' * 64}\n0010 {'b' * 64}\n"
-    assert (
-        subset_hash({10: "b" * 64, 2: "a" * 64})
-        == hashlib.sha256(lines.encode()).hexdigest()
-    )
-    subsets = {"valid": "1" * 64, "train": "0" * 64, "test": "2" * 64}
+    hashes = {10: "b" * 64, 2: "a" * 64}
+    assert subset_hash(hashes) == sha256(lines.encode())
+    subsets = {
+        "valid": "1" * 64,
+        "train": "0" * 64,
+        "test": "2" * 64,
+    }
     text = (
         '{"major":1,"size":"tiny","split":"cavity","subsets":'
         f'{{"test":"{"2" * 64}",'
         f'"train":"{"0" * 64}",'
         f'"valid":"{"1" * 64}"}}}}'
     )
-    expected = hashlib.sha256(text.encode()).hexdigest()
+    expected = sha256(text.encode())
     assert dataset_hash("cavity", "tiny", 1, subsets) == expected
-    assert dataset_hash("cavity", "tiny", 1, {**subsets, "extra": "3" * 64}) == expected
+    with_extra = {**subsets, "extra": "3" * 64}
+    assert dataset_hash("cavity", "tiny", 1, with_extra) == expected
+    del subsets["valid"]
     with pytest.raises(DataError) as caught:
-        dataset_hash("cavity", "tiny", 1, {"train": "0" * 64, "test": "2" * 64})
+        dataset_hash("cavity", "tiny", 1, subsets)
     assert caught.value.where == "cavity tiny"

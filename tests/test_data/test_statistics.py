@@ -28,7 +28,8 @@ def test_by_hand() -> None:
     """
     x = np.array([[0, 0], [1, 3], [4, 4]], np.float32)
     frames = np.stack([x, np.full_like(x, 0.5)], axis=-1)
-    result = statistics([scenario_moments(frames)])
+    moments = scenario_moments(frames)
+    result = statistics([moments])
     assert result["position_mean"] == (2.0, 0.5)
     # mean of squares (1 + 9 + 16 + 16) / 6 = 7, minus 4
     assert result["position_std"] == (round_digits(3**0.5), 0.0)
@@ -37,18 +38,17 @@ def test_by_hand() -> None:
     assert result["acceleration_mean"] == (0.0, 0.0)
     assert result["acceleration_std"] == (2.0, 0.0)
     # One frame has no velocity: no statistic is invented for it.
-    short = scenario_moments(np.zeros((1, 4, 2), np.float32))
-    assert set(statistics([short])) == {"position_mean", "position_std"}
+    one_frame = np.zeros((1, 4, 2), np.float32)
+    short = scenario_moments(one_frame)
+    names = set(statistics([short]))
+    assert names == {"position_mean", "position_std"}
     longer = scenario_moments(frames_of(1, 6, 4))
-    assert (
-        statistics([short, longer])["velocity_std"]
-        == statistics([longer])["velocity_std"]
-    )
+    of_both = statistics([short, longer])
+    of_longer = statistics([longer])
+    assert of_both["velocity_std"] == of_longer["velocity_std"]
     # Nine significant digits, no negative zero.
-    assert [round_digits(x) for x in (1 / 3, -2.19123456789e-3)] == [
-        0.333333333,
-        -2.19123457e-3,
-    ]
+    assert round_digits(1 / 3) == 0.333333333
+    assert round_digits(-2.19123456789e-3) == -2.19123457e-3
     assert str(round_digits(-0.0)) == "0.0"
 
 
@@ -56,22 +56,20 @@ def test_against_numpy() -> None:
     """Several scenarios of unequal length agree with NumPy on the concatenated
     arrays.
     """
-    runs = [
-        frames_of(i, frames, 50).astype(np.float64)
-        for i, frames in enumerate((9, 4, 17))
-    ]
-    result = statistics(scenario_moments(run.astype(np.float32)) for run in runs)
+    runs = []
+    for scenario, frame_count in enumerate((9, 4, 17)):
+        runs.append(frames_of(scenario, frame_count, 50))
+    result = statistics([scenario_moments(run) for run in runs])
     for order, name in enumerate(("position", "velocity", "acceleration")):
-        values = np.concatenate(
-            [np.diff(run, n=order, axis=0).reshape(-1, 2) for run in runs]
-        )
-        assert_allclose(
-            result[f"{name}_mean"],
-            values.mean(axis=0),
-            rtol=1e-7,
-            atol=1e-12,
-        )
-        assert_allclose(result[f"{name}_std"], values.std(axis=0), rtol=1e-8)
+        differences = []
+        for run in runs:
+            difference = np.diff(run.astype(np.float64), n=order, axis=0)
+            differences.append(difference.reshape(-1, 2))
+        values = np.concatenate(differences)
+        mean = values.mean(axis=0)
+        std = values.std(axis=0)
+        assert_allclose(result[f"{name}_mean"], mean, rtol=1e-7, atol=1e-12)
+        assert_allclose(result[f"{name}_std"], std, rtol=1e-8)
 
 
 @settings(deadline=None)
@@ -80,12 +78,14 @@ def test_order_and_grouping_do_not_matter(order: list[int], groups: int) -> None
     """Any order gives the very same moments, any grouping over workers the same nine
     digits.
     """
-    runs = [scenario_moments(frames_of(i, 3 + i, 33)) for i in range(5)]
-    parts = [
-        combine([runs[i] for i in order[start::groups]]) for start in range(groups)
-    ]
-    assert statistics(parts) == statistics(runs)
-    assert combine([runs[i] for i in order]) == combine(runs)
+    moments = []
+    for scenario in range(5):
+        run = frames_of(scenario, 3 + scenario, 33)
+        moments.append(scenario_moments(run))
+    reordered = [moments[scenario] for scenario in order]
+    parts = [combine(reordered[start::groups]) for start in range(groups)]
+    assert statistics(parts) == statistics(moments)
+    assert combine(reordered) == combine(moments)
 
 
 @settings(deadline=None)
@@ -99,20 +99,25 @@ def test_means_do_not_depend_on_the_order_of_particles(
     run = frames_of(seed, 5, 64)
     whole = scenario_moments(run)
     permuted = scenario_moments(run[:, order])
-    assert {n: m.total for n, m in whole.items()} == {
-        n: m.total for n, m in permuted.items()
-    }
+    assert whole.keys() == permuted.keys()
+    for name, moments in whole.items():
+        assert permuted[name].total == moments.total
 
 
 def test_files_give_the_same_as_arrays(tmp_path: Path) -> None:
     """Streaming stored frames gives the digits of the frames in memory, whatever the
     block.
     """
-    paths = [
-        write_scenario(tmp_path, make_key(i), frames=3 + i, particles=9000)[0]
-        for i in (0, 1)
-    ]
-    expected = statistics(scenario_moments(frames_of(i, 3 + i, 9000)) for i in (0, 1))
+    paths = []
+    moments = []
+    for scenario in (0, 1):
+        frame_count = 3 + scenario
+        key = make_key(scenario)
+        path, _ = write_scenario(tmp_path, key, frames=frame_count, particles=9000)
+        paths.append(path)
+        run = frames_of(scenario, frame_count, 9000)
+        moments.append(scenario_moments(run))
+    expected = statistics(moments)
     assert file_statistics(paths) == expected
     with pytest.raises(DataError):
         file_statistics([])

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import pytest
 from score_bench import ScoreBench
@@ -36,23 +37,28 @@ PAGES = [CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md"))]
 
 def blocks(text: str, language: str) -> list[str]:
     """Return the code blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    block = rf"^```{language}\n(.*?)^```"
+    return re.findall(block, text, re.MULTILINE | re.DOTALL)
 
 
 def run_program(text: str, root: Path, folder: Path) -> str:
     """Run a program in a folder, the data sets under a root; return what it prints."""
-    where = {**os.environ, "LAGBENCH_ROOT": str(root), "OMP_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "LAGBENCH_ROOT": str(root),
+        "OMP_NUM_THREADS": "1",
+    }
     command = [sys.executable, "-c", text]
-    done = subprocess.run(
+    result = subprocess.run(
         command,
         cwd=folder,
-        env=where,
+        env=environment,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 @pytest.mark.slow
@@ -66,8 +72,9 @@ def test_the_readme_program_beats_the_best_floor(tmp_path: Path) -> None:
     printed = run_program(program, tmp_path, tmp_path)
     assert printed.strip().endswith("over persistence")
     assert "\r" not in printed
-    scores = json.loads((tmp_path / "predictions" / "scores.json").read_text())
-    assert scores["skill"]["interval"][0] > 0.1
+    text = (tmp_path / "predictions" / "scores.json").read_text()
+    low, _ = json.loads(text)["skill"]["interval"]
+    assert low > 0.1
 
 
 @pytest.mark.slow
@@ -79,12 +86,15 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     nbformat = pytest.importorskip("nbformat")
     nbclient = pytest.importorskip("nbclient")
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    client = nbclient.NotebookClient(
-        notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}
-    )
+    resources = {"metadata": {"path": str(tmp_path)}}
+    client = nbclient.NotebookClient(notebook, timeout=600, resources=resources)
     client.execute()
-    shown = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    assert "True" in [output.get("data", {}).get("text/plain") for output in shown]
+    texts = []
+    for cell in notebook.cells:
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            texts.append(data.get("text/plain"))
+    assert "True" in texts
     assert (tmp_path / "predictions" / "scores.json").is_file()
     assert (tmp_path / "truth.gif").read_bytes().startswith(b"GIF89a")
 
@@ -97,11 +107,15 @@ def test_the_quickstart_programs_run(
     stated number comes out.
     """
     root = tiny_split("cavity").root
-    programs = blocks((CLONE / "docs" / "quickstart.md").read_text(), "python")
+    text = (CLONE / "docs" / "quickstart.md").read_text()
+    programs = blocks(text, "python")
     stated = re.findall(r"# (0\.\d+)$", programs[0], re.MULTILINE)
-    assert run_program("\n".join(programs), root, tmp_path).splitlines()[0] == stated[0]
+    printed = run_program("\n".join(programs), root, tmp_path)
+    first_line, *_ = printed.splitlines()
+    assert first_line == stated[0]
     assert len(programs) == 3
-    assert lagbench.validate(tmp_path / "fading.nc", root=root).valid
+    result = lagbench.validate(tmp_path / "fading.nc", root=root)
+    assert result.valid
 
 
 def test_every_command_of_the_pages_exists() -> None:
@@ -110,28 +124,29 @@ def test_every_command_of_the_pages_exists() -> None:
     """
     commands = dict(get_command(app).commands)  # type: ignore[attr-defined]
     for page in PAGES:
-        for line in "\n".join(
-            blocks(page.read_text(), "(?:bash|console)")
-        ).splitlines():
-            words = line.removeprefix("$ ").partition("#")[0].split()
+        shell_blocks = blocks(page.read_text(), "(?:bash|console)")
+        for line in "\n".join(shell_blocks).splitlines():
+            code, _, _ = line.removeprefix("$ ").partition("#")
+            words = code.split()
             if not words or words[0] != "lagbench":
                 continue
             command = commands[words[1]]
             if hasattr(command, "commands"):
                 command = command.commands[words[2]]
-            known = {
-                option
-                for parameter in command.loaded.params
-                for option in parameter.opts
-            }
-            given = {word.partition("=")[0] for word in words if word.startswith("-")}
-            assert given <= known | {"--help"}, f"{page.name}: {line}"
+            options = {"--help"}
+            for parameter in command.loaded.params:
+                options.update(parameter.opts)
+            for word in words:
+                if word.startswith("-"):
+                    option, _, _ = word.partition("=")
+                    assert option in options, f"{page.name}: {line}"
 
 
 def test_the_links_of_the_pages_lead_somewhere() -> None:
     """Every file that a page of ours links is there."""
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        text = page.read_text()
+        for target in re.findall(r"\]\(([^)#\s]+)", text):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
 
@@ -152,11 +167,14 @@ def test_what_is_stored_is_small() -> None:
     """The notebook has no outputs and no counts; on a slow line the film's reader waits
     for at most 1 MB.
     """
-    assert (CLONE / "docs" / "figures" / "film.gif").stat().st_size <= 1_000_000
+    film = CLONE / "docs" / "figures" / "film.gif"
+    assert film.stat().st_size <= 1_000_000
     cells = json.loads(NOTEBOOK.read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert len(code) > 5
-    assert not any(cell["outputs"] or cell["execution_count"] for cell in code)
+    for cell in code:
+        assert not cell["outputs"]
+        assert not cell["execution_count"]
 
 
 TEXT = (CLONE / "docs" / "scoring.md").read_text()
@@ -175,7 +193,9 @@ def test_every_metric_stands_in_the_table() -> None:
         )
     page = TEXT[TEXT.index("## Metrics") :]
     five_columns = r"^\| `(?:[^|\n]*\|){5}$"
-    rows = [row.group() for row in re.finditer(five_columns, page, re.MULTILINE)]
+    rows = []
+    for row in re.finditer(five_columns, page, re.MULTILINE):
+        rows.append(row.group())
     assert rows == expected
 
 
@@ -188,8 +208,10 @@ def test_thresholds_of_the_flags() -> None:
     assert "less than a quarter of the error" in TEXT
     assert flags.GROWTH == 2.0
     assert "less than twice the first frame's" in TEXT
-    assert f"outside {flags.ENERGY[0]:g} to {flags.ENERGY[1]:g} times" in TEXT
-    assert f"outside {flags.OCCUPANCY[0]:g} to {flags.OCCUPANCY[1]:g} times" in TEXT
+    low, high = flags.ENERGY
+    assert f"outside {low:g} to {high:g} times" in TEXT
+    low, high = flags.OCCUPANCY
+    assert f"outside {low:g} to {high:g} times" in TEXT
     assert flags.TWIN_REGULAR == 0.1
     assert "more than a tenth of the RMSE of `persistence`" in TEXT
 
@@ -198,17 +220,20 @@ def test_every_option_of_score_is_described() -> None:
     """The table of options holds all that `lagbench score` has, and none that it has
     not.
     """
-    table = TEXT[
-        TEXT.index("| option | does |") : TEXT.index("Several files are scored")
-    ]
-    cells = "".join(
-        line.split("|")[1] for line in table.splitlines() if line.startswith("| `")
-    )
+    start = TEXT.index("| option | does |")
+    end = TEXT.index("Several files are scored")
+    described = set()
+    for line in TEXT[start:end].splitlines():
+        if line.startswith("| `"):
+            _, cell, *_ = line.split("|")
+            described.update(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cell))
     score = get_command(app).commands["score"].loaded  # type: ignore[attr-defined]
-    options = {name for p in score.params for name in p.opts if name.startswith("-")}
-    assert set(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cells)) == options - {
-        "--help"
-    }
+    options = set()
+    for parameter in score.params:
+        for option in parameter.opts:
+            if option.startswith("-"):
+                options.add(option)
+    assert described == options - {"--help"}
 
 
 @pytest.fixture
@@ -239,7 +264,9 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
         root=tmp_path,
     ) as test:
         height = test.position.sel(space="y").mean("particle")
-        assert (height.isel(frame=-1) < 0.8 * height.isel(frame=0)).all()
+        first = height.isel(frame=0)
+        last = height.isel(frame=-1)
+        assert (last < 0.8 * first).all()
 
 
 def test_sage_is_a_baseline_and_enstrophy_a_metric(
@@ -255,7 +282,11 @@ def test_sage_is_a_baseline_and_enstrophy_a_metric(
     assert enstrophy.METRICS.name == "enstrophy_error"
     assert enstrophy.METRICS.name not in METRICS
     install(monkeypatch, sage=sage.Sage)
-    options = {"root": bench.root, "registry": bench.registry, "threads": 1}
+    options: dict[str, Any] = {
+        "root": bench.root,
+        "registry": bench.registry,
+        "threads": 1,
+    }
     run = tmp_path / "run"
     settings = ["training.steps=2"]
     trained = train(

@@ -43,13 +43,16 @@ recipes:
 def vortices(position: Floats) -> Floats:
     """Return the velocity of Taylor-Green vortices at rest [length/frame]."""
     x, y = 2.0 * math.pi * position.T
-    return VORTEX * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y)], axis=1)
+    u = np.sin(x) * np.cos(y)
+    v = -np.cos(x) * np.sin(y)
+    return VORTEX * np.stack([u, v], axis=1)
 
 
 def carried(side: int) -> NDArray[np.float32]:
     """Return particles in vortices that drift through the ends of the square."""
     axis = (np.arange(side) + 0.5) / side
-    x = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    grid = np.meshgrid(axis, axis, indexing="ij")
+    x = np.stack(grid, axis=-1).reshape(-1, 2)
     frames = []
     for frame in range(FRAMES):
         frames.append((x + frame * DRIFT) % 1.0)
@@ -57,7 +60,8 @@ def carried(side: int) -> NDArray[np.float32]:
         x = x + vortices(half)
     wrapped = np.asarray(np.stack(frames), np.float32)
     # A coordinate may round up to the end of the period, which is its start.
-    return np.where(wrapped >= 1.0, np.float32(0.0), wrapped)
+    zero = np.float32(0.0)
+    return np.where(wrapped >= 1.0, zero, wrapped)
 
 
 def write_set(folder: Path) -> Path:
@@ -67,9 +71,10 @@ def write_set(folder: Path) -> Path:
         with h5py.File(folder / f"{subset}.h5", "w") as file:
             for number, side in enumerate(SIDES[subset]):
                 position = carried(side)
+                particle_count = position.shape[1]
                 group = file.create_group(f"{number:05d}")
                 group["position"] = position
-                group["particle_type"] = np.zeros(position.shape[1], np.int64)
+                group["particle_type"] = np.zeros(particle_count, np.int64)
     changes = {
         "bounds": [[0.0, 1.0], [0.0, 1.0]],
         "sequence_length": FRAMES,
@@ -100,6 +105,20 @@ def ids_of_test(made: LocalSplit) -> dict[int, int]:
     return dict(zip(ids, SIDES["test"], strict=True))
 
 
+def score_predictions(made: LocalSplit, path: Path) -> ScoreCard:
+    """Return the scores of valid predictions."""
+    root = made.folder.parent
+    validated = lagbench.validate(path, root=root, isolated=False)
+    assert validated.valid
+    return lagbench.score(
+        path,
+        root=root,
+        write=False,
+        workers=1,
+        validated=validated,
+    )
+
+
 def score_of(
     made: LocalSplit,
     positions: dict[int, NDArray[np.float32]],
@@ -107,11 +126,16 @@ def score_of(
 ) -> ScoreCard:
     """Return the scores of predictions."""
     path = folder / "predictions.nc"
-    root = made.folder.parent
     lagbench.submission.write(path, positions, split=made.folder, method="trivial")
-    validated = lagbench.validate(path, root=root, isolated=False)
-    assert validated.valid
-    return lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+    return score_predictions(made, path)
+
+
+def position_errors(card: ScoreCard) -> dict[str, float]:
+    """Return the mean error of positions of the submission and of references."""
+    errors = {}
+    for name, scores in card.scores.items():
+        errors[name] = scores["position_rmse"].mean
+    return errors
 
 
 def test_the_box_and_the_numbers_of_particles_are_theirs(made: LocalSplit) -> None:
@@ -128,8 +152,9 @@ def test_positions_adopted_with_the_same_axes_are_the_same(
     paths: list[Path] = []
     for subset in SUBSETS:
         for side in SIDES[subset]:
-            paths.append(tmp_path / f"run{len(paths)}.npy")
-            np.save(paths[-1], carried(side))
+            path = tmp_path / f"run{len(paths)}.npy"
+            np.save(path, carried(side))
+            paths.append(path)
     own = adopt(
         paths,
         output=tmp_path / "own",
@@ -160,10 +185,12 @@ def test_a_particle_that_crosses_the_boundary_costs_no_error(
     moved = {}
     crossing_count = 0
     for number, side in ids_of_test(made).items():
-        truth[number] = carried(side)[GIVEN:]
+        run = carried(side)
+        truth[number] = run[GIVEN:]
         shifted = truth[number].astype(np.float64) + SHIFT
         crossing_count += int((shifted >= 1.0).sum())
-        moved[number] = (shifted % 1.0).astype(np.float32)
+        wrapped = shifted % 1.0
+        moved[number] = wrapped.astype(np.float32)
     assert crossing_count > 100
 
     perfect = score_of(made, truth, tmp_path)
@@ -172,11 +199,12 @@ def test_a_particle_that_crosses_the_boundary_costs_no_error(
     near = score_of(made, moved, tmp_path)
     # mean squares over axes: one of two is moved
     square = float(SHIFT @ SHIFT) / 2.0
-    assert near.submission["position_mse"].mean == pytest.approx(square, rel=1e-4)
-    root = math.sqrt(square)
-    assert near.submission["position_rmse"].mean == pytest.approx(root, rel=1e-4)
+    mse = near.submission["position_mse"].mean
+    assert mse == pytest.approx(square, rel=1e-4)
+    rmse = near.submission["position_rmse"].mean
+    assert rmse == pytest.approx(math.sqrt(square), rel=1e-4)
     # The references reach across the ends too: a drift is what a velocity predicts.
-    errors = {name: row["position_rmse"].mean for name, row in near.scores.items()}
+    errors = position_errors(near)
     assert errors["constant-velocity"] < 0.3 * errors["persistence"]
     assert near.skill is not None
 
@@ -203,10 +231,7 @@ def test_a_few_steps_of_training_are_scored(
     root = made.folder.parent
     path = tmp_path / "predictions.nc"
     predict(trained.weights, path, root=root)
-    validated = lagbench.validate(path, root=root, isolated=False)
-    assert validated.valid
-    card = lagbench.score(path, root=root, write=False, workers=1, validated=validated)
-    errors = {name: row["position_rmse"].mean for name, row in card.scores.items()}
+    errors = position_errors(score_predictions(made, path))
     # An untrained model keeps velocities; it loses no particle at the ends.
     assert errors["submission"] < errors["persistence"]
 
@@ -214,9 +239,10 @@ def test_a_few_steps_of_training_are_scored(
 def test_metadata_without_the_axes_are_refused(tmp_path: Path) -> None:
     """Particles that jump through the box are no data between walls."""
     folder = write_set(tmp_path / "theirs")
-    metadata = json.loads((folder / "metadata.json").read_text())
+    path = folder / "metadata.json"
+    metadata = json.loads(path.read_text())
     metadata["periodic_boundary_conditions"] = [False, False]
-    (folder / "metadata.json").write_text(json.dumps(metadata))
+    path.write_text(json.dumps(metadata))
     with pytest.raises(lagbench.errors.DataError) as caught:
         import_split(folder, format="lagrangebench-h5", output=tmp_path / "walls")
     assert "--periodic" in str(caught.value.fix)

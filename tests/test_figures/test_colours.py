@@ -33,15 +33,19 @@ CVD_ROWS = {
 row.
 """
 
-CVD = {
-    name: np.array(rows.split(), np.float64).reshape(3, 3)
-    for name, rows in CVD_ROWS.items()
-}
+CVD = {}
 """The matrix of a colour vision deficiency on linear RGB."""
+for deficiency_name, row_text in CVD_ROWS.items():
+    numbers = np.array(row_text.split(), np.float64)
+    CVD[deficiency_name] = numbers.reshape(3, 3)
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 TO_XYZ = np.array(
-    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    [
+        [0.4124, 0.3576, 0.1805],
+        [0.2126, 0.7152, 0.0722],
+        [0.0193, 0.1192, 0.9505],
+    ]
 )
 D65 = np.array([0.9505, 1.0, 1.089])
 
@@ -51,26 +55,37 @@ def linear_rgb(colour: str) -> Colour:
     digits = colour.removeprefix("#")
     if len(digits) == 3:
         digits = "".join(2 * digit for digit in digits)
-    srgb = np.frombuffer(bytes.fromhex(digits), np.uint8) / 255.0
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    content = np.frombuffer(bytes.fromhex(digits), np.uint8)
+    srgb = content / 255.0
+    bright = ((srgb + 0.055) / 1.055) ** 2.4
+    return np.where(srgb <= 0.04045, srgb / 12.92, bright)
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of a colour."""
+    return float(linear_rgb(colour) @ LUMINANCE)
 
 
 def contrast(first: str, second: str) -> float:
     """Return the contrast ratio of WCAG 2, of relative luminances."""
-    luminances = [float(linear_rgb(colour) @ LUMINANCE) for colour in (first, second)]
-    return (max(luminances) + 0.05) / (min(luminances) + 0.05)
+    luminances = (luminance(first), luminance(second))
+    brighter = max(luminances) + 0.05
+    darker = min(luminances) + 0.05
+    return brighter / darker
 
 
 def lab(colour: Colour) -> Colour:
     """Return CIE L*a*b* under D65 of a colour in linear RGB."""
     xyz = TO_XYZ @ np.clip(colour, 0, 1) / D65
-    f = np.cbrt(np.maximum(xyz, 1e-4))
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+    x, y, z = np.cbrt(np.maximum(xyz, 1e-4))
+    lightness = 116 * y - 16
+    return np.array([lightness, 500 * (x - y), 200 * (y - z)])
 
 
 def test_all_schemes_name_the_same_colours() -> None:
     """A variable that is missing in one scheme would show the colour of another."""
-    assert set(LIGHT) == set(DARK) == set(PRINT)
+    assert set(LIGHT) == set(DARK)
+    assert set(LIGHT) == set(PRINT)
     rules = format_schemes()
     for colours in (LIGHT, DARK, PRINT):
         for name, colour in colours.items():
@@ -84,12 +99,16 @@ def test_text_can_be_read_and_speeds_are_ordered(scheme: str) -> None:
     The faster an arrow, the farther it is from the background.
     """
     colours = SCHEMES[scheme]
-    ratios = [contrast(colours[f"q{k}"], colours["paper"]) for k in range(6)]
+    ratios = []
+    for number in range(6):
+        ratio = contrast(colours[f"q{number}"], colours["paper"])
+        ratios.append(ratio)
     assert ratios[0] > 1.3
     assert ratios == sorted(ratios)
     for background in ("paper", "card"):
         for name in ("ink", "soft", "muted", "accent", "good", "warn", "bad"):
-            assert contrast(colours[name], colours[background]) >= 4.5, name
+            ratio = contrast(colours[name], colours[background])
+            assert ratio >= 4.5, name
         for number in range(6):
             ratio = contrast(colours[f"c{number}"], colours[background])
             assert ratio >= 2.6, number
@@ -122,7 +141,8 @@ def test_materials_stay_apart(deficiency: str) -> None:
     seen = []
     for colour in MATERIAL_COLOURS:
         linear = np.clip(CVD[deficiency] @ linear_rgb(colour), 0.0, 1.0)
+        dark = 12.92 * linear
         bright = 1.055 * linear ** (1 / 2.4) - 0.055
-        seen.append(np.where(linear <= 0.0031308, 12.92 * linear, bright))
+        seen.append(np.where(linear <= 0.0031308, dark, bright))
     for first, second in itertools.combinations(seen, 2):
         assert np.linalg.norm(first - second) > 0.2

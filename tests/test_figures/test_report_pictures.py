@@ -29,26 +29,36 @@ OPAQUE = 255
 
 def read_pixels(png: bytes) -> NDArray[np.uint8]:
     """Return a PNG as red, green, blue and opacity, read by Pillow."""
-    return np.asarray(Image.open(io.BytesIO(png)).convert("RGBA"))
+    image = Image.open(io.BytesIO(png))
+    return np.asarray(image.convert("RGBA"))
 
 
 def test_signed_maps_are_blue_below_zero_and_vermilion_above() -> None:
     """Zero is clear, no value is grey; x goes right, y up."""
-    field = np.array([[-1.0, 0.0], [0.5, np.nan]])  # [x, y]
+    # [x, y]
+    field = np.array(
+        [
+            [-1.0, 0.0],
+            [0.5, np.nan],
+        ]
+    )
     shown = read_pixels(draw_diverging_map(field, 1.0))
     assert shown.shape == (2, 2, 4)
+    half_opaque = round(OPAQUE * 0.5)
     top_left, top_right = shown[0]
     lower_left, lower_right = shown[1]
     assert top_left[3] == 0
     assert top_right.tolist() == GREY
     assert lower_left.tolist() == [*BLUE, OPAQUE]
-    assert lower_right.tolist() == [*VERMILION, round(OPAQUE * 0.5)]
+    assert lower_right.tolist() == [*VERMILION, half_opaque]
 
 
 def test_values_beyond_the_limit_have_its_colour() -> None:
     """Even an infinite value does."""
-    shown = read_pixels(draw_diverging_map(np.full((1, 1), np.inf), 1.0))
-    assert shown[0, 0].tolist() == [*VERMILION, OPAQUE]
+    field = np.full((1, 1), np.inf)
+    shown = read_pixels(draw_diverging_map(field, 1.0))
+    pixel = shown[0, 0]
+    assert pixel.tolist() == [*VERMILION, OPAQUE]
 
 
 def test_opacity_of_magnitudes_grows_up_to_the_limit() -> None:
@@ -57,13 +67,18 @@ def test_opacity_of_magnitudes_grows_up_to_the_limit() -> None:
     shown = read_pixels(draw_sequential_map(magnitudes, 1.0))
     opacity = shown[0, :, 3].astype(int)
     assert opacity[0] == 0
-    assert (np.diff(opacity) >= 0).all()
-    assert (opacity[LEVELS // 2 :] == OPAQUE).all()
+    steps = np.diff(opacity)
+    assert (steps >= 0).all()
+    beyond_the_limit = opacity[LEVELS // 2 :]
+    assert (beyond_the_limit == OPAQUE).all()
 
 
 def test_particles_are_discs_of_their_material() -> None:
     """Discs lie at the places of the particles; those outside are not drawn."""
-    position = np.array([[0.25, 0.75], [0.75, 0.25], [1.5, 0.5]])
+    in_first_quarter = [0.25, 0.75]
+    in_last_quarter = [0.75, 0.25]
+    outside = [1.5, 0.5]
+    position = np.array([in_first_quarter, in_last_quarter, outside])
     material = np.array([0, 3, 1])
     unit_square = ((0.0, 1.0), (0.0, 1.0))
     png = draw_materials(position, material, view=unit_square, spacing=0.1)
@@ -71,8 +86,10 @@ def test_particles_are_discs_of_their_material() -> None:
     assert shown.shape == (SIDE, SIDE, 4)
     near = SIDE // 4
     far = 3 * SIDE // 4
-    assert shown[near, near].tolist() == [*BLUE, OPAQUE]
-    assert shown[far, far].tolist() == [*ORANGE, OPAQUE]
+    liquid = shown[near, near]
+    assert liquid.tolist() == [*BLUE, OPAQUE]
+    rope = shown[far, far]
+    assert rope.tolist() == [*ORANGE, OPAQUE]
     radius = 0.5 * 1.25 * 0.1 * SIDE
     disc_area = math.pi * radius**2
     covered = shown[..., 3].sum() / OPAQUE
@@ -81,10 +98,12 @@ def test_particles_are_discs_of_their_material() -> None:
 
 def test_arrows_point_along_their_velocity() -> None:
     """The shaft is centred on its node; a short arrow is a dot."""
-    shaft, head = arrow_data(50.0, 50.0, 20.0, 0.0).split("M")[1:]
+    _, shaft, head = arrow_data(50.0, 50.0, 20.0, 0.0).split("M")
     assert shaft == "40 50L60 50"
-    assert head.split("L")[1] == "60 50"
-    assert arrow_data(50.0, 50.0, 0.1, 0.0) == "M50 50h0"
+    _, tip, *_ = head.split("L")
+    assert tip == "60 50"
+    dot = arrow_data(50.0, 50.0, 0.1, 0.0)
+    assert dot == "M50 50h0"
 
 
 def test_histogram_shares_within_the_truths_range_are_those_of_numpy() -> None:
@@ -98,12 +117,14 @@ def test_histogram_shares_within_the_truths_range_are_those_of_numpy() -> None:
     assert shares.sum() == pytest.approx(100.0)
     counts, _ = np.histogram(guess, edges)
     expected = 100.0 * counts / 500
-    assert_allclose(shares[1:-1], expected[1:-1])
+    inside = shares[1:-1]
+    assert_allclose(inside, expected[1:-1])
     assert shares[0] > expected[0]
     assert shares[-1] > expected[-1]
 
 
 def test_no_values_have_no_shares() -> None:
     """Without nodes every bin is empty."""
-    _, shares = histogram_shares(np.array([]), np.array([]))
+    nothing = np.array([])
+    _, shares = histogram_shares(nothing, nothing)
     assert shares.sum() == 0.0

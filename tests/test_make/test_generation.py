@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 from conftest import PAINT_PICTURES, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 from numpy.testing import assert_array_equal
+from numpy.typing import NDArray
 
 from lagbench.data import WALLS
 from lagbench.data.manifest import Manifest, read_manifest
@@ -52,9 +54,10 @@ def manifest_of(root: Path, split: str = SPLIT) -> Manifest:
 
 def contents(root: Path) -> dict[str, bytes]:
     """Return name and bytes of every scenario file."""
-    return {
-        path.name: path.read_bytes() for path in sorted(folder_of(root).glob("*/*.nc"))
-    }
+    files = {}
+    for path in sorted(folder_of(root).glob("*/*.nc")):
+        files[path.name] = path.read_bytes()
+    return files
 
 
 def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
@@ -63,11 +66,18 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
     """
     subsets = {}
     for subset in ("train", "valid", "test"):
-        paths = sorted((generated.folder / subset).glob("*.nc"))
-        lines = "".join(f"{path.stem} {content_hash(path)}\n" for path in paths)
+        lines = ""
+        for path in sorted((generated.folder / subset).glob("*.nc")):
+            lines += f"{path.stem} {content_hash(path)}\n"
         subsets[subset] = hashlib.sha256(lines.encode()).hexdigest()
-    whole = dumps({"split": SPLIT, "size": SIZE, "major": 2, "subsets": subsets})
-    assert generated.dataset_sha256 == hashlib.sha256(whole).hexdigest()
+    whole = {
+        "split": SPLIT,
+        "size": SIZE,
+        "major": 2,
+        "subsets": subsets,
+    }
+    expected = hashlib.sha256(dumps(whole)).hexdigest()
+    assert generated.dataset_sha256 == expected
     assert generated.simulated == (0, 1, 2, 3, 4)
     assert generated.kept == ()
     assert generated.missing == ()
@@ -75,8 +85,10 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
     assert "nothing to compare with" in generated.verdict
     # Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no
     # temporary file.
-    files = [path for path in generated.folder.rglob("*") if path.is_file()]
-    names = {str(path.relative_to(generated.folder)) for path in files}
+    names = set()
+    for path in generated.folder.rglob("*"):
+        if path.is_file():
+            names.add(str(path.relative_to(generated.folder)))
     scenarios = {
         "train/0000.nc",
         "train/0001.nc",
@@ -111,8 +123,10 @@ def test_a_file_holds_what_its_scenario_says(
     assert_array_equal(velocity, state.velocity.astype(np.float32))
     assert_array_equal(material, state.material)
     words = [int(word) for word in header.seed.split(", ")]
-    again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
-    assert again.random() == generator(SPLIT, SIZE, 2, 3).random()
+    sequence = np.random.SeedSequence(words)
+    from_seed = np.random.Generator(np.random.PCG64(sequence))
+    own = generator(SPLIT, SIZE, 2, 3)
+    assert from_seed.random() == own.random()
     assert header.parameters["frequency"] == 2
     assert header.parameters["start_frame"] == 0
     assert header.parameters["modulus"] == size.value("modulus")
@@ -125,30 +139,37 @@ def test_cavity_files_hold_the_walls_of_every_frame(
     where recording starts.
     """
     state = draw_initial_state(load().size("cavity", "tiny"), 3)
-    with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
+    folder = tiny_split("cavity").folder
+    with read_scenario(folder / "test" / "0003.nc") as file:
         walls = file.read("wall_velocity")
         start = file.header.parameters["start_frame"]
         assert "active_frames" not in file.header.parameters
     assert start == state.start_frame
-    assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
-    assert (
-        len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0))
-        > 13
-    )
+    expected = state.wall_velocity[-26:].astype(np.float32)
+    assert_array_equal(walls, expected)
+    wall = str(state.parameters["wall"])
+    velocities = walls[:, WALLS.index(wall)]
+    assert len(np.unique(velocities, axis=0)) > 13
 
 
 def test_active_frames_end_when_little_energy_is_left() -> None:
     """Two frames given, six to predict: the last above 1 % counts, later peaks beyond
     the horizon do not.
     """
-    task = (
-        load()
-        .size("fluid", "tiny")
-        .task.model_copy(update={"input_frames": 2, "horizon": 6})
-    )
-    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05, 0.02, 90.0], task) == 6
-    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.0199, 0.1, 0.0199, 0.0, 0.5], task) == 4
-    assert active_frames([1.0, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], task) == 0
+    changes = {"input_frames": 2, "horizon": 6}
+    task = load().size("fluid", "tiny").task.model_copy(update=changes)
+    for energies, expected in (
+        ([1.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05, 0.02, 90.0], 6),
+        ([1.0, 2.0, 1.0, 0.5, 0.0199, 0.1, 0.0199, 0.0, 0.5], 4),
+        ([1.0, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 0),
+    ):
+        assert active_frames(energies, task) == expected
+
+
+def square_speeds(velocity: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the sum of squared speeds of each frame."""
+    squares = velocity.astype(np.float64) ** 2
+    return np.sum(squares, axis=(1, 2))
 
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
@@ -158,17 +179,17 @@ def test_active_frames_stand_in_the_file_and_its_hash(
     """They follow from the stored velocities; another number is another content
     hash.
     """
-    shutil.copytree(tiny_split(split).folder / "test", tmp_path / "test")
+    test_files = tmp_path / "test"
+    shutil.copytree(tiny_split(split).folder / "test", test_files)
     task = load().size(split, "tiny").task
-    for path in sorted((tmp_path / "test").glob("*.nc")):
+    for path in sorted(test_files.glob("*.nc")):
         with read_scenario(path) as file:
-            energy = (file.read("velocity").astype(np.float64) ** 2).sum(axis=(1, 2))
+            energy = square_speeds(file.read("velocity"))
             stated = file.header.parameters["active_frames"]
         span = energy[: task.input_frames + task.horizon]
-        assert (
-            stated
-            == np.flatnonzero(span >= 0.01 * span.max())[-1] + 1 - task.input_frames
-        )
+        is_active = span >= 0.01 * span.max()
+        last_active = np.flatnonzero(is_active)[-1]
+        assert stated == last_active + 1 - task.input_frames
         check_scenario(path)
         with h5py.File(path, "r+") as raw:
             raw.attrs.modify("active_frames", stated + 1)
@@ -188,9 +209,9 @@ def test_facts_of_the_manifest_follow_from_the_files(
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
     for entry in manifest_of(generated.root).files:
         with read_scenario(generated.folder / entry.path) as file:
-            velocity = file.read("velocity").astype(np.float64)
+            velocity = file.read("velocity")
             mass = float(file.read("particle_mass"))
-        energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
+        energy = 0.5 * mass * square_speeds(velocity)
         facts = entry.facts
         last = energy[-1]
         expected = {
@@ -203,10 +224,14 @@ def test_facts_of_the_manifest_follow_from_the_files(
             assert facts[name] == pytest.approx(value, rel=1e-12), name
         assert facts["max_speed"] >= np.abs(velocity).max()
         assert 0.0 < facts["cfl"] < 1.0
-        assert 0.9 < facts["jacobian_min"] <= 1.0 <= facts["jacobian_max"] < 1.1
-        assert len(entry.twin_floor) == (horizon if entry.subset == "test" else 0)
-        assert all(0.5 < floor * 2**20 < 2.0 for floor in entry.twin_floor[:1])
-        assert all(floor < 1e-4 for floor in entry.twin_floor)
+        assert 0.9 < facts["jacobian_min"] <= 1.0
+        assert 1.0 <= facts["jacobian_max"] < 1.1
+        floors = entry.twin_floor
+        assert len(floors) == (horizon if entry.subset == "test" else 0)
+        for floor in floors:
+            assert floor < 1e-4
+        if floors:
+            assert 0.5 < floors[0] * 2**20 < 2.0
 
 
 def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -> None:
@@ -217,13 +242,17 @@ def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -
     signs = draw_perturbation(size, 3) * 2**20
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert abs(signs.mean()) < 0.1
-    assert not np.array_equal(signs, draw_perturbation(size, 4) * 2**20)
-    plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
+    other_signs = draw_perturbation(size, 4) * 2**20
+    assert not np.array_equal(signs, other_signs)
+    rng = generator(SPLIT, SIZE, 2, 3)
+    plain = rng.random((size.particles, 2))
     assert not np.array_equal(signs > 0, plain >= 0.5)
 
 
 def test_resuming_makes_what_is_missing_or_wrong(
-    copied: Callable[[], Path], unmeasured: Registry, generated: GenerationResult
+    copied: Callable[[], Path],
+    unmeasured: Registry,
+    generated: GenerationResult,
 ) -> None:
     """A removed and a damaged scenario are made anew by one worker; then all bytes are
     as before.
@@ -233,7 +262,8 @@ def test_resuming_makes_what_is_missing_or_wrong(
     folder = folder_of(root)
     (folder / "test" / "0003.nc").unlink()
     damaged = folder / "train" / "0001.nc"
-    os.truncate(damaged, damaged.stat().st_size - 1000)
+    size = damaged.stat().st_size
+    os.truncate(damaged, size - 1000)
     leftover = folder / "test" / ".0003.nc.99999.partial"
     leftover.write_bytes(b"half a file")
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
@@ -299,11 +329,14 @@ def test_force_simulates_what_is_there(
     assert result.simulated == (2,)
     assert path.stat().st_mtime_ns > stamp
     assert contents(root) == before
-    assert any(entry.is_file() for entry in kernels.rglob("*"))
+    kernel_files = [entry for entry in kernels.rglob("*") if entry.is_file()]
+    assert kernel_files
 
 
 def test_files_of_other_parameters_are_made_anew(
-    copied: Callable[[], Path], unmeasured_path: Path, tmp_path: Path
+    copied: Callable[[], Path],
+    unmeasured_path: Path,
+    tmp_path: Path,
 ) -> None:
     """Whoever changes a parameter of an unreleased split does not keep files of the old
     one.
@@ -311,15 +344,14 @@ def test_files_of_other_parameters_are_made_anew(
     text = unmeasured_path.read_text()
     old = "velocity_relaxation: {value: 0.002"
     assert old in text
-    (tmp_path / "own.yaml").write_text(
-        text.replace(old, "velocity_relaxation: {value: 0.003")
-    )
+    own = tmp_path / "own.yaml"
+    own.write_text(text.replace(old, "velocity_relaxation: {value: 0.003"))
     result = generate(
         SPLIT,
         SIZE,
         root=copied(),
         dry_run=True,
-        registry=load(tmp_path / "own.yaml"),
+        registry=load(own),
     )
     assert result.simulated == (0, 1, 2, 3, 4)
     assert result.kept == ()
@@ -338,7 +370,8 @@ def test_a_dry_run_touches_nothing(
         dry_run=True,
         registry=unmeasured,
     )
-    real = sum(len(data) for data in contents(generated.root).values())
+    sizes = [len(content) for content in contents(generated.root).values()]
+    real = sum(sizes)
     assert real < result.bytes_needed < 2 * real
     assert result.bytes_free > result.bytes_needed
     assert result.seconds_expected > 0.0
@@ -359,12 +392,19 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
     )
     size = unmeasured.size(SPLIT, SIZE)
     simulating = [state for state in news if state.stage == "simulating"]
-    assert simulating[0].total == 2 * substep_count(size, 3) == 2 * 25 * 12
-    assert [state.done for state in simulating] == sorted(
-        state.done for state in simulating
-    )
-    assert simulating[-1].done == simulating[-1].total
-    assert simulating[-1].scenarios_done == 1
+    first = simulating[0]
+    last = simulating[-1]
+    assert first.total == 2 * substep_count(size, 3)
+    assert first.total == 2 * 25 * 12
+    counts = [state.done for state in simulating]
+    assert counts == sorted(counts)
+    assert last.done == last.total
+    assert last.scenarios_done == 1
+
+
+def hashes_of(manifest: Manifest) -> dict[int, str]:
+    """Return the content hashes of scenarios."""
+    return {entry.scenario: entry.content_sha256 for entry in manifest.files}
 
 
 def test_batches_start_each_scenario_at_its_own_frame(
@@ -374,7 +414,8 @@ def test_batches_start_each_scenario_at_its_own_frame(
     equal hashes.
     """
     size = load().size("cavity", "tiny")
-    assert len({draw_initial_state(size, i).start_frame for i in range(3)}) == 3
+    starts = {draw_initial_state(size, scenario).start_frame for scenario in range(3)}
+    assert len(starts) == 3
     batch = generate(
         "cavity",
         "tiny",
@@ -382,14 +423,11 @@ def test_batches_start_each_scenario_at_its_own_frame(
         device="parallel",
         scenarios="0-2",
     )
-    manifests = [
-        manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)
-    ]
-    single, together = (
-        [e.content_sha256 for e in m.files if e.scenario < 3] for m in manifests
-    )
-    assert single == together
-    assert len(single) == 3
+    single = hashes_of(manifest_of(tiny_split("cavity").root, "cavity"))
+    together = hashes_of(manifest_of(batch.root, "cavity"))
+    assert together.keys() == {0, 1, 2}
+    for scenario, content_hash_of_batch in together.items():
+        assert content_hash_of_batch == single[scenario]
 
 
 @pytest.mark.slow
@@ -400,8 +438,10 @@ def test_parallel_driver_gives_the_same_data_set(
     """The GPU's kernels with all scenarios in one batch agree to the bit with the
     serial kernel.
     """
-    together = generate(split, "tiny", root=tmp_path, device="parallel").dataset_sha256
-    assert together == tiny_split(split).dataset_sha256 is not None
+    together = generate(split, "tiny", root=tmp_path, device="parallel")
+    single = tiny_split(split)
+    assert single.dataset_sha256 is not None
+    assert together.dataset_sha256 == single.dataset_sha256
 
 
 def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
@@ -410,11 +450,12 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert select(size, subset="valid,test") == tuple(range(48, 72))
     assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
     assert select(size, scenarios=[5, 3, 5]) == (3, 5)
-    assert [type(i) for i in select(size, scenarios=np.arange(3, 5))] == [int, int]
+    chosen = select(size, scenarios=np.arange(3, 5))
+    assert [type(scenario) for scenario in chosen] == [int, int]
     for no_ids in (3, [3.0], [None]):
         with pytest.raises(UsageError):
             select(size, scenarios=no_ids)  # type: ignore[arg-type]
-    everything = {i for ids in size.subsets.values() for i in ids}
+    everything = set().union(*size.subsets.values())
     assert set(select(size)) == everything
 
 

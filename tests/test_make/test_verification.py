@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import shutil
@@ -27,7 +26,7 @@ from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.record import measured_values, replace_measured
 from lagbench.make.generate import GenerationResult, generate
-from lagbench.make.verify import evenly_spaced, verify
+from lagbench.make.verify import VerificationResult, evenly_spaced, verify
 
 Copy = Callable[[], Path]
 
@@ -51,7 +50,13 @@ def told_otherwise(measured: Registry, **update: Any) -> Registry:
     for name, value in update.items():
         if isinstance(value, dict):
             update[name] = {**getattr(own, name), **value}
-    return Registry(measured.splits, {SPLIT: {SIZE: own.model_copy(update=update)}})
+    told = own.model_copy(update=update)
+    return Registry(measured.splits, {SPLIT: {SIZE: told}})
+
+
+def verify_tiny(root: Path, registry: Registry, **options: Any) -> VerificationResult:
+    """Verify the tiny data set."""
+    return verify(SPLIT, SIZE, root=root, registry=registry, **options)
 
 
 @pytest.fixture
@@ -60,10 +65,9 @@ def measured(
 ) -> Registry:
     """A registry that holds the hashes of the generated data set."""
     values = measured_values(manifest_of(generated.root))
-    path = tmp_path / "measured.yaml"
-    path.write_text(
-        replace_measured(unmeasured_path.read_text(), {SPLIT: {SIZE: values}})
-    )
+    path = tmp_path / "datasets.yaml"
+    text = unmeasured_path.read_text()
+    path.write_text(replace_measured(text, {SPLIT: {SIZE: values}}))
     return load(path)
 
 
@@ -73,22 +77,21 @@ def test_what_was_generated_passes(
     """Every subset is there and equal to datasets.yaml, as is the whole; without a hash
     none claims that.
     """
-    result = verify(SPLIT, SIZE, root=generated.root, registry=measured, complete=True)
-    assert [
-        (r.name, r.present, r.missing, r.wrong, r.extra) for r in result.subsets
-    ] == [
-        ("train", 2, (), (), ()),
-        ("valid", 1, (), (), ()),
-        ("test", 2, (), (), ()),
-    ]
-    assert {report.verdict for report in result.subsets} == {"equal to datasets.yaml"}
+    result = verify_tiny(generated.root, measured, complete=True)
+    counts = {report.name: report.present for report in result.subsets}
+    assert counts == {"train": 2, "valid": 1, "test": 2}
+    for report in result.subsets:
+        assert report.missing == ()
+        assert report.wrong == ()
+        assert report.extra == ()
+        assert report.verdict == "equal to datasets.yaml"
     assert result.verdict == "equal to datasets.yaml"
     assert result.dataset_sha256 == generated.dataset_sha256
     assert result.problems == ()
     assert result.warnings == ()
     assert result.identity == "bitwise"
     result.check()
-    result = verify(SPLIT, SIZE, root=generated.root, registry=unmeasured)
+    result = verify_tiny(generated.root, unmeasured)
     assert result.verdict == "no hash in datasets.yaml yet"
     result.check()
 
@@ -101,20 +104,23 @@ def test_a_missing_file_is_a_warning_unless_all_are_wanted(
     """
     root = copied()
     file_of(root).unlink()
-    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    result = verify_tiny(root, measured)
     assert result.warnings == ("test lacks 3",)
-    assert [report.verdict for report in result.subsets] == [
-        *["equal to datasets.yaml"] * 2,
+    verdicts = [report.verdict for report in result.subsets]
+    assert verdicts == [
+        "equal to datasets.yaml",
+        "equal to datasets.yaml",
         "incomplete",
     ]
     result.check()
+    all_are_wanted = verify_tiny(root, measured, complete=True)
     with pytest.raises(DataError) as caught:
-        verify(SPLIT, SIZE, root=root, registry=measured, complete=True).check()
+        all_are_wanted.check()
     assert "missing: test 3" in str(caught.value)
     assert "lagbench generate --split curl-noise --size tiny" in str(caught.value)
     assert caught.value.exit_code == 4
     with pytest.raises(DataError) as caught:
-        verify(SPLIT, SIZE, root=root / "none", registry=measured).check()
+        verify_tiny(root / "none", measured).check()
     assert caught.value.where.endswith("root/none/curl-noise/tiny/v2")
 
 
@@ -152,10 +158,9 @@ def described(**attributes: object) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
-        *(
-            (flipped(name), f"0003.nc, variable '{name}'")
-            for name in ("position", "velocity", "material")
-        ),
+        (flipped("position"), "0003.nc, variable 'position'"),
+        (flipped("velocity"), "0003.nc, variable 'velocity'"),
+        (flipped("material"), "0003.nc, variable 'material'"),
         (
             lambda path: os.truncate(path, path.stat().st_size - 1024),
             "damaged or not one of lagbench",
@@ -180,8 +185,9 @@ def test_harm_is_named(
     """
     root = copied()
     harm(file_of(root))
-    result = verify(SPLIT, SIZE, root=root, registry=measured)
-    assert [report.wrong for report in result.subsets] == [(), (), (3,)]
+    result = verify_tiny(root, measured)
+    wrong = [report.wrong for report in result.subsets]
+    assert wrong == [(), (), (3,)]
     with pytest.raises(DataError, match=words) as caught:
         result.check()
     assert "test/0003.nc" in str(caught.value)
@@ -200,14 +206,14 @@ def test_a_forger_who_mends_the_file_is_caught(
     assert check_scenario(path) == content
     for registry in (measured, unmeasured):
         with pytest.raises(DataError) as caught:
-            verify(SPLIT, SIZE, root=root, registry=registry).check()
+            verify_tiny(root, registry).check()
         assert caught.value.where.endswith("root/curl-noise/tiny/v2")
         assert caught.value.exit_code == 4
         assert "test/0003.nc" in str(caught.value)
         assert content in str(caught.value)
     mend_manifest(path.parents[1] / "manifest.json", 3, path, content)
     with pytest.raises(DataError) as caught:
-        verify(SPLIT, SIZE, root=root, registry=measured).check()
+        verify_tiny(root, measured).check()
     assert caught.value.where.endswith("root/curl-noise/tiny/v2")
 
 
@@ -226,15 +232,18 @@ def test_a_forger_who_keeps_the_stored_hashes_is_caught(
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=measured)
     assert result.simulated == (0,)
     assert result.kept == (1, 2, 3, 4)
-    verify(SPLIT, SIZE, root=root, registry=measured).check()
+    verify_tiny(root, measured).check()
 
 
-def change_manifest(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+Content = dict[str, Any]
+
+
+def change_manifest(root: Path, change: Callable[[Content], object]) -> None:
     """Change the manifest of the tiny data set as a text editor would."""
     path = file_of(root).parents[1] / "manifest.json"
-    told = json.loads(path.read_text())
-    change(told)
-    path.write_text(json.dumps(told))
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
 
 
 def test_statistics_and_twin_floor_of_the_manifest_are_compared(
@@ -244,13 +253,13 @@ def test_statistics_and_twin_floor_of_the_manifest_are_compared(
     a warning.
     """
     root = copied()
-    change_manifest(
-        root, lambda told: told["statistics"].update(velocity_std=[1.0, 1.0])
-    )
-    change_manifest(
-        root, lambda told: told["files"][4]["twin_floor"].__setitem__(3, 0.5)
-    )
-    result = verify(SPLIT, SIZE, root=root, registry=measured)
+
+    def lie(content: Content) -> None:
+        content["statistics"]["velocity_std"] = [1.0, 1.0]
+        content["files"][4]["twin_floor"][3] = 0.5
+
+    change_manifest(root, lie)
+    result = verify_tiny(root, measured)
     assert [line for line in result.warnings if "velocity_std" in line]
     assert [line for line in result.warnings if "twin_floor" in line]
     result.check()
@@ -269,12 +278,15 @@ def test_other_bits_of_other_machines_are_warnings(
     }
     root = copied()
     registry = told_otherwise(measured, **wrong, dataset_sha256="0" * 64)
-    change_manifest(root, lambda told: told.update(identity="tolerance"))
-    change_manifest(
-        root,
-        lambda told: told["environments"][0].update(machine=machine, system="Linux"),
-    )
-    result = verify(SPLIT, SIZE, root=root, registry=registry)
+
+    def claim_other_machine(content: Content) -> None:
+        content["identity"] = "tolerance"
+        environment = content["environments"][0]
+        environment["machine"] = machine
+        environment["system"] = "Linux"
+
+    change_manifest(root, claim_other_machine)
+    result = verify_tiny(root, registry)
     if machine == "x86_64":
         with pytest.raises(DataError) as caught:
             result.check()
@@ -282,15 +294,13 @@ def test_other_bits_of_other_machines_are_warnings(
         return
     assert result.problems == ()
     assert result.identity == "tolerance"
-    assert any(
-        "scenarios 4 have other bits than datasets.yaml" in line
-        for line in result.warnings
-    )
+    text = "\n".join(result.warnings)
+    assert "scenarios 4 have other bits than datasets.yaml" in text
     assert "tolerance" in result.verdict
     result.check()
     forge(file_of(root, "test/0004"))
     with pytest.raises(DataError) as caught:
-        verify(SPLIT, SIZE, root=root, registry=registry).check()
+        verify_tiny(root, registry).check()
     assert caught.value.where.endswith("root/curl-noise/tiny/v2")
 
 
@@ -301,9 +311,11 @@ def test_the_data_set_hash_is_compared_too(
     told.
     """
     registry = told_otherwise(
-        measured, dataset_sha256="0" * 64, subset_sha256={"train": "1" * 64}
+        measured,
+        dataset_sha256="0" * 64,
+        subset_sha256={"train": "1" * 64},
     )
-    result = verify(SPLIT, SIZE, root=generated.root, registry=registry)
+    result = verify_tiny(generated.root, registry)
     assert result.verdict == "NOT that of datasets.yaml"
     assert result.subsets[0].verdict == "NOT that of datasets.yaml"
     with pytest.raises(DataError) as caught:
@@ -319,9 +331,13 @@ def test_strangers_and_a_lying_manifest_are_warnings(
     """
     root = copied()
     file_of(root, "test/0099").write_bytes(b"mine")
-    change_manifest(root, lambda told: told.update(identity="tolerance"))
-    change_manifest(root, lambda told: told["files"][0].update(content_sha256="a" * 64))
-    result = verify(SPLIT, SIZE, root=root, registry=measured)
+
+    def lie(content: Content) -> None:
+        content["identity"] = "tolerance"
+        content["files"][0]["content_sha256"] = "a" * 64
+
+    change_manifest(root, lie)
+    result = verify_tiny(root, measured)
     text = "\n".join(result.warnings)
     assert "test has files of no scenario: 0099.nc" in text
     assert "identity: tolerance" in text
@@ -337,8 +353,11 @@ def test_no_or_a_damaged_manifest_is_a_warning(
     """The files speak for themselves."""
     root = copied()
     path = file_of(root).parents[1] / "manifest.json"
-    path.unlink() if damage is None else path.write_text(damage)
-    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    if damage is None:
+        path.unlink()
+    else:
+        path.write_text(damage)
+    result = verify_tiny(root, measured)
     assert "manifest" in result.warnings[0]
     result.check()
 
@@ -347,14 +366,7 @@ def test_simulating_anew_is_identical(
     generated: GenerationResult, measured: Registry
 ) -> None:
     """First and last scenario, simulated anew, have the hashes of their files."""
-    result = verify(
-        SPLIT,
-        SIZE,
-        root=generated.root,
-        regenerate=2,
-        workers=2,
-        registry=measured,
-    )
+    result = verify_tiny(generated.root, measured, regenerate=2, workers=2)
     assert result.regenerated == {0: "identical", 4: "identical"}
     result.check()
 
@@ -366,43 +378,37 @@ def test_simulating_anew_needs_no_file_but_a_hash(
     to compare.
     """
     wrong = told_otherwise(measured, scenario_sha256={2: "0" * 16})
-    words = {
-        "identical": measured,
-        "nothing to compare with": unmeasured,
-        "different": wrong,
-    }
-    for word, registry in words.items():
-        result = verify(
-            SPLIT,
-            SIZE,
-            root=tmp_path,
-            scenarios="2",
-            regenerate=1,
-            registry=registry,
-        )
+    for word, registry in (
+        ("identical", measured),
+        ("nothing to compare with", unmeasured),
+        ("different", wrong),
+    ):
+        result = verify_tiny(tmp_path, registry, scenarios="2", regenerate=1)
         assert result.regenerated == {2: word}
     with pytest.raises(DataError) as caught:
         result.check()
     assert caught.value.where.endswith("curl-noise/tiny/v2")
 
 
-@given(
-    st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted),
-    st.integers(0, 80),
-)
+SORTED_IDS = st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted)
+
+
+@given(SORTED_IDS, st.integers(0, 80))
 def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
     """As many distinct ids as asked for (or all), ascending, first and last included,
     gaps alike.
     """
     chosen = evenly_spaced(ids, count)
-    assert len(chosen) == len(set(chosen)) == min(count, len(ids))
+    expected_count = min(count, len(ids))
+    assert len(chosen) == expected_count
+    assert len(set(chosen)) == expected_count
     assert list(chosen) == sorted(chosen)
     if len(chosen) > 1:
         assert chosen[0] == ids[0]
         assert chosen[-1] == ids[-1]
-        places = [ids.index(i) for i in chosen]
-        gaps = [b - a for a, b in itertools.pairwise(places)]
-        assert max(gaps) - min(gaps) <= 1
+        places = [ids.index(chosen_id) for chosen_id in chosen]
+        gaps = np.diff(places)
+        assert gaps.max() - gaps.min() <= 1
 
 
 def test_fewer_than_no_scenario_anew_is_refused(tmp_path: Path) -> None:

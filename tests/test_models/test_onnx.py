@@ -14,6 +14,7 @@ import pytest
 import torch
 from hostile_onnx import REFUSED, STOPPED, pickle_as_onnx, straight_on
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
@@ -52,7 +53,14 @@ def opened(path: Path, generated: GenerationResult) -> OnnxModel:
 
 def first_scenario(generated: GenerationResult) -> Path:
     """Return the file of the first test scenario."""
-    return SIZE.path(generated.root, SIZE.subsets["test"][0])
+    first = SIZE.subsets["test"][0]
+    return SIZE.path(generated.root, first)
+
+
+def first_prediction(step: Any, root: Path) -> tuple[int, NDArray[np.float32]]:
+    """Return the first test scenario and what a step predicts of it."""
+    rollouts = predict(step, SIZE.split, size=SIZE.name, history=2, root=root)
+    return next(rollouts)
 
 
 @pytest.mark.parametrize("make", REFUSED, ids=lambda make: make.__name__)
@@ -94,7 +102,8 @@ def test_a_greedy_model_is_stopped(
 
 def test_the_checks_run_in_a_child(tmp_path: Path) -> None:
     """A file that is refused there raises the error of an unreadable file."""
-    path = REFUSED[0](tmp_path / "model.onnx")
+    first_fault, *_ = REFUSED
+    path = first_fault(tmp_path / "model.onnx")
     with pytest.raises(UnreadableFileError) as caught:
         check_onnx(path)
     assert caught.value.where == str(path)
@@ -108,9 +117,15 @@ def test_a_child_writes_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not a byte, whatever runs there."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    search_path = os.pathsep.join(sys.path)
+    monkeypatch.setenv("PYTHONPATH", search_path)
     path = tmp_path / "written"
-    answers = run_in_child("hostile_onnx.write_a_file", [str(path)], seconds=5, wall=60)
+    answers = run_in_child(
+        "hostile_onnx.write_a_file",
+        [str(path)],
+        seconds=5,
+        wall=60,
+    )
     assert answers.values == ["OSError"]
     assert not path.exists() or path.stat().st_size == 0
 
@@ -121,8 +136,9 @@ def test_a_model_predicts_what_its_graph_says(
     """Straight lines, to rounding, in the frames of the task."""
     model = opened(straight_on(tmp_path / "model.onnx"), generated)
     rollout = model.roll_out(first_scenario(generated))
+    input_frames = slice(0, SIZE.task.input_frames)
     with read_scenario(first_scenario(generated)) as file:
-        given = file.read("position", slice(0, SIZE.task.input_frames)).astype(float)
+        given = file.read("position", input_frames).astype(float)
     step = given[-1] - given[-2]
     frames = np.arange(1, SIZE.task.horizon + 1)[:, None, None]
     assert_allclose(
@@ -159,11 +175,13 @@ def test_an_exported_step_predicts_what_it_did(
         before, now = window.position.unbind(1)
         velocity = now - before
         cell = (4 * now[:, 0]).long().clamp(0, 3)
+        ones = torch.ones_like(velocity)
         sums = torch.zeros(4, 2).index_add(0, cell, velocity)
-        counts = torch.zeros(4, 2).index_add(0, cell, torch.ones_like(velocity))
+        counts = torch.zeros(4, 2).index_add(0, cell, ones)
         mean = sums / counts.clamp(min=1.0)
         correction: torch.Tensor = net(velocity)
-        return now + 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * correction
+        motion = 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * correction
+        return now + motion
 
     path = export_onnx(
         step,
@@ -176,9 +194,7 @@ def test_an_exported_step_predicts_what_it_did(
     )
     model = open_onnx(path, size=SIZE, root=generated.root)
     assert model.parameters >= 6
-    scenario, expected = next(
-        iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
-    )
+    scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
@@ -197,8 +213,10 @@ def test_a_step_over_a_grid_of_particles_is_exported(
         mass = torch.ones_like(now[:, :1])
         carried = torch.cat([velocity, mass], 1)
         sums = grid.spread(nodes, carried, window.windows)
-        mean = sums / sums[:, 2:].clamp(min=1e-3)
-        flow = grid.gather(nodes, mean[:, :2] + 1e-4 * net(mean))
+        mass_at_nodes = sums[:, 2:].clamp(min=1e-3)
+        mean = sums / mass_at_nodes
+        mean_velocity = mean[:, :2] + 1e-4 * net(mean)
+        flow = grid.gather(nodes, mean_velocity)
         return (now + flow).clamp(grid.low, grid.high)
 
     path = export_onnx(
@@ -211,9 +229,7 @@ def test_a_step_over_a_grid_of_particles_is_exported(
         root=generated.root,
     )
     model = open_onnx(path, size=SIZE, root=generated.root)
-    scenario, expected = next(
-        iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
-    )
+    scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
@@ -226,14 +242,14 @@ def test_an_entry_carries_an_onnx_model(
     """
     path = straight_on(tmp_path / "lines.onnx")
     predictions = tmp_path / "predictions.nc"
-    result = predict_onnx(
+    prediction = predict_onnx(
         path,
         predictions,
         split=SIZE.split,
         size=SIZE.name,
         root=generated.root,
     )
-    assert result.method == "lines"
+    assert prediction.method == "lines"
     board = tmp_path / "board"
     meta = Meta(authors=("A. Author",), command="make")
     options: dict[str, Any] = {
@@ -243,14 +259,20 @@ def test_an_entry_carries_an_onnx_model(
     }
     other = tmp_path / "other.onnx"
     straight_on(other)
+    hostile = pickle_as_onnx(other)
     with pytest.raises(UnreadableFileError):
-        submit([predictions], meta, weights=[pickle_as_onnx(other)], **options)
+        submit([predictions], meta, weights=[hostile], **options)
     submit([predictions], meta, weights=[path], **options)
 
     place = board / "weights/curl-noise/tiny/lines_0.onnx"
     assert place.read_bytes() == path.read_bytes()
     assert check_board(board, isolated=False).findings == ()
-    done = reproduce(board, ["curl-noise/tiny/lines"], costs=False, root=generated.root)
-    assert done.exit_code == 0
-    (line,) = done.lines.values()
+    result = reproduce(
+        board,
+        ["curl-noise/tiny/lines"],
+        costs=False,
+        root=generated.root,
+    )
+    assert result.exit_code == 0
+    (line,) = result.lines.values()
     assert line.level is Level.REPRODUCED

@@ -37,19 +37,23 @@ def lattice(side: int, *, seed: int = 0, speed: float = 0.1) -> Trajectory:
     The shape is [frame, particle, 2].
     """
     axis = (np.arange(side) + 0.5) / side
-    regular = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    jitter = np.random.default_rng(seed).uniform(-0.1, 0.1, regular.shape)
+    x, y = np.meshgrid(axis, axis)
+    regular = np.stack([x, y], axis=-1).reshape(-1, 2)
+    rng = np.random.default_rng(seed)
+    jitter = rng.uniform(-0.1, 0.1, regular.shape)
     start = regular + jitter / side - 0.5
     x = start[:, 0]
     y = start[:, 1]
 
     # slower towards the walls, shape [frame, particle]
-    rate = speed * (1.0 - 4.0 * np.max(start**2, axis=1))
+    distance = np.max(start**2, axis=1)
+    rate = speed * (1.0 - 4.0 * distance)
     angle = np.arange(FRAMES)[:, None] * rate
-    rotated_x = np.cos(angle) * x - np.sin(angle) * y
-    rotated_y = np.sin(angle) * x + np.cos(angle) * y
-    position = 0.5 + np.stack([rotated_x, rotated_y], axis=-1)
-    return np.clip(position, 0.0, 1.0).astype(np.float32)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
+    rotated = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    position = np.clip(0.5 + rotated, 0.0, 1.0)
+    return position.astype(np.float32)
 
 
 def four_lattices(side: int, *, speed: float = 0.1) -> list[Trajectory]:
@@ -116,8 +120,10 @@ def test_the_proposed_grid_makes_the_score_defined(
     grid = Grid(cells, Placement.CELL_CENTRES)
     node_counts = set()
     with lagbench.open_split(str(split.folder), subset="test") as data:
-        for position in data["position"].values[:2, INPUT_FRAMES]:
-            node_counts.add(covered_nodes(Cloud(position, area), grid))
+        positions = data["position"].values[:2, INPUT_FRAMES]
+    for position in positions:
+        cloud = Cloud(position, area)
+        node_counts.add(covered_nodes(cloud, grid))
     assert max(node_counts) < NEEDED_NODES
     count_range = " to ".join(str(count) for count in sorted(node_counts))
     assert str(warning.got).startswith("2 of 2 test scenarios undefined: ")
@@ -144,15 +150,22 @@ def test_the_default_grid_fits_the_particles(
 
     It does so in the first and in the last frame.
     """
-    split = adopt_trajectories(tmp_path, four_lattices(side), full_box=full_box)
+    split = adopt_trajectories(
+        tmp_path,
+        four_lattices(side),
+        full_box=full_box,
+    )
     size, root, _ = locate(str(split.folder))
     score_grid = size.task.score_grid
-    grid = Grid(score_grid.cells, Placement(score_grid.placement))
+    placement = Placement(score_grid.placement)
+    grid = Grid(score_grid.cells, placement)
     area = side**2 * split.spacing**2
     with lagbench.open_split(str(split.folder), subset="test") as data:
-        frames = data["position"].values[:, [INPUT_FRAMES, FRAMES - 1]]
-    for position in frames.reshape(-1, side**2, 2):
-        assert covered_nodes(Cloud(position, area), grid) >= NEEDED_NODES
+        positions = data["position"].values
+    shown = positions[:, [INPUT_FRAMES, FRAMES - 1]]
+    for position in shown.reshape(-1, side**2, 2):
+        cloud = Cloud(position, area)
+        assert covered_nodes(cloud, grid) >= NEEDED_NODES
     assert list(check_scorability(size, root)) == []
 
 
@@ -161,11 +174,13 @@ def test_nodes_are_counted_as_the_metrics_do(cells: int) -> None:
     """A full box of n cells across has (n - 2)^2 nodes with neighbours on all sides."""
     cloud = Cloud(lattice(40)[0], 1.0)
     grid = Grid(cells, Placement.CELL_CENTRES)
-    assert covered_nodes(cloud, grid) == (cells - 2) ** 2
+    expected = (cells - 2) ** 2
+    assert covered_nodes(cloud, grid) == expected
 
 
 def test_a_single_particle_covers_one_node_at_most() -> None:
-    cloud = Cloud(lattice(40)[0, :1], 1.0)
+    first_particle = lattice(40)[0, :1]
+    cloud = Cloud(first_particle, 1.0)
     grid = Grid(10, Placement.CELL_CENTRES)
     assert covered_nodes(cloud, grid) <= 1
 
@@ -177,7 +192,12 @@ def list_reasons(split: LocalSplit) -> str:
 
 
 def test_a_coarse_grid_is_a_reason(tmp_path: Path) -> None:
-    split = adopt_trajectories(tmp_path, four_lattices(12), cells=5, full_box=True)
+    split = adopt_trajectories(
+        tmp_path,
+        four_lattices(12),
+        cells=5,
+        full_box=True,
+    )
     reasons = list_reasons(split)
     assert "2 of 2 test scenarios undefined: 9" in reasons
     assert "1 of 1 valid scenarios undefined" in reasons
@@ -191,7 +211,8 @@ def test_different_particle_numbers_are_no_reason(tmp_path: Path) -> None:
 
 
 def test_data_without_motion_are_a_reason(tmp_path: Path) -> None:
-    split = adopt_trajectories(tmp_path, four_lattices(12, speed=0.0))
+    at_rest = four_lattices(12, speed=0.0)
+    split = adopt_trajectories(tmp_path, at_rest)
     assert "nothing moves in test" in list_reasons(split)
 
 
@@ -221,7 +242,12 @@ def test_a_training_begins_with_the_warning(
         raise WorkFailedError("begun")
 
     monkeypatch.setattr("lagbench.baselines.train.train", stop_training)
-    split = adopt_trajectories(tmp_path, four_lattices(12), cells=cells, full_box=True)
+    split = adopt_trajectories(
+        tmp_path,
+        four_lattices(12),
+        cells=cells,
+        full_box=True,
+    )
     recipe = tmp_path / "own.yaml"
     recipe.write_text(f"format: 1\nrecipes:\n  '*/{split.size}': {{}}\n")
     arguments = [

@@ -24,21 +24,25 @@ from lagbench.scoring.score_file_checks import find_unreadable
 SIDE = 8
 FRAMES = 10
 GIVEN = 4
-AMPLITUDES = ((0.02, 0.03, 0.01), (0.01, 0.02, 0.03), (0.03, 0.01, 0.02))
+AMPLITUDES = (
+    (0.02, 0.03, 0.01),
+    (0.01, 0.02, 0.03),
+    (0.03, 0.01, 0.02),
+)
 """Of the flows of Arnold, Beltrami and Childress [length/frame]."""
 
 
-def beltrami(position: NDArray[np.float64], a: float, b: float, c: float) -> object:
+Floats = NDArray[np.float64]
+
+
+def beltrami(position: Floats, amplitudes: tuple[float, float, float]) -> Floats:
     """Return the ABC flow of period 1, whose curl is 2 pi times itself."""
+    a, b, c = amplitudes
     x, y, z = 2.0 * math.pi * position.T
-    return np.stack(
-        [
-            a * np.sin(z) + c * np.cos(y),
-            b * np.sin(x) + a * np.cos(z),
-            c * np.sin(y) + b * np.cos(x),
-        ],
-        axis=1,
-    )
+    u = a * np.sin(z) + c * np.cos(y)
+    v = b * np.sin(x) + a * np.cos(z)
+    w = c * np.sin(y) + b * np.cos(x)
+    return np.stack([u, v, w], axis=1)
 
 
 def carried(amplitudes: tuple[float, float, float]) -> NDArray[np.float32]:
@@ -51,10 +55,10 @@ def carried(amplitudes: tuple[float, float, float]) -> NDArray[np.float32]:
     frames = []
     for _ in range(FRAMES):
         frames.append(x % 1.0)
-        k1 = np.asarray(beltrami(x, *amplitudes))
-        k2 = np.asarray(beltrami(x + k1 / 2, *amplitudes))
-        k3 = np.asarray(beltrami(x + k2 / 2, *amplitudes))
-        k4 = np.asarray(beltrami(x + k3, *amplitudes))
+        k1 = beltrami(x, amplitudes)
+        k2 = beltrami(x + k1 / 2, amplitudes)
+        k3 = beltrami(x + k2 / 2, amplitudes)
+        k4 = beltrami(x + k3, amplitudes)
         x = x + (k1 + 2 * k2 + 2 * k3 + k4) / 6
     return np.asarray(np.stack(frames), np.float32)
 
@@ -64,8 +68,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     folder = tmp_path_factory.mktemp("abc")
     paths = []
     for number, amplitudes in enumerate(AMPLITUDES):
-        paths.append(folder / f"run{number}.npy")
-        np.save(paths[-1], carried(amplitudes))
+        path = folder / f"run{number}.npy"
+        np.save(path, carried(amplitudes))
+        paths.append(path)
     return adopt(
         paths,
         output=folder / "abc",
@@ -120,7 +125,8 @@ def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
     root = made.folder.parent
     with read_scenario(size.path(root, 2)) as file:
         given = given_in(file, size, root)
-    first = next(REFERENCES["constant-velocity"].predict(given))
+    predictor = REFERENCES["constant-velocity"]
+    first = next(predictor.predict(given))
     step = given.box.displacement(given.last, first.astype(np.float64))
     assert_allclose(step, given.step, atol=1e-6)
     assert np.abs(given.step).max() < 0.1
@@ -130,7 +136,8 @@ def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
     for name in ("constant-velocity", "projection-2x"):
         *_, last = REFERENCES[name].predict(given)
         error = given.box.displacement(truth, last.astype(np.float64))
-        errors[name] = float(np.sqrt(np.mean(error**2)))
+        mean_square = np.mean(error**2)
+        errors[name] = float(np.sqrt(mean_square))
     assert errors["projection-2x"] < 0.6 * errors["constant-velocity"]
 
 
@@ -141,7 +148,13 @@ def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None
     root = made.folder.parent
     lagbench.template(made.folder, output=path)
     validated = lagbench.validate(path, root=root, isolated=False)
-    card = lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+    card = lagbench.score(
+        path,
+        root=root,
+        write=False,
+        workers=1,
+        validated=validated,
+    )
     page = write_report(tmp_path / "report", [card], [path], root=root)
     text = page.read_text("utf-8")
     assert "a slice across z" in text
