@@ -112,11 +112,17 @@ def test_all_ways_to_name_it(
     in no other root.
     """
     monkeypatch.chdir(own.parent)
-    by_path = [
-        (name, None)
-        for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")
-    ]
-    for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
+    for split, root in (
+        (own, None),
+        (Path("own"), None),
+        (str(own), None),
+        (f"{own}/", None),
+        ("./own", None),
+        ("own/", None),
+        ("own", own.parent),
+        ("own", "."),
+        ("own", None),
+    ):
         found = locate_split(split, root=root)
         assert found.name == "own"
         assert found.root.resolve() == own.parent.resolve()
@@ -124,7 +130,8 @@ def test_all_ways_to_name_it(
     monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
     assert locate_split("own").root == own.parent
     assert locate("root/own").size.split == "own"
-    assert locate(str(own), root=own.parent).root == own.parent
+    by_path_and_root = locate(str(own), root=own.parent)
+    assert by_path_and_root.root == own.parent
     with pytest.raises(UsageError) as caught:
         locate(str(own), root=tmp_path)
     assert caught.value.where == "--split and --root"
@@ -142,6 +149,12 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
     assert caught.value.where.endswith("/cavity")
 
 
+def folder_of_tests(root: Path, size: str) -> Path:
+    """Return the folder of test scenarios of a cavity."""
+    major = load().size("cavity", size).major
+    return dataset_folder(root, "cavity", size, major) / "test"
+
+
 def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     """One size there: that one; of several mini. None, or several without mini: an
     error that names them. What is to be made: mini.
@@ -151,14 +164,12 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     assert none.value.where == "--size"
     assert "--size mini" in str(none.value.fix)
     for size in ("tiny", "full"):
-        folder = (
-            dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major)
-            / "test"
-        )
+        folder = folder_of_tests(tmp_path, size)
         folder.mkdir(parents=True)
         (folder / "0000.nc").touch()
         if size == "tiny":
-            assert locate("cavity", root=tmp_path).size.name == "tiny"
+            only = locate("cavity", root=tmp_path)
+            assert only.size.name == "tiny"
     for opened in (
         lagbench.open_split,
         lagbench.windows,
@@ -169,22 +180,22 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
             opened("cavity", root=tmp_path)
         assert several.value.where == "--size"
         assert several.value.fix == "--size full"
-    assert locate_new("cavity", root=tmp_path).size.name == "mini"
-    mini = load().size("cavity", "mini")
-    mini_folder = dataset_folder(tmp_path, "cavity", "mini", mini.major) / "test"
+    new = locate_new("cavity", root=tmp_path)
+    assert new.size.name == "mini"
+    mini_folder = folder_of_tests(tmp_path, "mini")
     mini_folder.mkdir(parents=True)
     (mini_folder / "0000.nc").touch()
-    assert locate("cavity", root=tmp_path).size.name == "mini"
+    one_of_three = locate("cavity", root=tmp_path)
+    assert one_of_three.size.name == "mini"
     # Nothing is removed by a default.
     with pytest.raises(UsageError) as unnamed:
         clean("cavity", root=tmp_path)
     assert unnamed.value.where == "--size"
     assert (mini_folder / "0000.nc").exists()
     # Where a split has no mini, its only size is the default.
-    assert (
-        locate_new("own", root=own.parent).size.name
-        == locate("own", root=own.parent).size.name
-    )
+    new = locate_new("own", root=own.parent)
+    old = locate("own", root=own.parent)
+    assert new.size.name == old.size.name
 
 
 def test_unknown_names_list_local_ones(own: Path) -> None:
@@ -207,9 +218,11 @@ def test_a_folder_may_be_moved_but_not_renamed(
     of nothing.
     """
     moved = Path(shutil.move(own, tmp_path / "own"))
-    assert lagbench.verify(str(moved)).dataset_sha256 == made.dataset_sha256
+    result = lagbench.verify(str(moved))
+    assert result.dataset_sha256 == made.dataset_sha256
+    renamed = moved.rename(moved.with_name("mine"))
     with pytest.raises(UnreadableFileError) as caught:
-        locate(str(moved.rename(moved.with_name("mine"))))
+        locate(str(renamed))
     assert caught.value.where.endswith("mine/split.yaml")
 
 
@@ -218,21 +231,33 @@ def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> No
     is refused.
     """
     path = own / "split.yaml"
-    path.write_text(
-        path.read_text().replace("generator: none", "generator: antigravity")
-    )
+    text = path.read_text()
+    path.write_text(text.replace("generator: none", "generator: antigravity"))
     with pytest.raises(UnreadableFileError) as caught:
         locate(str(own))
     assert caught.value.where.endswith("root/own/split.yaml, key splits.own.generator")
     path.write_text("splits: [")
-    assert locate("cavity", "tiny", root=own.parent).size.split == "cavity"
+    cavity = locate("cavity", "tiny", root=own.parent)
+    assert cavity.size.split == "cavity"
     with pytest.raises(UnreadableFileError) as caught:
         locate("own", root=own.parent)
     assert caught.value.where.endswith("root/own/split.yaml")
 
 
 @pytest.mark.parametrize(
-    "name", ["../own", "/etc", "own/", ".", "..", "", "Own", "a b", "a" * 65, "own\0"]
+    "name",
+    [
+        "../own",
+        "/etc",
+        "own/",
+        ".",
+        "..",
+        "",
+        "Own",
+        "a b",
+        "a" * 65,
+        "own\0",
+    ],
 )
 def test_paths_are_no_names(name: str) -> None:
     """Whatever could leave the root folder cannot be the name of a split."""
@@ -246,12 +271,15 @@ def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> 
     """
     target = tmp_path / "predictions.nc"
     lagbench.template(str(own), output=target)
-    assert lagbench.validate(target, root=own.parent, isolated=False).valid
+    result = lagbench.validate(target, root=own.parent, isolated=False)
+    assert result.valid
     with h5py.File(target, "a") as file:
         file.attrs["split"] = "../root/own" if path == "relative" else str(own)
     result = lagbench.validate(target, root=own.parent, isolated=False)
-    assert [finding.check for finding in result.errors] == ["split"]
-    assert not lagbench.validate(target, isolated=False).valid
+    checks = [finding.check for finding in result.errors]
+    assert checks == ["split"]
+    without_root = lagbench.validate(target, isolated=False)
+    assert not without_root.valid
 
 
 def test_a_rooted_registry_leaves_its_base_alone(own: Path) -> None:
@@ -260,6 +288,7 @@ def test_a_rooted_registry_leaves_its_base_alone(own: Path) -> None:
     known = load_rooted_registry(own.parent, base)
     assert known.split("own").generator == "none"
     assert "own" not in base.splits
-    assert load_rooted_registry(own.parent.parent, known).local_names() == ()
+    elsewhere = load_rooted_registry(own.parent.parent, known)
+    assert elsewhere.local_names() == ()
     with pytest.raises(UsageError):
-        load_rooted_registry(own.parent.parent, known).split("own")
+        elsewhere.split("own")
