@@ -28,16 +28,18 @@ def save_model(
 ) -> Path:
     """Write a model with the input position and the output next_position."""
     if inputs is None:
-        inputs = [value("position", FLOAT, ["given", "particle", "axis"])]
+        inputs = [value("position", GIVEN_POSITIONS)]
+    output = value("next_position", ["frame", "particle", "axis"])
     graph = helper.make_graph(
         nodes,
         "model",
         inputs,
-        [value("next_position", FLOAT, ["frame", "particle", "axis"])],
+        [output],
         initializer=initialisers or [],
     )
     imports = []
-    for domain, version in (opsets or {"": 18}).items():
+    versions = opsets or {"": 18}
+    for domain, version in versions.items():
         imports.append(helper.make_opsetid(domain, version))
     model = helper.make_model(
         graph,
@@ -49,27 +51,35 @@ def save_model(
     return path
 
 
-def value(name: str, kind: int, shape: list[str]) -> Any:
+GIVEN_POSITIONS = ["given", "particle", "axis"]
+
+
+def value(name: str, shape: list[str]) -> Any:
     """Return the description of an input or output."""
-    return helper.make_tensor_value_info(name, kind, shape)
+    return helper.make_tensor_value_info(name, FLOAT, shape)
 
 
 def integers(name: str, *numbers: int) -> Any:
     """Return an initialiser of integers."""
-    return numpy_helper.from_array(np.array(numbers, np.int64), name)
+    array = np.array(numbers, np.int64)
+    return numpy_helper.from_array(array, name)
+
+
+def node(operator: str, inputs: list[str], output: str, **attributes: Any) -> Any:
+    """Return a node of a graph."""
+    return helper.make_node(operator, inputs, [output], **attributes)
 
 
 def straight_on(path: Path) -> Path:
     """Write the model x(n) + (x(n) - x(n - 1))."""
     nodes = [
-        helper.make_node("Gather", ["position", "last"], ["now"], axis=0),
-        helper.make_node("Gather", ["position", "before"], ["past"], axis=0),
-        helper.make_node("Sub", ["now", "past"], ["step"]),
-        helper.make_node("Add", ["now", "step"], ["next_position"]),
+        node("Gather", ["position", "last"], "now", axis=0),
+        node("Gather", ["position", "before"], "past", axis=0),
+        node("Sub", ["now", "past"], "step"),
+        node("Add", ["now", "step"], "next_position"),
     ]
-    return save_model(
-        path, nodes, initialisers=[integers("last", -1), integers("before", -2)]
-    )
+    places = [integers("last", -1), integers("before", -2)]
+    return save_model(path, nodes, initialisers=places)
 
 
 def external_data(path: Path) -> Path:
@@ -88,8 +98,8 @@ def external_data(path: Path) -> Path:
 
 def custom_domain(path: Path) -> Path:
     """Use an operator that a shared library would have to bring."""
-    node = helper.make_node("Run", ["position"], ["next_position"], domain="evil")
-    return save_model(path, [node], opsets={"": 18, "evil": 1})
+    run = node("Run", ["position"], "next_position", domain="evil")
+    return save_model(path, [run], opsets={"": 18, "evil": 1})
 
 
 def own_function(path: Path) -> Path:
@@ -99,62 +109,64 @@ def own_function(path: Path) -> Path:
         "F",
         ["x"],
         ["y"],
-        [helper.make_node("Identity", ["x"], ["y"])],
+        [node("Identity", ["x"], "y")],
         [helper.make_opsetid("", 18)],
     )
-    node = helper.make_node("F", ["position"], ["next_position"], domain="own")
-    return save_model(path, [node], opsets={"": 18, "own": 1}, functions=[function])
+    call = node("F", ["position"], "next_position", domain="own")
+    opsets = {"": 18, "own": 1}
+    return save_model(path, [call], opsets=opsets, functions=[function])
 
 
 def endless_loop(path: Path) -> Path:
     """Loop as often as a 64-bit number can count."""
     body = helper.make_graph(
         [
-            helper.make_node("Identity", ["go"], ["go_on"]),
-            helper.make_node("Identity", ["x"], ["x_next"]),
+            node("Identity", ["go"], "go_on"),
+            node("Identity", ["x"], "x_next"),
         ],
         "body",
         [
             helper.make_tensor_value_info("i", TensorProto.INT64, []),
             helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            value("x", FLOAT, ["given", "particle", "axis"]),
+            value("x", GIVEN_POSITIONS),
         ],
         [
             helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            value("x_next", FLOAT, ["given", "particle", "axis"]),
+            value("x_next", GIVEN_POSITIONS),
         ],
     )
     yes = numpy_helper.from_array(np.array(True), "yes")
     count = numpy_helper.from_array(np.array(2**62, np.int64), "count")
-    node = helper.make_node(
-        "Loop", ["count", "yes", "position"], ["next_position"], body=body
-    )
-    return save_model(path, [node], initialisers=[count, yes])
+    loop = node("Loop", ["count", "yes", "position"], "next_position", body=body)
+    return save_model(path, [loop], initialisers=[count, yes])
 
 
 def huge_shape(path: Path) -> Path:
     """Fill 10^12 numbers with zero."""
     nodes = [
-        helper.make_node("ConstantOfShape", ["shape"], ["zeros"]),
-        helper.make_node("ReduceSum", ["zeros"], ["sum"], keepdims=0),
-        helper.make_node("Add", ["position", "sum"], ["next_position"]),
+        node("ConstantOfShape", ["shape"], "zeros"),
+        node("ReduceSum", ["zeros"], "sum", keepdims=0),
+        node("Add", ["position", "sum"], "next_position"),
     ]
-    return save_model(path, nodes, initialisers=[integers("shape", 1000000, 1000000)])
+    shape = integers("shape", 1_000_000, 1_000_000)
+    return save_model(path, nodes, initialisers=[shape])
 
 
 def long_work(path: Path) -> Path:
     """Multiply large matrices many times: no loop, and no end in sight."""
     nodes = [
-        helper.make_node("ReduceSum", ["position"], ["seed"], keepdims=0),
-        helper.make_node("Expand", ["seed", "shape"], ["m0"]),
+        node("ReduceSum", ["position"], "seed", keepdims=0),
+        node("Expand", ["seed", "shape"], "m0"),
     ]
-    for i in range(200):
-        nodes.append(helper.make_node("MatMul", [f"m{i}", f"m{i}"], [f"m{i + 1}"]))
+    for number in range(200):
+        matrix = f"m{number}"
+        nodes.append(node("MatMul", [matrix, matrix], f"m{number + 1}"))
     nodes += [
-        helper.make_node("ReduceSum", ["m200"], ["sum"], keepdims=0),
-        helper.make_node("Add", ["position", "sum"], ["next_position"]),
+        node("ReduceSum", ["m200"], "sum", keepdims=0),
+        node("Add", ["position", "sum"], "next_position"),
     ]
-    return save_model(path, nodes, initialisers=[integers("shape", 3000, 3000)])
+    shape = integers("shape", 3000, 3000)
+    return save_model(path, nodes, initialisers=[shape])
 
 
 def large_constant(path: Path) -> Path:
@@ -207,21 +219,21 @@ def torch_export_as_onnx(path: Path) -> Path:
 
 def random_numbers(path: Path) -> Path:
     """Draw random numbers, so that no run is like another."""
-    node = helper.make_node("RandomNormalLike", ["position"], ["next_position"])
-    return save_model(path, [node])
+    draw = node("RandomNormalLike", ["position"], "next_position")
+    return save_model(path, [draw])
 
 
 def other_input(path: Path) -> Path:
     """Ask for something that no model is given."""
-    inputs = [value("future", FLOAT, ["given", "particle", "axis"])]
-    node = helper.make_node("Identity", ["future"], ["next_position"])
-    return save_model(path, [node], inputs=inputs)
+    inputs = [value("future", GIVEN_POSITIONS)]
+    copy = node("Identity", ["future"], "next_position")
+    return save_model(path, [copy], inputs=inputs)
 
 
 def old_opset(path: Path) -> Path:
     """Use operators of an old version."""
-    node = helper.make_node("Identity", ["position"], ["next_position"])
-    return save_model(path, [node], opsets={"": 13})
+    copy = node("Identity", ["position"], "next_position")
+    return save_model(path, [copy], opsets={"": 13})
 
 
 def damaged(path: Path) -> Path:
@@ -230,7 +242,9 @@ def damaged(path: Path) -> Path:
     return path
 
 
-REFUSED: tuple[Callable[[Path], Path], ...] = (
+Make = Callable[[Path], Path]
+
+REFUSED: tuple[Make, ...] = (
     external_data,
     custom_domain,
     own_function,
@@ -247,7 +261,7 @@ REFUSED: tuple[Callable[[Path], Path], ...] = (
 )
 """Files that the checks refuse."""
 
-STOPPED: tuple[Callable[[Path], Path], ...] = (huge_shape, long_work)
+STOPPED: tuple[Make, ...] = (huge_shape, long_work)
 """Files that the checks let pass, and that the limits of a rollout stop."""
 
 

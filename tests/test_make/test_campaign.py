@@ -9,6 +9,7 @@ import platform
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import SIZE, SPLIT
@@ -60,13 +61,13 @@ def test_all_hashes_are_compared(
     without_two = dict(right.scenario_sha256)
     del without_two[2]
     root = copied()
-    changes = (
+    for change, place in (
         ({"dataset_sha256": "0" * 64}, "the data set"),
         ({"subset_sha256": {"train": "0" * 64}}, "train"),
         ({"scenario_sha256": without_two}, "scenarios 2"),
-    )
-    for change, place in changes:
-        registry = with_measured(unmeasured, right.model_copy(update=change))
+    ):
+        changed = right.model_copy(update=change)
+        registry = with_measured(unmeasured, changed)
         with pytest.raises(DataError) as caught:
             generate(SPLIT, SIZE, root=root, registry=registry)
         assert place in str(caught.value.where)
@@ -94,10 +95,17 @@ def test_a_forged_file_is_made_anew(
     not adopted.
     """
     root = copied()
-    forge(root / SPLIT / SIZE / "v2" / "test" / "0003.nc")
+    test_folder = root / SPLIT / SIZE / "v2" / "test"
+    forge(test_folder / "0003.nc")
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
     assert result.simulated == (3,)
     assert result.dataset_sha256 == generated.dataset_sha256
+
+
+def change_manifest(root: Path, **changes: object) -> None:
+    """Change the manifest of the tiny data set."""
+    manifest = manifest_of(root)
+    write_manifest(root, manifest.model_copy(update=changes))
 
 
 def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
@@ -109,11 +117,12 @@ def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
     root = copied()
     manifest = manifest_of(root)
     environment = {**manifest.environments[0], "machine": "aarch64"}
-    write_manifest(root, manifest.model_copy(update={"environments": (environment,)}))
+    change_manifest(root, environments=(environment,))
     generate(SPLIT, SIZE, root=root, registry=unmeasured)
     assert manifest_of(root).identity == "tolerance"
     assert "tolerance" in card_of(root)
-    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
+    recorded = with_measured(unmeasured, right)
+    generate(SPLIT, SIZE, root=root, registry=recorded)
     assert manifest_of(root).identity == "bitwise"
     assert "same bits on every" in card_of(root)
 
@@ -128,27 +137,34 @@ def test_other_bits_of_another_machine_are_kept_and_told(
     simulated twice.
     """
     wrong = {**right.scenario_sha256, 4: "0" * 16}
-    registry = with_measured(
-        unmeasured, right.model_copy(update={"scenario_sha256": wrong})
-    )
-    options = {"root": tmp_path, "scenarios": "4", "workers": 1, "registry": registry}
+    with_wrong = right.model_copy(update={"scenario_sha256": wrong})
+    registry = with_measured(unmeasured, with_wrong)
+    options: dict[str, Any] = {
+        "root": tmp_path,
+        "scenarios": "4",
+        "workers": 1,
+        "registry": registry,
+    }
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    first = generate(SPLIT, SIZE, **options)  # type: ignore[arg-type]
+    first = generate(SPLIT, SIZE, **options)
     assert first.simulated == (4,)
     assert "tolerance" in first.verdict
     assert manifest_of(tmp_path).identity == "tolerance"
     assert "tolerance" in card_of(tmp_path)
-    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    second = generate(SPLIT, SIZE, **options)
+    assert second.simulated == ()
     verify(SPLIT, SIZE, root=tmp_path, registry=registry).check()
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
-    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    third = generate(SPLIT, SIZE, **options)
+    assert third.simulated == ()
     # A broken promise is never tolerated: bitwise still, and no card says more.
     with pytest.raises(DataError) as caught:
-        generate(SPLIT, SIZE, force=True, **options)  # type: ignore[arg-type]
+        generate(SPLIT, SIZE, force=True, **options)
     assert caught.value.where == "curl-noise tiny, scenarios 4"
     root = tmp_path / "other"
+    options["root"] = root
     with pytest.raises(DataError) as caught:
-        generate(SPLIT, SIZE, **{**options, "root": root})  # type: ignore[arg-type]
+        generate(SPLIT, SIZE, **options)
     assert caught.value.where == "curl-noise tiny, scenarios 4"
     assert caught.value.exit_code == 4
     assert manifest_of(root).identity == "bitwise"
@@ -162,8 +178,9 @@ def test_wrong_statistics_are_mended(
     root = copied()
     manifest = manifest_of(root)
     lie = {**manifest.statistics, "velocity_std": (1.0, 1.0)}
-    write_manifest(root, manifest.model_copy(update={"statistics": lie}))
-    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
+    change_manifest(root, statistics=lie)
+    recorded = with_measured(unmeasured, right)
+    generate(SPLIT, SIZE, root=root, registry=recorded)
     assert manifest_of(root).statistics == right.statistics
 
 
@@ -179,7 +196,8 @@ def test_paths_of_a_manifest_are_not_published(
     path.write_text(json.dumps(manifest))
     generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
     for name in ("manifest.json", "croissant.json", "README.md"):
-        assert "passwd" not in (folder / name).read_text()
+        text = (folder / name).read_text()
+        assert "passwd" not in text
 
 
 def test_a_second_call_hashes_each_file_once_and_draws_nothing(
@@ -205,11 +223,14 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
     read.clear()
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
-    assert read == {f"{i:04d}.nc": 1 for i in range(5)}
+    each_once = {f"{scenario:04d}.nc": 1 for scenario in range(5)}
+    assert read == each_once
     checking = [state for state in news if state.stage == "checking"]
-    assert checking[0].done == 0
-    assert checking[-1].done == 5
-    assert checking[-1].total == 5
+    first = checking[0]
+    last = checking[-1]
+    assert first.done == 0
+    assert last.done == 5
+    assert last.total == 5
 
 
 def test_values_are_hashed_once(
@@ -223,8 +244,11 @@ def test_values_are_hashed_once(
         pytest.fail("values are hashed again")
 
     root = copied()
-    calls = ((True, False), (False, True), (False, False))
-    for dry_run, may_hash in calls:
+    for dry_run, may_hash in (
+        (True, False),
+        (False, True),
+        (False, False),
+    ):
         with monkeypatch.context() as patch:
             if not may_hash:
                 patch.setattr("lagbench.make.inventory.check_scenario", refuse)

@@ -9,6 +9,7 @@ import dask.array
 import netCDF4
 import numpy as np
 import pytest
+import xarray as xr
 from numpy.testing import assert_array_equal, assert_equal
 from scenario_factory import frames_of, make_key, write_scenario
 
@@ -35,6 +36,11 @@ def ragged(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def open_tiny(root: Path) -> xr.Dataset:
+    """Open the test subset of cavity tiny."""
+    return open_split("cavity", size="tiny", root=root)
+
+
 def scenario_path(root: Path, scenario: int) -> Path:
     """Return the file of a test scenario."""
     return root / "cavity/tiny/v2/test" / f"{scenario:04d}.nc"
@@ -48,11 +54,12 @@ def set_scenario_id(path: Path, scenario: int) -> None:
 
 def test_ragged_scenarios_are_padded(ragged: Path) -> None:
     """Beyond its own frames and particles a scenario is NaN, its material -1."""
-    with open_split("cavity", size="tiny", root=ragged) as data:
+    with open_tiny(ragged) as data:
         assert data["position"].dims == ("scenario", "frame", "particle", "space")
         assert data["wall_velocity"].dims == ("scenario", "frame", "wall", "space")
         assert tuple(data["scenario"].values) == TEST_IDS
-        assert_array_equal(data["time"], np.arange(5) * 0.1)
+        times = 0.1 * np.arange(5)
+        assert_array_equal(data["time"], times)
         most_particles = 6 + len(TEST_IDS) - 1
         for place, scenario in enumerate(TEST_IDS):
             frames = 5 - place
@@ -62,8 +69,9 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
             assert int(one["particle_count"]) == particles
             assert one["particle_mass"] == 1e-4 / particles
 
+            positions = frames_of(scenario, frames, particles)
             expected = np.full((5, most_particles, 2), np.nan, np.float32)
-            expected[:frames, :particles] = frames_of(scenario, frames, particles)
+            expected[:frames, :particles] = positions
             assert_array_equal(one["position"], expected)
             assert_array_equal(one["velocity"], -expected)
             material = np.full(most_particles, -1)
@@ -81,7 +89,7 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
     ],
 )
 def test_types_survive_the_padding(ragged: Path, name: str, dtype: str) -> None:
-    with open_split("cavity", size="tiny", root=ragged) as data:
+    with open_tiny(ragged) as data:
         assert str(data[name].dtype) == dtype
 
 
@@ -100,15 +108,17 @@ def test_the_default_root_is_that_of_the_environment(
 
 def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
     """Each scenario has its own; one that states none has none in the cavity."""
-    stated = dict(zip(TEST_IDS, (2e-3, 5e-4), strict=False))
+    first, second, *_ = TEST_IDS
+    stated = {first: 2e-3, second: 5e-4}
     for scenario in TEST_IDS:
         parameters: dict[str, object] = {"grid": 16}
         if scenario in stated:
             parameters["viscosity"] = stated[scenario]
         write_scenario(tmp_path, make_key(scenario), parameters=parameters)
-    with open_split("cavity", size="tiny", root=tmp_path) as data:
+    with open_tiny(tmp_path) as data:
         for scenario in TEST_IDS:
-            viscosity = float(data["viscosity"].sel(scenario=scenario))
+            of_scenario = data["viscosity"].sel(scenario=scenario)
+            viscosity = float(of_scenario)
             expected = stated.get(scenario, np.nan)
             assert_equal(viscosity, expected)
 
@@ -116,20 +126,22 @@ def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
 def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
     """Positions are dask arrays in chunks of some megabytes, one scenario each."""
     for scenario in TEST_IDS:
-        write_scenario(tmp_path, make_key(scenario), frames=100, particles=8192)
-    with open_split("cavity", size="tiny", root=tmp_path) as data:
+        key = make_key(scenario)
+        write_scenario(tmp_path, key, frames=100, particles=8192)
+    with open_tiny(tmp_path) as data:
         position = data["position"]
         assert isinstance(position.data, dask.array.Array)
         assert position.data.chunksize == (1, 64, 8192, 2)  # 4 MiB
         expected = frames_of(TEST_IDS[1], 100, 8192)
-        assert float(position[1, 99, 0, 0]) == expected[99, 0, 0]
+        value = float(position[1, 99, 0, 0])
+        assert value == expected[99, 0, 0]
 
 
 def test_missing_files_are_counted_and_named(ragged: Path) -> None:
     """The error gives the command that generates them."""
     scenario_path(ragged, TEST_IDS[1]).unlink()
     with pytest.raises(DataError) as caught:
-        open_split("cavity", size="tiny", root=ragged)
+        open_tiny(ragged)
     message = str(caught.value)
     command = "lagbench generate --split cavity --size tiny --subset test"
     assert caught.value.exit_code == 4
@@ -141,16 +153,17 @@ def test_missing_files_are_counted_and_named(ragged: Path) -> None:
 def test_a_truncated_file_is_damage(ragged: Path) -> None:
     path = scenario_path(ragged, TEST_IDS[0])
     content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
+    half = len(content) // 2
+    path.write_bytes(content[:half])
     with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
-        open_split("cavity", size="tiny", root=ragged)
+        open_tiny(ragged)
 
 
 def test_a_file_of_another_scenario_is_refused(ragged: Path) -> None:
     path = scenario_path(ragged, TEST_IDS[0])
     set_scenario_id(path, 17)
     with pytest.raises(DataError, match=rf"(?s)another scenario.*{path.name}"):
-        open_split("cavity", size="tiny", root=ragged)
+        open_tiny(ragged)
 
 
 def list_open_files(root: Path) -> list[str]:
@@ -172,11 +185,11 @@ def test_nothing_stays_open_after_an_error(ragged: Path) -> None:
     path = scenario_path(ragged, TEST_IDS[1])
     set_scenario_id(path, 17)
     with pytest.raises(DataError) as caught:
-        open_split("cavity", size="tiny", root=ragged)
+        open_tiny(ragged)
     assert list_open_files(ragged) == [], caught
 
     set_scenario_id(path, TEST_IDS[1])
-    with open_split("cavity", size="tiny", root=ragged):
+    with open_tiny(ragged):
         assert len(list_open_files(ragged)) == len(TEST_IDS)
     assert list_open_files(ragged) == []
 
@@ -206,7 +219,7 @@ def test_a_split_left_open_spoils_nothing(ragged: Path, tmp_path: Path) -> None:
     """Files open elsewhere are checked and, after another file was written, opened
     again.
     """
-    data = open_split("cavity", size="tiny", root=ragged)
+    data = open_tiny(ragged)
     paths = sorted(ragged.rglob("*.nc"))
     for path in paths:
         check_scenario(path)
@@ -215,7 +228,8 @@ def test_a_split_left_open_spoils_nothing(ragged: Path, tmp_path: Path) -> None:
         other.createVariable("x", "f4", ("n",))
         for path in paths:
             with read_scenario(path) as file:
-                assert file.read("space").tolist() == ["x", "y"]
+                space = file.read("space")
+                assert space.tolist() == ["x", "y"]
     data.close()
 
 
@@ -230,7 +244,8 @@ def test_load_manifest_reads_what_was_written(tmp_path: Path) -> None:
         environment={},
     )
     write_manifest(tmp_path, manifest)
-    assert load_manifest("cavity", size="tiny", root=tmp_path) == manifest
+    again = load_manifest("cavity", size="tiny", root=tmp_path)
+    assert again == manifest
 
 
 def test_a_missing_manifest_is_an_error(tmp_path: Path) -> None:

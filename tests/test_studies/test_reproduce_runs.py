@@ -42,26 +42,31 @@ def reproduce(
     """Call the command on tiny curl-noise data."""
 
     def call(*words: str) -> int:
-        places = [
-            "--size",
-            "tiny",
-            "--root",
-            str(generated.root),
-            "--runs",
-            str(tmp_path / "runs"),
+        options = [
+            *("--size", "tiny"),
+            *("--root", str(generated.root)),
+            *("--runs", str(tmp_path / "runs")),
+            *("--device", "cpu"),
+            *("--threads", "1"),
+            *("--set", "model.layers=1"),
         ]
-        small = ["--device", "cpu", "--threads", "1", "--set", "model.layers=1"]
-        return command.main([*places, *small, *words], registry=unmeasured)
+        return command.main([*options, *words], registry=unmeasured)
 
     return call
 
 
 def stamps(folder: Path) -> dict[str, int]:
     """Return when the files of a run were written."""
-    return {name: (folder / name).stat().st_mtime_ns for name in FILES}
+    times = {}
+    for name in FILES:
+        times[name] = (folder / name).stat().st_mtime_ns
+    return times
 
 
-def changed_files(before: dict[str, int], after: dict[str, int]) -> list[str]:
+Times = dict[str, int]
+
+
+def changed_files(before: Times, after: Times) -> list[str]:
     """Return the names of the files that were written between two looks."""
     return [name for name in FILES if after[name] != before[name]]
 
@@ -125,39 +130,42 @@ def test_studies_are_what_was_asked_for(
     monkeypatch.setitem(TABLES, "table_4_2", ("4.2", SPLIT))
     for module in (runs, tables):
         monkeypatch.setattr(module, "study_rows", lambda _: MLP_STUDIES[:1])
-    places = {
-        "root": generated.root,
-        "runs": tmp_path / "runs",
-        "output": tmp_path / "out",
-    }
-    small = ("training.steps=1", "model.widths=[4]")
+    one_step = ("training.steps=1", "model.widths=[4]")
     plan = Plan(
         size="tiny",
-        settings=small,
+        settings=one_step,
         device="cpu",
         threads=1,
         registry=unmeasured,
-        **places,
+        root=generated.root,
+        runs=tmp_path / "runs",
+        output=tmp_path / "out",
     )
     runs.make_studies(plan, "table_4_2")
     home = plan.home(SPLIT)
-    first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
+
+    def written_at() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
+
+    first = written_at()
     runs.make_studies(plan, "table_4_2")
-    assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
+    assert written_at() == first
     studies = read_studies([home], plan.hash(SPLIT))
     study = studies["mlp-4-2-1"]
     assert study["train"] > 0.0
     assert study["training"]["step"] == 1
-    (row,) = tables.studies_beside_thesis("table_4_2", "tiny", studies).tables[0].rows
+    item = tables.studies_beside_thesis("table_4_2", "tiny", studies)
+    (row,) = item.tables[0].rows
     assert f"{study['valid']:.3g}" in row
-    assert read_studies([home], "f" * 64) == {}
-    stale = {**study, "training": {"dataset_sha256": "f" * 64}}
+    other_hash = "f" * 64
+    assert read_studies([home], other_hash) == {}
+    stale = {**study, "training": {"dataset_sha256": other_hash}}
     later = {**study, "train": 9.0}
     for other, expected in ((stale, study), (later, later)):
-        (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
-        assert read_studies([home, tmp_path], plan.hash(SPLIT)) == {
-            "mlp-4-2-1": expected
-        }
+        content = json.dumps({"mlp-4-2-1": other})
+        (tmp_path / "mlp_studies.json").write_text(content)
+        studies = read_studies([home, tmp_path], plan.hash(SPLIT))
+        assert studies == {"mlp-4-2-1": expected}
     more_steps = replace(plan, settings=("training.steps=2", "model.widths=[4]"))
     with pytest.raises(UsageError):
         runs.make_studies(more_steps, "table_4_2")
@@ -170,9 +178,11 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     folder = tmp_path / "recipes"
     folder.mkdir()
+    one_step = {"training": {"steps": 1}}
     for name, recipe in (("gns", "tiny-short"), ("mlp", "tiny")):
-        recipes = {"format": 1, "recipes": {f"*/{recipe}": {"training": {"steps": 1}}}}
-        (folder / f"{name}.yaml").write_text(json.dumps(recipes))  # JSON is YAML
+        recipes = {"format": 1, "recipes": {f"*/{recipe}": one_step}}
+        content = json.dumps(recipes)  # JSON is YAML
+        (folder / f"{name}.yaml").write_text(content)
     monkeypatch.setattr(catalogue, "RECIPES", folder)
     monkeypatch.setattr(command, "EXPECTED", {SPLIT: ("supergat", "mlp")})
 
@@ -184,21 +194,25 @@ def test_models_without_the_recipe_are_left_out(
     """With ``--recipe short`` a model that has none is named on stderr, and all others
     are made.
     """
-    words = (*ONLY, "--split", SPLIT, "--recipe", "short", "--set", "model.latent=8")
+    words = (
+        *ONLY,
+        *("--split", SPLIT),
+        *("--recipe", "short"),
+        *("--set", "model.latent=8"),
+    )
     home = tmp_path / "runs" / SPLIT / "tiny-short"
     assert reproduce(*words, "--dry-run") == 0
     output = capsys.readouterr()
-    assert (
-        output.out
-        == "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
-    )
+    plan = "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
+    assert output.out == plan
     assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in output.err
     assert not home.exists()
 
     assert reproduce(*words) == 0
     output = capsys.readouterr()
     assert "curl-noise tiny mlp: left out" in output.err
-    assert [folder.name for folder in home.iterdir()] == ["supergat-0"]
+    names = [folder.name for folder in home.iterdir()]
+    assert names == ["supergat-0"]
     assert reproduce(*words, "--dry-run") == 0
     assert capsys.readouterr().out == "curl-noise tiny supergat-0: there\n"
 
@@ -220,12 +234,9 @@ def test_the_way_to_full_is_told_without_data(
     thesis's own.
     """
     places = (
-        "--size",
-        "full",
-        "--root",
-        str(tmp_path),
-        "--runs",
-        str(tmp_path / "runs"),
+        *("--size", "full"),
+        *("--root", str(tmp_path)),
+        *("--runs", str(tmp_path / "runs")),
     )
     assert command.main([*places, "--recipe", "short", "--list"]) == 0
     assert "table_5_4" in capsys.readouterr().out
@@ -271,12 +282,14 @@ def test_committed_weights_are_shown_without_training(
     assert reproduce(*words) == 0
     assert "seeds 3; 1 x 2 steps" in capsys.readouterr().out
     folder = run_folder.with_name("supergat-3")
-    assert read_statistics(folder / "scores.nc").predictions_sha256 == expected
+    scores = read_statistics(folder / "scores.nc")
+    assert scores.predictions_sha256 == expected
     first = stamps(folder)
     assert reproduce(*words) == 0
     assert stamps(folder) == first
     assert not (folder / "tensorboard").exists()
-    assert list((tmp_path / "runs" / "reproduce" / "tiny").glob("fig_5_22*.png"))
+    figures = tmp_path / "runs" / "reproduce" / "tiny"
+    assert list(figures.glob("fig_5_22*.png"))
 
 
 def test_unusable_committed_weights_leave_nothing(
@@ -285,12 +298,13 @@ def test_unusable_committed_weights_leave_nothing(
     """No weights leave a figure that says so; damaged ones end with exit code 3, and no
     run appears.
     """
-    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "none")) == 0
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["reproduce"]
+    runs_folder = tmp_path / "runs"
+    without_training = (*ONLY, "--no-training", "--weights")
+    assert reproduce(*without_training, str(tmp_path / "none")) == 0
+    names = [path.name for path in runs_folder.iterdir()]
+    assert names == ["reproduce"]
     weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.pt"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"no weights")
-    assert (
-        reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3
-    )
-    assert not list((tmp_path / "runs" / SPLIT).rglob("*.*"))
+    assert reproduce(*without_training, str(tmp_path / "weights")) == 3
+    assert not list((runs_folder / SPLIT).rglob("*.*"))
