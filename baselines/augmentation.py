@@ -96,7 +96,8 @@ def mirror_matrices(symmetry: Symmetry, dimension: int = 2) -> Tensor:
     upright = torch.diag_embed(diagonals)
 
     if symmetry is Symmetry.SQUARE:
-        return torch.cat([upright, upright.flip(2)])
+        swapped = upright.flip(2)
+        return torch.cat([upright, swapped])
     if symmetry is Symmetry.MIRROR:
         return upright[:2]
     return upright[:1]
@@ -104,15 +105,18 @@ def mirror_matrices(symmetry: Symmetry, dimension: int = 2) -> Tensor:
 
 def _solid_matrices(symmetry: Symmetry) -> Tensor:
     """Return the matrices of all mirror images in three dimensions."""
-    signs = torch.tensor(list(itertools.product((1.0, -1.0), repeat=3)))
+    diagonals = itertools.product((1.0, -1.0), repeat=3)
+    signs = torch.tensor(list(diagonals))
     upright = torch.diag_embed(signs)
     if symmetry is Symmetry.NONE:
         return upright[:1]
     if symmetry is Symmetry.MIRROR:
-        return upright[signs[:, 1] > 0.0]
+        keeps_y = signs[:, 1] > 0.0
+        return upright[keeps_y]
     images = []
     for order in itertools.permutations(range(3)):
-        images.append(upright[:, :, list(order)])
+        permuted = upright[:, :, list(order)]
+        images.append(permuted)
     return torch.cat(images)
 
 
@@ -127,13 +131,20 @@ def mirror_field(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> T
             of a node.
     """
     channel_matrix: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
+    channel_matrix = channel_matrix.to(field)
     with torch.autocast(field.device.type, enabled=False):
-        image = torch.einsum("dc,wc...->wd...", channel_matrix.to(field), field)
+        image = torch.einsum("dc,wc...->wd...", channel_matrix, field)
+
     # New axis i is that old axis where row i of the matrix is not 0.
-    order = matrix.abs().argmax(dim=1).tolist()
-    image = image.permute(0, 1, *[axis + 2 for axis in order])
+    old_axes = matrix.abs().argmax(dim=1)
+    order = [0, 1]  # windows and channels stay
+    for old_axis in old_axes.tolist():
+        order.append(old_axis + 2)
+    image = image.permute(order)
+
+    signs = matrix.sum(dim=1)
     flipped_axes = []
-    for axis, sign in enumerate(matrix.sum(dim=1).tolist()):
+    for axis, sign in enumerate(signs.tolist()):
         if sign < 0.0:
             flipped_axes.append(axis + 2)
     return image.flip(flipped_axes)
@@ -154,9 +165,12 @@ def draw_mirror_matrices(
     flip_x, flip_y, swap = bits * (symmetry is Symmetry.SQUARE)
     if symmetry is Symmetry.MIRROR:
         flip_x = bits[0]
-    signs = 1.0 - 2.0 * torch.stack([flip_x, flip_y], dim=1)
-    matrix = torch.diag_embed(signs)
-    return torch.where(swap.bool()[:, None, None], matrix.flip(2), matrix)
+    flips = torch.stack([flip_x, flip_y], dim=1)
+    signs = 1.0 - 2.0 * flips
+    upright = torch.diag_embed(signs)
+    swapped = upright.flip(2)
+    is_swapped = swap.bool()[:, None, None]
+    return torch.where(is_swapped, swapped, upright)
 
 
 def _draw_solid_matrices(
@@ -167,10 +181,10 @@ def _draw_solid_matrices(
     Where gravity acts along the second axis it stays as it is.
     """
     device = generator.device
-    signs = 1.0 - 2.0 * torch.randint(
-        2, (windows, 3), generator=generator, device=device
-    )
-    order = torch.arange(3, device=device).expand(windows, 3)
+    flips = torch.randint(2, (windows, 3), generator=generator, device=device)
+    signs = 1.0 - 2.0 * flips
+    axes = torch.arange(3, device=device)
+    order = axes.expand(windows, 3)
     if symmetry is Symmetry.SQUARE:
         draws = torch.rand(windows, 3, generator=generator, device=device)
         order = draws.argsort(dim=1)
@@ -178,7 +192,8 @@ def _draw_solid_matrices(
         signs[:, 1] = 1.0
     if symmetry is Symmetry.NONE:
         signs = torch.ones_like(signs)
-    permutation = torch.eye(3, device=device)[order]
+    identity = torch.eye(3, device=device)
+    permutation = identity[order]
     return signs[:, :, None] * permutation
 
 
@@ -195,9 +210,15 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         UsageError: axes change places in a box whose sides differ, or the y axis does
             so where a force acts on layers along it.
     """
-    lengths = [high - low for low, high in bounds]
-    swaps_axes = bool((matrix.diagonal(dim1=1, dim2=2) == 0.0).any())
-    if max(lengths) - min(lengths) > 1e-6 and swaps_axes:
+    lengths = []
+    middles = []
+    for low, high in bounds:
+        lengths.append(high - low)
+        middles.append((low + high) / 2)
+    largest_difference = max(lengths) - min(lengths)
+    diagonal = matrix.diagonal(dim1=1, dim2=2)
+    changes_place = diagonal == 0.0
+    if largest_difference > 1e-6 and bool(changes_place.any()):
         raise UsageError(
             "axes cannot change places in this box",
             where="symmetry",
@@ -206,19 +227,23 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
             fix="use symmetry: mirror",
         )
     matrix = matrix.to(batch.position)
-    centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
+    centre = batch.position.new_tensor(middles)
     by_particle = matrix[batch.sample]
 
-    position = _multiply(by_particle[:, None], batch.position - centre) + centre
+    from_centre = batch.position - centre
+    position = _multiply(by_particle[:, None], from_centre) + centre
     origin = batch.origin
     if origin is not None:
-        origin = _multiply(by_particle, origin - centre) + centre
+        from_centre = origin - centre
+        origin = _multiply(by_particle, from_centre) + centre
     walls = batch.wall_velocity
     if walls is not None:
         # A wall takes the place of the wall to which its mirrored normal points.
-        source = wall_permutation(matrix).argmax(dim=2)
+        permutation = wall_permutation(matrix)
+        old_wall = permutation.argmax(dim=2)
         walls = _multiply(matrix[:, None, None], walls)
-        walls = walls.gather(2, source[:, None, :, None].expand_as(walls))
+        old_walls = old_wall[:, None, :, None].expand_as(walls)
+        walls = walls.gather(2, old_walls)
     force = batch.body_force
     if force is not None:
         force = _mirror_force(force, matrix)
@@ -250,8 +275,10 @@ def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
             fix="use symmetry: mirror",
         )
     image = _multiply(matrix[:, None, None], force)
-    is_upside_down = (sign < 0.0)[:, None, None, None]
-    return torch.where(is_upside_down, image.flip(2), image)
+    reversed_layers = image.flip(2)
+    is_upside_down = sign < 0.0
+    is_reversed = is_upside_down[:, None, None, None]
+    return torch.where(is_reversed, reversed_layers, image)
 
 
 def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Batch:
@@ -265,20 +292,23 @@ def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Bat
         generator: source of the ways, uniform over a period.
     """
     dimension = batch.position.shape[2]
-    draws = torch.rand(
-        (batch.windows, dimension), generator=generator, device=generator.device
-    )
+    shape = (batch.windows, dimension)
+    draws = torch.rand(shape, generator=generator, device=generator.device)
+    ways = draws.to(box.period) * box.period
     # The period of an axis with walls is infinite.
     is_periodic = box.period.isfinite()
-    shift = torch.where(is_periodic, draws.to(box.period) * box.period, 0.0)
+    shift = torch.where(is_periodic, ways, 0.0)
     if batch.body_force is not None:
         shift[:, 1] = 0.0
-    by_particle = shift.to(batch.position)[batch.sample]
+    shift = shift.to(batch.position)
+    by_particle = shift[batch.sample]
 
-    position = box.wrap(batch.position + by_particle[:, None])
+    moved = batch.position + by_particle[:, None]
+    position = box.wrap(moved)
     origin = batch.origin
     if origin is not None:
-        origin = box.wrap(origin + by_particle)
+        moved = origin + by_particle
+        origin = box.wrap(moved)
     return replace(batch, position=position, origin=origin)
 
 
@@ -287,12 +317,18 @@ def wall_permutation(matrix: Tensor) -> Tensor:
     dimension = matrix.shape[-1]
     normals = torch.zeros(2 * dimension, dimension)
     for axis in range(dimension):
-        normals[2 * axis, axis] = -1.0
-        normals[2 * axis + 1, axis] = 1.0
+        lower_wall = 2 * axis
+        upper_wall = lower_wall + 1
+        normals[lower_wall, axis] = -1.0
+        normals[upper_wall, axis] = 1.0
     normals = normals.to(matrix)
-    image_normals = _multiply(matrix[..., None, :, :], normals)  # [..., wall, 2]
-    cosines = (normals[:, None] * image_normals[..., None, :, :]).sum(dim=-1)
-    return (cosines > 0.5).to(matrix)
+
+    matrix_of_walls = matrix[..., None, :, :]
+    image_normals = _multiply(matrix_of_walls, normals)  # [..., wall, axis]
+    products = normals[:, None] * image_normals[..., None, :, :]
+    cosines = products.sum(dim=-1)
+    is_same_wall = cosines > 0.5
+    return is_same_wall.to(matrix)
 
 
 def strain_matrix(matrix: Tensor) -> Tensor:
@@ -309,7 +345,8 @@ def strain_matrix(matrix: Tensor) -> Tensor:
 
 def _multiply(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return products of matrices and vectors; autocast would round matmul's."""
-    return (matrix * vector.unsqueeze(-2)).sum(dim=-1)
+    products = matrix * vector.unsqueeze(-2)
+    return products.sum(dim=-1)
 
 
 def add_walk_noise(
@@ -321,17 +358,22 @@ def add_walk_noise(
     ``std / sqrt(history - 1)`` each. That of positions [length] is its sum, 0 in the
     first frame. The frames after the history move along.
     """
+    particles, frame_count, dimension = position.shape
     velocity_count = history - 1
-    shape = (len(position), velocity_count, position.shape[2])
+    shape = (particles, velocity_count, dimension)
     normal = torch.randn(shape, generator=generator, device=generator.device)
-    step = normal * (std / math.sqrt(velocity_count))
+    step_std = std / math.sqrt(velocity_count)
+    step = normal * step_std
 
     velocity_noise = step.cumsum(dim=1)
-    position_noise = velocity_noise.cumsum(dim=1).to(position)
+    position_noise = velocity_noise.cumsum(dim=1)
+    position_noise = position_noise.to(position)
     first = torch.zeros_like(position_noise[:, :1])
-    future_frames = position.shape[1] - history
-    future = position_noise[:, -1:].expand(-1, future_frames, -1)
-    return position + torch.cat([first, position_noise, future], dim=1)
+    last = position_noise[:, -1:]
+    future_frames = frame_count - history
+    future = last.expand(-1, future_frames, -1)
+    noise = torch.cat([first, position_noise, future], dim=1)
+    return position + noise
 
 
 def velocity_towards_path(
@@ -353,7 +395,8 @@ def velocity_towards_path(
     velocity = gap / frames
     limit = _MOST_DEVIATIONS * acceleration_std
     speed: Tensor = torch.linalg.vector_norm(velocity, dim=1, keepdim=True)
-    return velocity * limit / speed.clamp(min=limit)
+    divisor = speed.clamp(min=limit)
+    return velocity * limit / divisor
 
 
 def augment(model: Baseline, batch: Batch, generator: torch.Generator) -> Batch:

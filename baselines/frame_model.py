@@ -49,6 +49,12 @@ class FrameState(nn.Module):
         self.register_buffer("mean", mean_tensor, persistent=False)
         self.register_buffer("std", std_tensor, persistent=False)
 
+    def _position_statistics(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Return mean and deviation of positions [length], each of shape [axis]."""
+        mean = self.mean[: self.dimension]
+        std = self.std[: self.dimension]
+        return mean.to(dtype), std.to(dtype)
+
     def standardise(self, position: Tensor) -> Tensor:
         """Return the states [1], shape [..., frame, particle, 2 axis].
 
@@ -60,41 +66,51 @@ class FrameState(nn.Module):
             raise DataError(
                 "a velocity needs two frames", expected="2 or more", got=frame_count
             )
-        velocity = self.box.displacement(
-            position[..., :-1, :, :], position[..., 1:, :, :]
-        )
-        velocity = torch.cat([velocity[..., :1, :, :], velocity], dim=-3)
+        before = position[..., :-1, :, :]
+        after = position[..., 1:, :, :]
+        velocity = self.box.displacement(before, after)
+        first_velocity = velocity[..., :1, :, :]
+        velocity = torch.cat([first_velocity, velocity], dim=-3)
         state = torch.cat([position, velocity], dim=-1)
-        return (state - self.mean.to(state.dtype)) / self.std.to(state.dtype)
+
+        mean = self.mean.to(state.dtype)
+        std = self.std.to(state.dtype)
+        return (state - mean) / std
 
     def position(self, state: Tensor) -> Tensor:
         """Return the positions of states [length], [..., axis] from [..., 2 axis]."""
-        mean = self.mean[: self.dimension].to(state.dtype)
-        std = self.std[: self.dimension].to(state.dtype)
-        return state[..., : self.dimension] * std + mean
+        mean, std = self._position_statistics(state.dtype)
+        standardised = state[..., : self.dimension]
+        return standardised * std + mean
 
     def wrap(self, state: Tensor) -> Tensor:
         """Return states whose positions lie in the box along periodic axes."""
         if not self.box.box.is_periodic:
             return state
-        mean = self.mean[: self.dimension].to(state.dtype)
-        std = self.std[: self.dimension].to(state.dtype)
-        position = self.box.wrap(self.position(state))
-        return torch.cat([(position - mean) / std, state[..., self.dimension :]], -1)
+        mean, std = self._position_statistics(state.dtype)
+        position = self.position(state)
+        wrapped = self.box.wrap(position)
+        standardised = (wrapped - mean) / std
+        velocity = state[..., self.dimension :]
+        return torch.cat([standardised, velocity], dim=-1)
 
     def squared_errors(self, truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
         """Return squared errors of positions and velocities [1], halves of Eq. 4.16."""
         dimension = self.dimension
         difference = predicted - truth
         if self.box.box.is_periodic:
-            std = self.std[:dimension].to(truth.dtype)
+            _, std = self._position_statistics(truth.dtype)
             true_position = self.position(truth)
-            way = self.box.displacement(true_position, self.position(predicted))
-            difference = torch.cat([way / std, difference[..., dimension:]], dim=-1)
+            predicted_position = self.position(predicted)
+            way = self.box.displacement(true_position, predicted_position)
+            velocity_difference = difference[..., dimension:]
+            difference = torch.cat([way / std, velocity_difference], dim=-1)
         error = difference.square()
+        position_error = error[..., :dimension]
+        velocity_error = error[..., dimension:]
         return {
-            "position": error[..., :dimension].mean(),
-            "velocity": error[..., dimension:].mean(),
+            "position": position_error.mean(),
+            "velocity": velocity_error.mean(),
         }
 
 
@@ -107,17 +123,19 @@ def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
     Raises:
         DataError: a window has another number of particles.
     """
-    counts = torch.bincount(batch.sample, minlength=batch.windows).tolist()
-    if set(counts) != {particles}:
+    counts = torch.bincount(batch.sample, minlength=batch.windows)
+    distinct_counts = set(counts.tolist())
+    if distinct_counts != {particles}:
         raise DataError(
             "a model of whole frames needs every particle",
             where="batch",
             expected=f"{particles} particles in each window",
-            got=", ".join(map(str, sorted(set(counts)))),
+            got=", ".join(map(str, sorted(distinct_counts))),
             fix="use a graph network for scenarios of other sizes",
         )
-    position = batch.position.view(batch.windows, particles, batch.frames, -1)
-    material = batch.material.view(batch.windows, particles)
+    windows = batch.windows
+    position = batch.position.view(windows, particles, batch.frames, -1)
+    material = batch.material.view(windows, particles)
     return position.transpose(1, 2), material
 
 
@@ -175,14 +193,17 @@ class FrameModel(Baseline):
         """Return the true and the predicted state of the last frame."""
         window = self._standardise(batch)
         truth = window.state[:, -1]
-        inputs = window.state[:, -1 - self.inputs : -1]
+        first_input = -1 - self.inputs
+        inputs = window.state[:, first_input:-1]
         noisy_inputs = self.add_noise(inputs, generator)
-        predicted = self.next_state(FrameWindow(noisy_inputs, window.material))
+        noisy_window = FrameWindow(noisy_inputs, window.material)
+        predicted = self.next_state(noisy_window)
         return truth, predicted
 
     def _standardise(self, batch: Batch) -> FrameWindow:
         position, material = arrange_in_frames(batch, self.info.particles)
-        state = self.frame_state.standardise(position.to(self.precision))
+        position = position.to(self.precision)
+        state = self.frame_state.standardise(position)
         return FrameWindow(state, material)
 
     def add_noise(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -198,15 +219,22 @@ class FrameModel(Baseline):
         window = self._standardise(given)
         state = window.state[:, -self.inputs :]
         missing_frames = self.inputs - state.shape[1]
-        repeated = state[:, :1].expand(-1, missing_frames, -1, -1)
-        return FrameWindow(torch.cat([repeated, state], dim=1), window.material)
+        first_state = state[:, :1]
+        repeated = first_state.expand(-1, missing_frames, -1, -1)
+        full_state = torch.cat([repeated, state], dim=1)
+        return FrameWindow(full_state, window.material)
 
     def advance(self, state: FrameWindow) -> tuple[FrameWindow, Tensor]:
         """Return the next window and positions [length], shape [particle, axis]."""
-        new_state = self.frame_state.wrap(self.next_state(state))
-        states = torch.cat([state.state[:, 1:], new_state.unsqueeze(1)], dim=1)
-        position = self.frame_state.position(new_state).flatten(0, 1)
-        return FrameWindow(states, state.material), position.to(torch.float32)
+        predicted = self.next_state(state)
+        new_state = self.frame_state.wrap(predicted)
+        latest_states = state.state[:, 1:]
+        states = torch.cat([latest_states, new_state.unsqueeze(1)], dim=1)
+        window = FrameWindow(states, state.material)
+
+        position = self.frame_state.position(new_state)
+        position = position.flatten(0, 1)
+        return window, position.to(torch.float32)
 
 
 class FrameTarget(enum.StrEnum):
@@ -248,13 +276,16 @@ class FrameNetwork(FrameModel):
         self.input_features = 2 * info.box.dimension + options.material
         # the standard deviation of a state's change per frame [standardised]
         statistics = info.statistics
+        change_of_state = {
+            "position_std": "velocity_std",
+            "velocity_std": "acceleration_std",
+        }
         ratios = []
-        for change_name, state_name in (
-            ("velocity_std", "position_std"),
-            ("acceleration_std", "velocity_std"),
-        ):
-            pairs = zip(statistics[change_name], statistics[state_name], strict=True)
-            ratios += [change_std / state_std for change_std, state_std in pairs]
+        for state_name, change_name in change_of_state.items():
+            state_stds = statistics[state_name]
+            change_stds = statistics[change_name]
+            for state_std, change_std in zip(state_stds, change_stds, strict=True):
+                ratios.append(change_std / state_std)
         typical_change = torch.tensor(ratios)
         self.register_buffer("typical_change", typical_change, persistent=False)
 
@@ -275,8 +306,11 @@ class FrameNetwork(FrameModel):
         if not self.options.material:
             return window.state
         frame_count = window.state.shape[1]
-        material = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
-        material = material[:, None, :, None].expand(-1, frame_count, -1, -1)
+        number = window.material.to(torch.float32)
+        step = 2.0 / (MATERIALS - 1)
+        material = number * step - 1.0
+        material = material[:, None, :, None]
+        material = material.expand(-1, frame_count, -1, -1)
         return torch.cat([window.state, material], dim=-1)
 
     def decode_state(self, output: Tensor, window: FrameWindow) -> Tensor:
@@ -285,7 +319,9 @@ class FrameNetwork(FrameModel):
         The output of the network has shape [window, feature].
         """
         last_state = window.state[:, -1]
-        output = output.view(last_state.shape).to(last_state.dtype)
+        output = output.view(last_state.shape)
+        output = output.to(last_state.dtype)
         if self.options.target is FrameTarget.STATE:
             return output
-        return last_state + self.typical_change * output
+        change = self.typical_change * output
+        return last_state + change

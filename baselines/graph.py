@@ -86,17 +86,23 @@ def radius_graph(
         numbers = tree_edges(
             x_array, window_array, radius, box=box, self_edges=self_edges, most=most
         )
-        edges = torch.from_numpy(np.sort(numbers)).to(x.device)
+        numbers.sort()
+        edges = torch.from_numpy(numbers).to(x.device)
     elif most is not None:
         x_array = x.cpu().numpy()
         window_array = window.cpu().numpy()
         numbers = nearest_edges(x_array, window_array, radius, self_edges, most)
-        edges = torch.from_numpy(np.sort(numbers)).to(x.device)
+        numbers.sort()
+        edges = torch.from_numpy(numbers).to(x.device)
     elif x.device.type == "cpu":
-        numbers = edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)
-        edges = torch.from_numpy(np.sort(numbers))
+        x_array = x.numpy()
+        window_array = window.numpy()
+        numbers = edge_numbers(np, x_array, window_array, radius, self_edges)
+        numbers.sort()
+        edges = torch.from_numpy(numbers)
     else:
-        edges = edge_numbers(torch, x, window, radius, self_edges).sort().values
+        unsorted_edges = edge_numbers(torch, x, window, radius, self_edges)
+        edges = unsorted_edges.sort().values
     senders = edges & 0xFFFFFFFF
     receivers = edges >> 32
     return torch.stack([senders, receivers])
@@ -122,8 +128,11 @@ def _check_search(
         )
     if sample is None:
         return
-    fits = sample.shape == position.shape[:1]
-    if not fits or not bool((sample[1:] >= sample[:-1]).all()):
+    is_valid = sample.shape == position.shape[:1]
+    if is_valid:
+        is_ascending = sample[1:] >= sample[:-1]
+        is_valid = bool(is_ascending.all())
+    if not is_valid:
         raise UsageError(
             "windows do not fit the particles",
             where="radius_graph, sample",
@@ -137,9 +146,11 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
 
     ``xp`` is NumPy or torch; ``x`` and ``window`` are its arrays.
     """
-    finite = xp.where(xp.isfinite(x).all(1))[0]  # particles that have neighbours
+    is_finite = xp.isfinite(x).all(1)
+    finite = xp.where(is_finite)[0]  # particles that have neighbours
     x = x[finite]
-    key, stride = _cell_keys(xp, x, window[finite], radius)
+    window = window[finite]
+    key, stride = _cell_keys(xp, x, window, radius)
 
     # Particles in the order of their cells.
     order = xp.argsort(key, stable=True)
@@ -149,24 +160,30 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
 
     # The candidates of each particle are two runs in that order: the rest of its own
     # cell with the cell above, and three cells of the next column.
-    place = xp.arange(len(x), device=x.device)
+    own_start = xp.arange(len(x), device=x.device) + 1
     above_end = xp.searchsorted(key, key + 2)
     beside_start = xp.searchsorted(key, key + (stride - 1))
     beside_end = xp.searchsorted(key, key + (stride + 2))
-    start = xp.concatenate([place + 1, beside_start])
-    count = xp.concatenate([above_end - (place + 1), beside_end - beside_start])
+    own_count = above_end - own_start
+    beside_count = beside_end - beside_start
+    start = xp.concatenate([own_start, beside_start])
+    count = xp.concatenate([own_count, beside_count])
     i, j = _expand_runs(xp, start, count, particles=len(x))
 
     x_axis, y_axis = xp.stack([x[:, 0], x[:, 1]])
     dx = x_axis[i] - x_axis[j]
     dy = y_axis[i] - y_axis[j]
-    near = xp.where(dx * dx + dy * dy <= radius * radius)[0]
+    is_near = dx * dx + dy * dy <= radius * radius
+    near = xp.where(is_near)[0]
     first = particle[i[near]]
     second = particle[j[near]]
 
-    parts = [(first << 32) | second, (second << 32) | first]
+    forward = (first << 32) | second
+    backward = (second << 32) | first
+    parts = [forward, backward]
     if self_edges:
-        parts.append((finite << 32) | finite)
+        own_edges = (finite << 32) | finite
+        parts.append(own_edges)
     return xp.concatenate(parts)
 
 
@@ -178,13 +195,17 @@ def _cell_keys(xp: Any, x: Any, window: Any, radius: float) -> tuple[Any, Any]: 
     """
     if not len(x):
         return window, 0
-    cell = xp.floor(x * (1.0 / (radius * (1.0 + MARGIN))))
-    cell = xp.asarray(xp.clip(cell, -FAR, FAR), dtype=xp.int64)
+    width = radius * (1.0 + MARGIN)
+    place = xp.floor(x * (1.0 / width))
+    place = xp.clip(place, -FAR, FAR)
+    cell = xp.asarray(place, dtype=xp.int64)
     cell = cell - xp.amin(cell, 0)
-    columns, rows = xp.amax(cell, 0)
-    stride = rows + 2
-    column = window * (columns + 2) + cell[:, 0]
-    return column * stride + cell[:, 1], stride
+    last_column, last_row = xp.amax(cell, 0)
+    columns = last_column + 2
+    stride = last_row + 2
+    column = window * columns + cell[:, 0]
+    row = cell[:, 1]
+    return column * stride + row, stride
 
 
 def _expand_runs(xp: Any, start: Any, count: Any, *, particles: int) -> tuple[Any, Any]:  # noqa: ANN401
@@ -205,7 +226,9 @@ def _expand_runs(xp: Any, start: Any, count: Any, *, particles: int) -> tuple[An
         i = run % particles
     first_pair = xp.cumsum(count, 0) - count
     pair = xp.arange(len(run), device=start.device)
-    return i, pair + (start - first_pair)[run]
+    offset = start - first_pair
+    j = pair + offset[run]
+    return i, j
 
 
 def nearest_edges(
@@ -220,31 +243,61 @@ def nearest_edges(
     ``x`` are positions [length], shape [particle, 2], ``window`` the number of the
     window of each.
     """
-    finite = np.flatnonzero(np.isfinite(x).all(axis=1))
+    is_finite = np.isfinite(x).all(axis=1)
+    finite = np.flatnonzero(is_finite)
     x = x[finite]
     window = window[finite]
     if not len(x):
         return np.empty(0, np.int64)
 
     # A third coordinate keeps windows farther apart than the radius.
-    points = np.column_stack([x, 4.0 * radius * window])
+    height = 4.0 * radius * window
+    points = np.column_stack([x, height])
     # A particle is among its own neighbours, unless more lie at its very place.
-    ranks = np.arange(1, min(most + 1, len(x)) + 1)
+    count = len(x)
+    most_ranks = min(most + 1, count)
+    ranks = np.arange(1, most_ranks + 1)
     reach = radius * (1.0 + MARGIN)
-    _, neighbours = KDTree(points).query(points, k=ranks, distance_upper_bound=reach)
+    tree = KDTree(points)
+    _, neighbours = tree.query(points, k=ranks, distance_upper_bound=reach)
 
-    receiver = np.arange(len(x))[:, None]
-    sender = np.minimum(neighbours, len(x) - 1)  # len(x) stands for no neighbour
-    dx, dy = np.moveaxis(x[receiver] - x[sender], -1, 0)
+    receiver = np.arange(count)[:, None]
+    sender = np.minimum(neighbours, count - 1)  # ``count`` stands for no neighbour
+    way = x[receiver] - x[sender]
+    dx, dy = np.moveaxis(way, -1, 0)
     is_near = dx * dx + dy * dy <= radius * radius
-    is_neighbour = (neighbours < len(x)) & (neighbours != receiver) & is_near
-    is_heard = is_neighbour & (is_neighbour.cumsum(axis=1) <= most)
-    i, rank = np.nonzero(is_heard)
+    is_neighbour = _is_neighbour(neighbours, count) & is_near
+    i, rank = _nearest_pairs(is_neighbour, most)
 
-    parts = [(finite[i] << 32) | finite[sender[i, rank]]]
+    heard_receiver = finite[i]
+    heard_sender = finite[sender[i, rank]]
+    edges = (heard_receiver << 32) | heard_sender
+    parts = [edges]
     if self_edges:
-        parts.append((finite << 32) | finite)
+        own_edges = (finite << 32) | finite
+        parts.append(own_edges)
     return np.concatenate(parts)
+
+
+def _is_neighbour(neighbours: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
+    """Tell which answers of a k-d tree name a particle other than the asking one.
+
+    The answers have shape [particle, rank]; the number of particles stands for none.
+    """
+    receiver = np.arange(count)[:, None]
+    is_particle = neighbours < count
+    is_other = neighbours != receiver
+    return is_particle & is_other
+
+
+def _nearest_pairs(
+    is_neighbour: NDArray[np.bool_], most: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return receivers and ranks of the first ``most`` neighbours of each particle."""
+    neighbour_count = is_neighbour.cumsum(axis=1)
+    is_heard = is_neighbour & (neighbour_count <= most)
+    receiver, rank = np.nonzero(is_heard)
+    return receiver, rank
 
 
 def tree_edges(
@@ -262,18 +315,25 @@ def tree_edges(
     window of each.
     """
     parts = [np.empty(0, np.int64)]
-    finite = np.flatnonzero(np.isfinite(x).all(axis=1))
-    for number in np.unique(window[finite]):
-        members = finite[window[finite] == number]
+    is_finite = np.isfinite(x).all(axis=1)
+    finite = np.flatnonzero(is_finite)
+    finite_window = window[finite]
+    for number in np.unique(finite_window):
+        is_member = finite_window == number
+        members = finite[is_member]
         tree = box.tree(x[members])
         if most is None:
             pairs = tree.query_pairs(radius, output_type="ndarray")
             first, second = members[pairs].T
-            parts += [(first << 32) | second, (second << 32) | first]
+            forward = (first << 32) | second
+            backward = (second << 32) | first
+            parts += [forward, backward]
         else:
-            parts.append(_nearest_in_tree(tree, members, radius, most))
+            edges = _nearest_in_tree(tree, members, radius, most)
+            parts.append(edges)
         if self_edges:
-            parts.append((members << 32) | members)
+            own_edges = (members << 32) | members
+            parts.append(own_edges)
     return np.concatenate(parts)
 
 
@@ -281,15 +341,18 @@ def _nearest_in_tree(
     tree: cKDTree, members: NDArray[np.int64], radius: float, most: int
 ) -> NDArray[np.int64]:
     """Return the edges to the nearest neighbours of each particle of a tree."""
-    ranks = np.arange(1, min(most + 1, len(members)) + 1)
+    count = len(members)
+    most_ranks = min(most + 1, count)
+    ranks = np.arange(1, most_ranks + 1)
+    points = np.asarray(tree.data)
     reach = math.nextafter(radius, math.inf)  # the tree leaves out what is as far
-    answer = tree.query(np.asarray(tree.data), k=ranks, distance_upper_bound=reach)
+    answer = tree.query(points, k=ranks, distance_upper_bound=reach)
     neighbours = np.asarray(answer[1])
-    receiver = np.arange(len(members))[:, None]
-    is_neighbour = (neighbours < len(members)) & (neighbours != receiver)
-    is_heard = is_neighbour & (is_neighbour.cumsum(axis=1) <= most)
-    i, rank = np.nonzero(is_heard)
-    return np.asarray((members[i] << 32) | members[neighbours[i, rank]])
+    is_neighbour = _is_neighbour(neighbours, count)
+    i, rank = _nearest_pairs(is_neighbour, most)
+    receiver = members[i]
+    sender = members[neighbours[i, rank]]
+    return np.asarray((receiver << 32) | sender)
 
 
 MATERIALS = 4  # in datasets.yaml: 0 liquid, 1 jelly, 2 snow, 3 rope
@@ -306,9 +369,11 @@ class Standardisation(nn.Module):
         self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0
     ) -> None:
         super().__init__()
-        variance = torch.tensor(std, dtype=torch.float64) ** 2 + noise**2
+        exact_std = torch.tensor(std, dtype=torch.float64)
+        variance = exact_std**2 + noise**2
+        std_with_noise = variance.sqrt()
         mean_tensor = torch.tensor(mean, dtype=torch.float32)
-        std_tensor = variance.sqrt().to(torch.float32)
+        std_tensor = std_with_noise.to(torch.float32)
         # Not in the files of weights, where half precision would round them: dataset
         # info and options rebuild them.
         self.register_buffer("mean", mean_tensor, persistent=False)
@@ -339,12 +404,16 @@ def wall_distance(
     """
     distances = []
     components = position.unbind(dim=-1)
-    for x, (low, high), is_periodic in zip(components, bounds, periodic, strict=False):
+    for x, interval, is_periodic in zip(components, bounds, periodic, strict=False):
+        low, high = interval
         if is_periodic:
-            distances += [torch.full_like(x, reach), torch.full_like(x, reach)]
+            out_of_reach = torch.full_like(x, reach)
+            distances += [out_of_reach, out_of_reach]
         else:
             distances += [x - low, high - x]
-    return (torch.stack(distances, dim=-1) / reach).clamp(-1.0, 1.0)
+    distance = torch.stack(distances, dim=-1)
+    relative_distance = distance / reach
+    return relative_distance.clamp(-1.0, 1.0)
 
 
 def edge_features(
@@ -373,9 +442,11 @@ def edge_features(
     displacement = way / radius
     # The gradient of a norm is NaN at 0, where two particles coincide; that of this
     # root is 0.
-    square = (displacement**2).sum(dim=-1, keepdim=True)
+    squares = displacement**2
+    square = squares.sum(dim=-1, keepdim=True)
     is_positive = square > 0.0
-    distance = torch.where(is_positive, square, 1.0).sqrt() * is_positive
+    radicand = torch.where(is_positive, square, 1.0)
+    distance = radicand.sqrt() * is_positive
     return torch.cat([displacement, distance], dim=-1)
 
 
@@ -439,10 +510,12 @@ class NodeFeatures(nn.Module):
                 shape [particle, wall, axis]; None stands for walls at rest.
         """
         last_velocity = self.velocity(velocity[:, -1])
-        changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
+        acceleration = velocity.diff(dim=1)
+        changes = self.acceleration(acceleration)
         distance = wall_distance(position, self.bounds, self.reach, self.periodic)
-        embedded = self.embedding(material).to(position.dtype)
-        parts = [last_velocity, changes, distance, embedded]
+        embedded = self.embedding(material)
+        embedded = embedded.to(position.dtype)
+        parts = [last_velocity, changes.flatten(1), distance, embedded]
         if self.moving_walls:
             shape = (*distance.shape, self.dimension)
             felt_velocity = distance.new_zeros(shape)

@@ -86,25 +86,36 @@ class FieldEncoder(nn.Module):
         self.material_count = len(options.materials)
 
         slot = torch.full((MATERIALS,), -1)
-        slot[list(options.materials)] = torch.arange(self.material_count)
-        wall_distance = grid.wall_distance(REACH * grid.spacing)
+        slots = torch.arange(self.material_count)
+        slot[list(options.materials)] = slots
+        reach = REACH * grid.spacing
+        wall_distance = grid.wall_distance(reach)
+        beside_walls = grid.beside_walls()
         self.register_buffer("slot", slot, persistent=False)
         self.register_buffer("wall_distance", wall_distance, persistent=False)
-        self.register_buffer("beside_walls", grid.beside_walls(), persistent=False)
+        self.register_buffer("beside_walls", beside_walls, persistent=False)
 
     @property
     def field_channels(self) -> int:
         """Channels of :meth:`encode`."""
         axes = self.grid.dimension
-        per_material = 1 + axes * self.options.velocities + 3 * self.options.strain
-        return self.material_count * per_material + len(self.wall_distance)
+        velocity_channels = axes * self.options.velocities
+        strain_channels = 3 * self.options.strain
+        per_material = 1 + velocity_channels + strain_channels
+        wall_channels = len(self.wall_distance)
+        return self.material_count * per_material + wall_channels
 
     @property
     def forcing_channels(self) -> int:
         """Channels of :meth:`forcing`."""
         axes = self.grid.dimension
-        kinds = int(self.options.wall_velocity) + int(self.options.body_force)
-        return axes * self.options.bundle * kinds
+        return axes * self.options.bundle * self._forcing_kinds
+
+    @property
+    def _forcing_kinds(self) -> int:
+        """Number of forcings that the U-Net sees: moving walls, a force, or both."""
+        options = self.options
+        return int(options.wall_velocity) + int(options.body_force)
 
     def layers(self, material: Tensor, sample: Tensor) -> Tensor:
         """Return the layer of each particle: one for each window and material.
@@ -113,7 +124,8 @@ class FieldEncoder(nn.Module):
             DataError: the model was not trained with one of the materials.
         """
         slot = self.slot[material]
-        if bool((slot < 0).any()):
+        is_unknown = slot < 0
+        if bool(is_unknown.any()):
             raise DataError(
                 "a material that the model does not know",
                 where="model.materials",
@@ -130,46 +142,53 @@ class FieldEncoder(nn.Module):
         [length/frame] shape [layer, 2, x node, y node]. Velocities enter the fields as
         the last one and the changes before it, each over its own deviation.
         """
+        grid = self.grid
         windows = len(state.walls)
         layers = windows * self.material_count
-        axes = self.grid.dimension
+        axes = grid.dimension
         velocity_channels = axes * self.options.velocities
 
-        carried = [torch.ones_like(state.position[:, :1]), state.velocity.flatten(1)]
+        one = torch.ones_like(state.position[:, :1])
+        carried = [one, state.velocity.flatten(1)]
         if state.rest_shape is not None:
-            carried.append(state.rest_shape.strain(state.position))
-        sums = self.grid.spread(stencil, torch.cat(carried, dim=1), layers)
+            strain = state.rest_shape.strain(state.position)
+            carried.append(strain)
+        value = torch.cat(carried, dim=1)
+        sums = grid.spread(stencil, value, layers)
 
         weight = sums[:, :1] / self.unit
-        means = sums[:, 1:] / self.unit / weight.clamp(min=EMPTY_WEIGHT)
+        divisor = weight.clamp(min=EMPTY_WEIGHT)
+        means = sums[:, 1:] / self.unit / divisor
         velocity = means[:, :velocity_channels]
-        velocity = velocity.reshape(layers, -1, axes, *self.grid.shape)
-        changes = velocity.diff(dim=1) / self.acceleration_std
-        scaled_velocity = velocity[:, -1] / self.velocity_std
-        strain = means[:, velocity_channels:]
+        velocity = velocity.reshape(layers, -1, axes, *grid.shape)
+        mean_strain = means[:, velocity_channels:]
 
-        per_material = torch.cat(
-            [weight, scaled_velocity, changes.flatten(1, 2), strain], dim=1
-        )
+        last_velocity = velocity[:, -1]
+        scaled_velocity = last_velocity / self.velocity_std
+        changes = velocity.diff(dim=1) / self.acceleration_std
+        changes = changes.flatten(1, 2)
+        channels = [weight, scaled_velocity, changes, mean_strain]
+        per_material = torch.cat(channels, dim=1)
+        per_window = per_material.reshape(windows, -1, *grid.shape)
         wall_distance = self.wall_distance.expand(windows, *self.wall_distance.shape)
-        of_window = per_material.reshape(windows, -1, *self.grid.shape)
-        fields = torch.cat([of_window, wall_distance], dim=1)
+        fields = torch.cat([per_window, wall_distance], dim=1)
         if self.options.mixture:
-            return fields, self._mixture_velocity(sums[:, : 1 + velocity_channels])
-        return fields, velocity[:, -1]
+            weight_and_velocity = sums[:, : 1 + velocity_channels]
+            return fields, self._mixture_velocity(weight_and_velocity)
+        return fields, last_velocity
 
     def _mixture_velocity(self, sums: Tensor) -> Tensor:
         """Return the last velocity of all materials together, for each layer.
 
         ``sums`` are those of weights and velocities.
         """
-        by_material = sums.view(
-            -1, self.material_count, sums.shape[1], *self.grid.shape
-        )
-        total = by_material.sum(dim=1) / self.unit
-        velocity = total[:, -self.grid.dimension :] / total[:, :1].clamp(
-            min=EMPTY_WEIGHT
-        )
+        channels = sums.shape[1]
+        by_material = sums.view(-1, self.material_count, channels, *self.grid.shape)
+        total = by_material.sum(dim=1)
+        total = total / self.unit
+        weight = total[:, :1]
+        last_momentum = total[:, -self.grid.dimension :]
+        velocity = last_momentum / weight.clamp(min=EMPTY_WEIGHT)
         return velocity.repeat_interleave(self.material_count, dim=0)
 
     def forcing(self, walls: Tensor) -> Tensor:
@@ -178,13 +197,21 @@ class FieldEncoder(nn.Module):
         ``walls`` are those of :class:`GridState`; the result has shape [window,
         channel, x node, y node].
         """
-        frame = torch.arange(1, self.options.bundle + 1, device=walls.device)
-        last_frame = walls.shape[1] - 1
-        velocity = walls[:, frame.clamp(max=last_frame)] / self.velocity_std
-        forcing = torch.einsum(
-            "fmwc,w...->fmc...", velocity[:, :, self.grid.walls], self.beside_walls
-        )
+        wall_velocity = self._coming_frames(walls) / self.velocity_std
+        wall_velocity = wall_velocity[:, :, self.grid.walls]
+        forcing = torch.einsum("fmwc,w...->fmc...", wall_velocity, self.beside_walls)
         return forcing.flatten(1, 2)
+
+    def _coming_frames(self, forcing: Tensor) -> Tensor:
+        """Return the forcing of the frames of the bundle; the last known one repeats.
+
+        ``forcing`` has shape [window, frame, ...] and starts with the last frame.
+        """
+        last_frame = forcing.shape[1] - 1
+        bundle = self.options.bundle
+        frame = torch.arange(1, bundle + 1, device=forcing.device)
+        known_frame = frame.clamp(max=last_frame)
+        return forcing[:, known_frame]
 
     def force(self, body_force: Tensor) -> Tensor:
         """Return the force on the fluid in the coming frames, at every node.
@@ -192,18 +219,25 @@ class FieldEncoder(nn.Module):
         ``body_force`` is that of :class:`GridState`; the result has shape [window,
         channel, x node, y node].
         """
-        layer_count = body_force.shape[2]
         grid = self.grid
-        share = (grid.get_buffer("axis_y") - grid.low[1]) / (grid.high[1] - grid.low[1])
-        layer = (share * layer_count).long().clamp(0, layer_count - 1)
-        frame = torch.arange(1, self.options.bundle + 1, device=body_force.device)
-        coming = body_force[:, frame.clamp(max=body_force.shape[1] - 1)]
+        height = grid.axes[1]
+        low = grid.low[1]
+        high = grid.high[1]
+        relative_height = (height - low) / (high - low)
+        layer_count = body_force.shape[2]
+        layer = (relative_height * layer_count).long()
+        layer = layer.clamp(0, layer_count - 1)
+
+        coming = self._coming_frames(body_force)
         # shape [window, frame, axis, y node]
-        along_y = coming[:, :, layer].transpose(2, 3) / self.acceleration_std
-        channels = along_y.flatten(1, 2).unsqueeze(2)
+        along_y = coming[:, :, layer].transpose(2, 3)
+        along_y = along_y / self.acceleration_std
+        channels = along_y.flatten(1, 2)
+        channels = channels.unsqueeze(2)
         if grid.dimension == 3:
             channels = channels.unsqueeze(4)
-        return channels.expand(*channels.shape[:2], *grid.shape)
+        windows, channel_count = channels.shape[:2]
+        return channels.expand(windows, channel_count, *grid.shape)
 
     def mirror_fields(self, matrix: Tensor) -> list[Tensor]:
         """Return the blocks by which a mirror image changes the fields of a node."""
@@ -212,10 +246,11 @@ class FieldEncoder(nn.Module):
         if self.options.strain:
             per_material.append(strain_matrix(matrix))
         walls = self.grid.walls
-        permutation = wall_permutation(matrix)[walls][:, walls]
+        permutation = wall_permutation(matrix)
+        permutation = permutation[walls][:, walls]
         return [*per_material * self.material_count, permutation]
 
     def mirror_forcing(self, matrix: Tensor) -> list[Tensor]:
         """Return the blocks by which a mirror image changes the forcing of a node."""
-        kinds = int(self.options.wall_velocity) + int(self.options.body_force)
-        return [matrix] * (self.options.bundle * kinds)
+        block_count = self.options.bundle * self._forcing_kinds
+        return [matrix] * block_count

@@ -69,31 +69,40 @@ class ParticleGrid(nn.Module):
         box = Box.from_bounds(bounds, periodic)
         self.box = TensorBox(box)
         self.bounds = bounds
-        self.spacing = max(high - low for low, high in bounds) / cells
-        widths = []
-        for name, interval, is_periodic in zip(
-            AXES, bounds, box.periodic, strict=False
-        ):
-            if is_periodic:
+        widest_side = max(high - low for low, high in bounds)
+        self.spacing = widest_side / cells
+
+        cell_widths = []
+        for axis, interval in enumerate(bounds):
+            if box.periodic[axis]:
                 width, places = self._periodic_places(interval, multiple)
             else:
                 width = self.spacing
                 places = self._node_places(interval, multiple)
-            widths.append(width)
-            self.register_buffer(f"axis_{name}", places, persistent=False)
+            cell_widths.append(width)
+            name = f"axis_{AXES[axis]}"
+            self.register_buffer(name, places, persistent=False)
+
         ends = torch.tensor(bounds)
-        cell = torch.tensor(widths, dtype=torch.float64)
-        self.register_buffer("low", ends[:, 0], persistent=False)
-        self.register_buffer("high", ends[:, 1], persistent=False)
+        low = ends[:, 0]
+        high = ends[:, 1]
+        cell = torch.tensor(cell_widths, dtype=torch.float64)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
         self.register_buffer("cell", cell, persistent=False)
 
     def _node_places(self, interval: tuple[float, float], multiple: int) -> Tensor:
         """Return the nodes' places between two walls [length], shape [node]."""
         low, high = interval
-        nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+        cells = math.ceil((high - low) / self.spacing - 1e-6)
+        nodes = cells + 2
         nodes += -nodes % multiple
-        steps = torch.arange(nodes, dtype=torch.float64) - (nodes - 1) / 2
-        places = (low + high) / 2 + steps * self.spacing
+
+        middle = (low + high) / 2
+        middle_node = (nodes - 1) / 2
+        numbers = torch.arange(nodes, dtype=torch.float64)
+        steps = numbers - middle_node
+        places = middle + steps * self.spacing
         return places.to(torch.float32)
 
     def _periodic_places(
@@ -105,10 +114,14 @@ class ParticleGrid(nn.Module):
         no fewer than the three nodes that a particle touches.
         """
         low, high = interval
-        multiples = round((high - low) / self.spacing / multiple)
-        nodes = multiple * max(multiples, math.ceil(3 / multiple))
-        width = (high - low) / nodes
-        steps = torch.arange(nodes, dtype=torch.float64) + 0.5
+        period = high - low
+        nearest_multiples = round(period / self.spacing / multiple)
+        fewest_multiples = math.ceil(3 / multiple)
+        nodes = multiple * max(nearest_multiples, fewest_multiples)
+
+        width = period / nodes
+        numbers = torch.arange(nodes, dtype=torch.float64)
+        steps = numbers + 0.5
         places = low + steps * width
         return width, places.to(torch.float32)
 
@@ -125,8 +138,11 @@ class ParticleGrid(nn.Module):
     @property
     def axes(self) -> tuple[Tensor, ...]:
         """Places of the nodes along each axis [length], each of shape [node]."""
-        names = AXES[: self.dimension]
-        return tuple(getattr(self, f"axis_{name}") for name in names)
+        places = []
+        for name in AXES[: self.dimension]:
+            buffer = self.get_buffer(f"axis_{name}")
+            places.append(buffer)
+        return tuple(places)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -150,12 +166,14 @@ class ParticleGrid(nn.Module):
             layer: layer of nodes of each particle, int64, shape [particle].
         """
         corner, offset = self._locate(position)
+        shape = self.shape
         places = three_places(corner.long())
         for axis, is_periodic in enumerate(self.periodic):
             if is_periodic:
-                places[axis] = places[axis] % self.shape[axis]
-        node = number_nodes(layer, places, self.shape)
-        return Stencil(spline_weights(offset).flatten(1), node.flatten())
+                places[axis] = places[axis] % shape[axis]
+        node = number_nodes(layer, places, shape)
+        weight = spline_weights(offset)
+        return Stencil(weight.flatten(1), node.flatten())
 
     def _locate(self, position: Tensor) -> tuple[Tensor, Tensor]:
         """Return the lowest node of each particle's stencil, and the distance from it.
@@ -164,17 +182,26 @@ class ParticleGrid(nn.Module):
         periodic axis the lowest node may have a number below 0.
         """
         origin = torch.stack([axis[0] for axis in self.axes])
-        s = (position - origin) / self.cell.to(position)
+        distance = position - origin
+        s = distance / self.cell.to(position)
+        corner = torch.floor(s.detach() - 0.5)
         # NaN must not become an index.
-        corner = torch.floor(s.detach() - 0.5).nan_to_num(0.0)
+        corner = corner.nan_to_num(0.0)
+
         # On the far wall the third node has weight 0 and may not exist: the stencil
         # stays inside.
-        first = [-math.inf if is_periodic else 0.0 for is_periodic in self.periodic]
-        last = [
-            math.inf if is_periodic else nodes - 3.0
-            for is_periodic, nodes in zip(self.periodic, self.shape, strict=True)
-        ]
-        corner = corner.clamp(s.new_tensor(first), s.new_tensor(last))
+        first = []
+        last = []
+        for is_periodic, nodes in zip(self.periodic, self.shape, strict=True):
+            if is_periodic:
+                first.append(-math.inf)
+                last.append(math.inf)
+            else:
+                first.append(0.0)
+                last.append(nodes - 3.0)
+        lowest = s.new_tensor(first)
+        highest = s.new_tensor(last)
+        corner = corner.clamp(lowest, highest)
         return corner, s - corner
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
@@ -184,33 +211,37 @@ class ParticleGrid(nn.Module):
         that of the z nodes.
         """
         contributions = stencil.weight[:, :, None] * value[:, None]
-        node_count = layers * math.prod(self.shape)
+        contributions = contributions.flatten(0, 1)  # [particle * 9, channel]
+
+        shape = self.shape
         channels = value.shape[1]
+        node_count = layers * math.prod(shape)
         sums = value.new_zeros(node_count, channels)
-        sums = sums.index_add(0, stencil.node, contributions.flatten(0, 1))
+        sums = sums.index_add(0, stencil.node, contributions)
+        by_node = sums.view(layers, *shape, channels)
         # The exporter to ONNX understands no axis below 0 here.
         last_axis = self.dimension + 1
-        return sums.view(layers, *self.shape, channels).movedim(last_axis, 1)
+        return by_node.movedim(last_axis, 1)
 
     def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
         """Return a field at the particles, shape [particle, channel].
 
         ``field`` has shape [layer, channel, x node, y node], or with z nodes.
         """
+        weight = stencil.weight
         channels = field.shape[1]
-        nodes_around = stencil.weight.shape[1]
-        by_node = field.movedim(1, self.dimension + 1).reshape(-1, channels)
+        nodes_around = weight.shape[1]
+        last_axis = self.dimension + 1
+        by_node = field.movedim(1, last_axis)
+        by_node = by_node.reshape(-1, channels)
         if self.dimension == 3:
             # Products with 27 nodes would fill the memory: this sums at once.
-            return embedding_bag(
-                stencil.node.view(-1, nodes_around),
-                by_node,
-                per_sample_weights=stencil.weight,
-                mode="sum",
-            )
+            node = stencil.node.view(-1, nodes_around)
+            return embedding_bag(node, by_node, per_sample_weights=weight, mode="sum")
         nearby = by_node.index_select(0, stencil.node)
         nearby = nearby.view(-1, nodes_around, channels)
-        return (stencil.weight[:, :, None] * nearby).sum(dim=1)
+        weighted = weight[:, :, None] * nearby
+        return weighted.sum(dim=1)
 
     def accelerate(
         self, stencil: Stencil, position: Tensor, stress: Tensor, mass: Tensor
@@ -234,20 +265,28 @@ class ParticleGrid(nn.Module):
         """
         columns, rows = self.shape
         _, offset = self._locate(position)
-        slopes = spline_slopes(offset).flatten(2)[..., None]  # [particle, 2, 9, 1]
+        slopes = spline_slopes(offset)
+        slopes = slopes.flatten(2)[..., None]  # [particle, 2, 9, 1]
         slope_x, slope_y = slopes.unbind(dim=1)
         xx, xy, yy = stress[:, None].unbind(dim=3)  # each [particle, 1, frame]
 
         pull_x = xx * slope_x + xy * slope_y
         pull_y = xy * slope_x + yy * slope_y
         force = -torch.stack([pull_x, pull_y], dim=3)  # [particle, 9, frame, 2]
-        contributions = force.flatten(2).flatten(0, 1)
-        sums = force.new_zeros(mass.numel(), contributions.shape[1])
+        contributions = force.flatten(2)
+        contributions = contributions.flatten(0, 1)  # [particle * 9, frame * 2]
+
+        node_count = mass.numel()
+        channels = contributions.shape[1]
+        sums = force.new_zeros(node_count, channels)
         sums = sums.index_add(0, stencil.node, contributions)
 
-        node_mass = mass.flatten().clamp(min=1e-9)
+        node_mass = mass.flatten()
+        node_mass = node_mass.clamp(min=1e-9)
         acceleration = sums / node_mass[:, None]
-        return acceleration.view(len(mass), columns, rows, -1).permute(0, 3, 1, 2)
+        layers = len(mass)
+        by_node = acceleration.view(layers, columns, rows, -1)
+        return by_node.permute(0, 3, 1, 2)
 
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
         """Return the way from each particle to its nodes [length], [particle, 9, 2].
@@ -255,11 +294,15 @@ class ParticleGrid(nn.Module):
         The box has two dimensions and walls.
         """
         columns, rows = self.shape
-        node = stencil.node.view(-1, 9) % (columns * rows)
         axis_x, axis_y = self.axes
-        x = axis_x[node // rows]
-        y = axis_y[node % rows]
-        return torch.stack([x, y], dim=2) - position[:, None]
+        nodes_of_layer = columns * rows
+        node = stencil.node.view(-1, 9) % nodes_of_layer
+        column = node // rows
+        row = node % rows
+        x = axis_x[column]
+        y = axis_y[row]
+        place = torch.stack([x, y], dim=2)
+        return place - position[:, None]
 
     def wall_distance(self, reach: float) -> Tensor:
         """Return the nodes' distances to the walls, shape [wall, x node, y node].
@@ -267,9 +310,11 @@ class ParticleGrid(nn.Module):
         They are those of :func:`~lagbench.baselines.graph.wall_distance`. Periodic axes
         have no walls.
         """
-        node = torch.stack(torch.meshgrid(*self.axes, indexing="ij"), dim=-1)
+        coordinates = torch.meshgrid(*self.axes, indexing="ij")
+        node = torch.stack(coordinates, dim=-1)
         distance = wall_distance(node, self.bounds, reach, self.periodic)
-        return distance.movedim(-1, 0)[self.walls].contiguous()
+        by_wall = distance.movedim(-1, 0)
+        return by_wall[self.walls].contiguous()
 
     def share_inside(self) -> Tensor:
         """Return the shares of the nodes' splines in the box [1], [x node, y node].
@@ -284,23 +329,28 @@ class ParticleGrid(nn.Module):
         return share_x[:, None] * share_y
 
     def _axis_share_inside(self, axis: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        below_high = _integrate_spline((high - axis) / self.spacing)
-        below_low = _integrate_spline((low - axis) / self.spacing)
-        return below_high - below_low
+        to_high = (high - axis) / self.spacing
+        to_low = (low - axis) / self.spacing
+        share_below_high = _integrate_spline(to_high)
+        share_below_low = _integrate_spline(to_low)
+        return share_below_high - share_below_low
 
     def beside_walls(self) -> Tensor:
         """Return 1 at the two rows of nodes beside each wall, else 0.
 
         The shape is [wall, x node, y node].
         """
-        is_beside = self.wall_distance(self.spacing).abs() < 1.0
+        distance = self.wall_distance(self.spacing)
+        is_beside = distance.abs() < 1.0
         return is_beside.to(torch.float32)
 
 
 def _integrate_spline(s: Tensor) -> Tensor:
     """Return the integral of the spline up to a distance s from its node [cell]."""
     s = s.clamp(-1.5, 1.5)
+    distance = s.abs()
     inner = 0.5 + s * (0.75 - s * s / 3.0)
-    tail = (1.5 - s.abs()) ** 3 / 6.0
+    tail = (1.5 - distance) ** 3 / 6.0
     outer = torch.where(s < 0.0, tail, 1.0 - tail)
-    return torch.where(s.abs() < 0.5, inner, outer)
+    is_inner = distance < 0.5
+    return torch.where(is_inner, inner, outer)

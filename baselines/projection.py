@@ -72,14 +72,19 @@ class ShapeMatching:
         # A cluster whose arms do not add up to 0 turns a little in every frame:
         # rounding would spin bodies. So the means are in float64.
         exact_position = position.double()
-        exact_stencil = Stencil(stencil.weight.double(), stencil.node)
+        exact_weight = stencil.weight.double()
+        exact_stencil = Stencil(exact_weight, stencil.node)
         one = torch.ones_like(exact_position[:, :1])
         value = torch.cat([one, exact_position], dim=1)
         sums = grid.spread(exact_stencil, value, layers)
-        sums = sums.permute(0, 2, 3, 1).reshape(-1, 3)  # [node, (weight, x, y)]
-        inverse_weight = 1.0 / sums[:, :1].clamp(min=1e-6)
+        sums = sums.permute(0, 2, 3, 1)
+        sums = sums.reshape(-1, 3)  # [node, (weight, x, y)]
+
+        node_weight = sums[:, :1]
+        inverse_weight = 1.0 / node_weight.clamp(min=1e-6)
         centre = sums[:, 1:] * inverse_weight  # C_i, shape [node, 2]
-        nearby_centre = centre.index_select(0, stencil.node).view(-1, 9, 2)
+        nearby_centre = centre.index_select(0, stencil.node)
+        nearby_centre = nearby_centre.view(-1, 9, 2)
         arm = exact_position[:, None] - nearby_centre
 
         particle_count = position.new_zeros(layers, 1)
@@ -103,34 +108,42 @@ class ShapeMatching:
         # Moments are taken about the middle of each body: about a far point rounding
         # would be larger.
         middle = self._body_middle(position)
-        x, y = (position - middle)[:, None].unbind(dim=2)  # each [particle, 1]
+        from_middle = position - middle
+        x, y = from_middle[:, None].unbind(dim=2)  # each [particle, 1]
 
         # Sums over the particles around each node: mean place and rotation.
         cosine = x * arm_x + y * arm_y
         sine = y * arm_x - x * arm_y
-        moments = torch.stack(
-            [x.expand_as(weight), y.expand_as(weight), cosine, sine], dim=2
-        )
-        weighted = (weight[..., None] * moments).flatten(0, 1)
-        sums = weighted.new_zeros(self.node_count, 4)
-        sums = sums.index_add(0, self.stencil.node, weighted)
+        x_of_nodes = x.expand_as(weight)
+        y_of_nodes = y.expand_as(weight)
+        moments = torch.stack([x_of_nodes, y_of_nodes, cosine, sine], dim=2)
+        weighted_moments = weight[..., None] * moments
+        contributions = weighted_moments.flatten(0, 1)
+        sums = contributions.new_zeros(self.node_count, 4)
+        sums = sums.index_add(0, self.stencil.node, contributions)
         centre = sums[:, :2] * self.inverse_weight  # c_i
+
         # A lone particle turns nothing: the root's gradient must not be infinite there.
-        square = sums[:, 2:].square().sum(dim=1, keepdim=True)
-        rotation = sums[:, 2:] / (square + TINY).sqrt()  # (cosine, sine) of R_i
+        turn = sums[:, 2:]
+        square = turn.square().sum(dim=1, keepdim=True)
+        length = (square + TINY).sqrt()
+        rotation = turn / length  # (cosine, sine) of R_i
         motion = torch.cat([centre, rotation], dim=1)
 
         # Back at the particles: c_i + R_i (X_p - C_i) of their nine nodes.
-        nearby = motion.index_select(0, self.stencil.node).view(-1, 9, 4)
-        centre_x, centre_y, cosine, sine = nearby.unbind(dim=2)
+        nearby_motion = motion.index_select(0, self.stencil.node)
+        nearby_motion = nearby_motion.view(-1, 9, 4)
+        centre_x, centre_y, cosine, sine = nearby_motion.unbind(dim=2)
         place_x = centre_x + cosine * arm_x - sine * arm_y
         place_y = centre_y + sine * arm_x + cosine * arm_y
         places = torch.stack([place_x, place_y], dim=2)
-        return middle + (weight[..., None] * places).sum(dim=1)
+        weighted_places = weight[..., None] * places
+        return middle + weighted_places.sum(dim=1)
 
     def _body_middle(self, position: Tensor) -> Tensor:
         """Return the mean position of each particle's body, shape [particle, 2]."""
-        sums = position.new_zeros(len(self.particle_count), 2)
+        layer_count = len(self.particle_count)
+        sums = position.new_zeros(layer_count, 2)
         sums = sums.index_add(0, self.layer, position)
         mean = sums / self.particle_count
         return mean.index_select(0, self.layer)
@@ -164,13 +177,16 @@ class DensityProjection:
 
         Positions [length] have shape [particle, 2].
         """
-        inverse_share = 1.0 / grid.share_inside().clamp(min=LEAST_SHARE_INSIDE)
-        unscaled = cls(grid, inverse_share, sample, position.new_ones(windows))
-        stencil = grid.stencil(grid.box.inside(position), sample)
+        share_inside = grid.share_inside()
+        inverse_share = 1.0 / share_inside.clamp(min=LEAST_SHARE_INSIDE)
+        unit = position.new_ones(windows)
+        unscaled = cls(grid, inverse_share, sample, unit)
+
+        position = grid.box.inside(position)
+        stencil = grid.stencil(position, sample)
         density, _ = unscaled.relative_density(stencil)
-        greatest = position.new_zeros(windows).scatter_reduce(
-            0, sample, density, "amax"
-        )
+        greatest = position.new_zeros(windows)
+        greatest = greatest.scatter_reduce(0, sample, density, "amax")
         return cls(grid, inverse_share, sample, greatest)
 
     def relative_density(self, stencil: Stencil) -> tuple[Tensor, Tensor]:
@@ -179,9 +195,13 @@ class DensityProjection:
         Their shapes are [particle] and [window, 1, x node, y node].
         """
         one = torch.ones_like(stencil.weight[:, :1])
-        mass = self.grid.spread(stencil, one, len(self.greatest))
-        density = self.grid.gather(stencil, mass * self.inverse_share)[:, 0]
-        return density / self.greatest[self.sample], mass
+        windows = len(self.greatest)
+        mass = self.grid.spread(stencil, one, windows)
+        node_density = mass * self.inverse_share
+        gathered = self.grid.gather(stencil, node_density)
+        density = gathered[:, 0]
+        greatest = self.greatest[self.sample]
+        return density / greatest, mass
 
     def correct(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
         """Return x' from x [length], both of shape [particle, 2].
@@ -194,11 +214,15 @@ class DensityProjection:
         position = self.grid.box.inside(position)
         stencil = self.grid.stencil(position, self.sample)
         density, mass = self.relative_density(stencil)
-        pressure = push * (density - limit).clamp(0.0, LARGEST_EXCESS)
+        excess = density - limit
+        pressure = push * excess.clamp(0.0, LARGEST_EXCESS)
         shear = torch.zeros_like(pressure)
-        stress = -torch.stack([pressure, shear, pressure], dim=1)[:, None]
-        acceleration = self.grid.accelerate(stencil, position, stress, mass)
-        return position + self.grid.spacing * self.grid.gather(stencil, acceleration)
+        stress = -torch.stack([pressure, shear, pressure], dim=1)
+        node_acceleration = self.grid.accelerate(
+            stencil, position, stress[:, None], mass
+        )
+        acceleration = self.grid.gather(stencil, node_acceleration)
+        return position + self.grid.spacing * acceleration
 
 
 @dataclass(frozen=True)
@@ -232,19 +256,26 @@ class Projection(nn.Module):
     ) -> None:
         super().__init__()
         self.grid_cells = {"shape": tuple(shape), "density": tuple(density)}
-        self.clusters = nn.ModuleList(ParticleGrid(bounds, cells) for cells in shape)
-        self.cells = nn.ModuleList(ParticleGrid(bounds, cells) for cells in density)
+        self.clusters = nn.ModuleList()
+        for cells in shape:
+            self.clusters.append(ParticleGrid(bounds, cells))
+        self.cells = nn.ModuleList()
+        for cells in density:
+            self.cells.append(ParticleGrid(bounds, cells))
+
         # The names of the parameters are those in files of weights. A parameter without
         # a gradient would stop training on several devices, so there are none without
         # grids.
         if shape:
-            share = torch.full(
-                (len(shape), len(ELASTIC)), INITIAL_SHARE / LEARNING_SCALE
-            )
-            self.held = nn.Parameter(share)
+            share_count = (len(shape), len(ELASTIC))
+            initial_share = INITIAL_SHARE / LEARNING_SCALE
+            shares = torch.full(share_count, initial_share)
+            self.held = nn.Parameter(shares)
         if density:
-            self.push = nn.Parameter(torch.zeros(len(density)))
-            self.limit = nn.Parameter(torch.zeros(MATERIALS))
+            pushes = torch.zeros(len(density))
+            limits = torch.zeros(MATERIALS)
+            self.push = nn.Parameter(pushes)
+            self.limit = nn.Parameter(limits)
 
     def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any], *, prefix: str
@@ -263,14 +294,18 @@ class Projection(nn.Module):
         weights = dict(weights)
         options = dict(options)
         initial = self.state_dict(prefix=prefix)
-        for option, name in (("shape", "held"), ("density", "push")):
+        weight_of_option = {"shape": "held", "density": "push"}
+        for option, weight_name in weight_of_option.items():
             grids = self.grid_cells[option]
             shared_count = _count_shared(grids, options[option])
             options[option] = list(grids)
-            learned = weights.pop(prefix + name, None)
+
+            name = prefix + weight_name
+            learned = weights.pop(name, None)
             if learned is not None and grids:
-                rest = initial[prefix + name][shared_count:]
-                weights[prefix + name] = torch.cat([learned[:shared_count], rest])
+                shared = learned[:shared_count]
+                rest = initial[name][shared_count:]
+                weights[name] = torch.cat([shared, rest])
 
         adapted = dict(initial)
         for name, value in weights.items():
@@ -291,22 +326,31 @@ class Projection(nn.Module):
             sample: window of each particle, int64, shape [particle].
             windows: number of windows.
         """
-        kind_of_material = torch.full((MATERIALS,), -1, device=material.device)
-        kinds = torch.arange(len(ELASTIC), device=material.device)
+        device = material.device
+        kind_count = len(ELASTIC)
+        # place of each material in ELASTIC; -1 for those that are not elastic
+        kind_of_material = torch.full((MATERIALS,), -1, device=device)
+        kinds = torch.arange(kind_count, device=device)
         kind_of_material[list(ELASTIC)] = kinds
-        elastic = (kind_of_material[material] >= 0).nonzero()[:, 0]
-        elastic_kind = kind_of_material[material[elastic]]
-        layer = sample[elastic] * len(ELASTIC) + elastic_kind
-        layers = windows * len(ELASTIC)
+        kind = kind_of_material[material]
+        is_elastic = kind >= 0
+        elastic = is_elastic.nonzero()[:, 0]
+        elastic_kind = kind[elastic]
 
+        # One layer of nodes for each window and elastic material.
+        layer = sample[elastic] * kind_count + elastic_kind
+        layers = windows * kind_count
+        elastic_first = first[elastic]
         shapes = []
         for module in self.clusters:
             grid = cast(ParticleGrid, module)
-            shapes.append(ShapeMatching.build(grid, first[elastic], layer, layers))
+            shape = ShapeMatching.build(grid, elastic_first, layer, layers)
+            shapes.append(shape)
         densities = []
         for module in self.cells:
             grid = cast(ParticleGrid, module)
-            densities.append(DensityProjection.build(grid, first, sample, windows))
+            density = DensityProjection.build(grid, first, sample, windows)
+            densities.append(density)
         return ProjectionState(
             elastic=elastic,
             elastic_kind=elastic_kind,
@@ -322,16 +366,21 @@ class Projection(nn.Module):
         beyond walls are first put on them.
         """
         if state.densities:
-            limit = (1.0 + LIMIT_SCALE * self.limit)[state.material]
-            pushes = LARGEST_PUSH * (LEARNING_SCALE * self.push).sigmoid()
+            limit_of_material = 1.0 + LIMIT_SCALE * self.limit
+            limit = limit_of_material[state.material]
+            log_odds = LEARNING_SCALE * self.push
+            pushes = LARGEST_PUSH * log_odds.sigmoid()
             for push, density in zip(pushes, state.densities, strict=True):
                 position = density.correct(position, push, limit)
         if state.shapes:
             elastic = position.index_select(0, state.elastic)
-            shares = (LEARNING_SCALE * self.held).sigmoid()
-            for share, shape in zip(shares, state.shapes, strict=True):
-                correction = shape.match(elastic) - elastic
-                elastic = elastic + share[state.elastic_kind][:, None] * correction
+            log_odds = LEARNING_SCALE * self.held
+            shares = log_odds.sigmoid()
+            for share_of_kind, shape in zip(shares, state.shapes, strict=True):
+                matched = shape.match(elastic)
+                correction = matched - elastic
+                share = share_of_kind[state.elastic_kind]
+                elastic = elastic + share[:, None] * correction
             position = position.index_copy(0, state.elastic, elastic)
         return position
 

@@ -57,8 +57,12 @@ class TensorFields:
 
         Vorticity and divergence are defined at these nodes.
         """
-        along_x = self.counted[..., 2:, 1:-1] & self.counted[..., :-2, 1:-1]
-        along_y = self.counted[..., 1:-1, 2:] & self.counted[..., 1:-1, :-2]
+        right = self.counted[..., 2:, 1:-1]
+        left = self.counted[..., :-2, 1:-1]
+        above = self.counted[..., 1:-1, 2:]
+        below = self.counted[..., 1:-1, :-2]
+        along_x = right & left
+        along_y = above & below
         return pad(along_x & along_y, (1, 1, 1, 1))
 
     @cached_property
@@ -70,7 +74,8 @@ class TensorFields:
         u, v = self.velocity.unbind(dim=-1)
         _, du_dy = self._differentiate(u)
         dv_dx, _ = self._differentiate(v)
-        return (dv_dx - du_dy) * self.differentiable
+        curl = dv_dx - du_dy
+        return curl * self.differentiable
 
     @cached_property
     def divergence(self) -> Tensor:
@@ -81,14 +86,17 @@ class TensorFields:
         u, v = self.velocity.unbind(dim=-1)
         du_dx, _ = self._differentiate(u)
         _, dv_dy = self._differentiate(v)
-        return (du_dx + dv_dy) * self.differentiable
+        trace = du_dx + dv_dy
+        return trace * self.differentiable
 
     def _differentiate(self, field: Tensor) -> tuple[Tensor, Tensor]:
         """Return ``df/dx`` and ``df/dy`` by central differences; 0 on the rim."""
         double_spacing = 2.0 * self.grid.spacing
-        along_x = (field[..., 2:, :] - field[..., :-2, :]) / double_spacing
-        along_y = (field[..., :, 2:] - field[..., :, :-2]) / double_spacing
-        return pad(along_x, (0, 0, 1, 1)), pad(along_y, (1, 1))
+        difference_x = field[..., 2:, :] - field[..., :-2, :]
+        difference_y = field[..., :, 2:] - field[..., :, :-2]
+        slope_x = difference_x / double_spacing
+        slope_y = difference_y / double_spacing
+        return pad(slope_x, (0, 0, 1, 1)), pad(slope_y, (1, 1))
 
 
 def tensor_fields(
@@ -109,15 +117,18 @@ def tensor_fields(
         counted: nodes that count; by default those of the particles. The fields of a
             prediction take the nodes of the truth.
     """
+    weight = sums.weight
     if counted is None:
-        counted = sums.weight.detach() >= COUNTED_SHARE * full_weight
-    is_filled = (sums.weight >= EMPTY_SHARE * full_weight) & (sums.weight > 0.0)
+        least_counted = COUNTED_SHARE * full_weight
+        counted = weight.detach() >= least_counted
+    least_filled = EMPTY_SHARE * full_weight
+    is_filled = (weight >= least_filled) & (weight > 0.0)
     # Empty nodes divide by 1: a quotient that `where` drops must not have an infinite
     # gradient.
-    divisor = torch.where(is_filled, sums.weight, 1.0)
+    divisor = torch.where(is_filled, weight, 1.0)
     quotient = sums.momentum / divisor[..., None]
     velocity = torch.where(is_filled[..., None], quotient, 0.0)
-    return TensorFields(grid, sums.weight, velocity, counted, full_weight)
+    return TensorFields(grid, weight, velocity, counted, full_weight)
 
 
 def transfer(
@@ -141,9 +152,10 @@ def transfer(
     leading: tuple[int, ...]
     if sample is None:
         leading = tuple(position.shape[:-2])
+        particles = position.shape[-2]
         windows = math.prod(leading)
         window_numbers = torch.arange(windows, device=position.device)
-        sample = window_numbers.repeat_interleave(position.shape[-2])
+        sample = window_numbers.repeat_interleave(particles)
     else:
         if windows is None:
             windows = _count_windows(sample)
@@ -151,7 +163,8 @@ def transfer(
 
     x = position.reshape(-1, 2)
     u = velocity.reshape(-1, 2)
-    is_inside = ((x >= 0.0) & (x <= 1.0)).all(dim=-1, keepdim=True)
+    is_axis_inside = (x >= 0.0) & (x <= 1.0)
+    is_inside = is_axis_inside.all(dim=-1, keepdim=True)
     # Replaced before any arithmetic: 0 times NaN would be NaN, in the gradient too.
     x = torch.where(is_inside, x, 0.5)
     u = torch.where(is_inside, u, 0.0)
@@ -162,17 +175,25 @@ def transfer(
     corner = base.long() + _ROWS_BELOW
     places = three_places(corner)
     node = number_nodes(sample, places, (side, side))
-    weight = spline_weights(s - base) * is_inside[..., None]  # [particle, 3, 3]
+    weight = spline_weights(s - base)
+    weight = weight * is_inside[..., None]  # [particle, 3, 3]
 
-    carried = torch.cat([torch.ones_like(u[:, :1]), u], dim=-1)  # (1, u, v)
+    one = torch.ones_like(u[:, :1])
+    carried = torch.cat([one, u], dim=-1)  # (1, u, v)
     contributions = weight[..., None] * carried[:, None, None]
+    contributions = contributions.reshape(-1, 3)
     node_count = windows * side * side
     sums = contributions.new_zeros(node_count, 3)
-    sums = sums.index_add(0, node.flatten(), contributions.reshape(-1, 3))
+    sums = sums.index_add(0, node.flatten(), contributions)
     sums = sums.reshape(windows, side, side, 3)
-    sums = sums[:, _ROWS_BELOW:-_ROWS_ABOVE, _ROWS_BELOW:-_ROWS_ABOVE]
+
+    # The grid's own nodes, without the rows that particles at the walls can reach.
+    own = slice(_ROWS_BELOW, -_ROWS_ABOVE)
+    sums = sums[:, own, own]
     sums = sums.reshape(*leading, grid.nodes, grid.nodes, 3)
-    return TensorTransfer(sums[..., 0], sums[..., 1:])
+    weight_sum = sums[..., 0]
+    momentum = sums[..., 1:]
+    return TensorTransfer(weight_sum, momentum)
 
 
 def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> None:
@@ -181,7 +202,8 @@ def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> 
         axes_fit = position.ndim >= 2
     else:
         axes_fit = position.ndim == 2 and position.shape[:1] == sample.shape
-    if axes_fit and position.shape == velocity.shape and position.shape[-1] == 2:
+    has_one_shape = position.shape == velocity.shape
+    if axes_fit and has_one_shape and position.shape[-1] == 2:
         return
 
     shapes = f"{tuple(position.shape)}, {tuple(velocity.shape)}"
@@ -198,7 +220,8 @@ def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> 
 def _count_windows(sample: Tensor) -> int:
     if not len(sample):
         return 0
-    return int(sample.max()) + 1
+    last_window = int(sample.max())
+    return last_window + 1
 
 
 def spline_weights(s: Tensor) -> Tensor:
@@ -207,10 +230,13 @@ def spline_weights(s: Tensor) -> Tensor:
     The shape is [particle, 3, 3] in two dimensions, [particle, 3, 3, 3] in three.
     ``s`` is where particles lie from the first of their nodes on [cell].
     """
-    b = spline_values(s)
-    weight = b[:, :, None, 0] * b[:, None, :, 1]
-    if b.shape[2] == 3:
-        weight = weight[..., None] * b[:, None, None, :, 2]
+    values = spline_values(s)
+    along_x = values[:, :, None, 0]
+    along_y = values[:, None, :, 1]
+    weight = along_x * along_y
+    if values.shape[2] == 3:
+        along_z = values[:, None, None, :, 2]
+        weight = weight[..., None] * along_z
     return weight
 
 
@@ -219,10 +245,17 @@ def spline_slopes(s: Tensor) -> Tensor:
 
     The shape is [particle, 2, 3, 3]; ``s`` is that of :func:`spline_weights`.
     """
-    b = spline_values(s)
-    slope = torch.stack([s - 1.5, 2.0 - 2.0 * s, s - 0.5], dim=1)
-    along_x = slope[:, :, None, 0] * b[:, None, :, 1]
-    along_y = b[:, :, None, 0] * slope[:, None, :, 1]
+    values = spline_values(s)
+    first = s - 1.5
+    second = 2.0 - 2.0 * s
+    third = s - 0.5
+    slopes = torch.stack([first, second, third], dim=1)
+    value_x = values[:, :, None, 0]
+    value_y = values[:, None, :, 1]
+    slope_x = slopes[:, :, None, 0]
+    slope_y = slopes[:, None, :, 1]
+    along_x = slope_x * value_y
+    along_y = value_x * slope_y
     return torch.stack([along_x, along_y], dim=1)
 
 
@@ -240,7 +273,11 @@ def three_places(corner: Tensor) -> list[Tensor]:
     ``corner`` holds the first of them, int64, shape [particle, axis].
     """
     offset = torch.arange(3, device=corner.device)
-    return [first[:, None] + offset for first in corner.unbind(dim=1)]
+    places = []
+    for first in corner.unbind(dim=1):
+        place = first[:, None] + offset
+        places.append(place)
+    return places
 
 
 def number_nodes(
@@ -257,9 +294,11 @@ def number_nodes(
         shape: nodes along each axis.
     """
     dimension = len(shape)
-    node = layer.view(-1, *[1] * dimension)
-    for axis, (place, node_count) in enumerate(zip(places, shape, strict=True)):
+    one_node = [1] * dimension
+    node = layer.view(-1, *one_node)
+    for axis, place in enumerate(places):
         along_axis = [1] * dimension
         along_axis[axis] = 3
-        node = node * node_count + place.view(-1, *along_axis)
+        place_along_axis = place.view(-1, *along_axis)
+        node = node * shape[axis] + place_along_axis
     return node

@@ -62,19 +62,25 @@ class LaggedRows:
     def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
         """Yield regressors and responses, at most :data:`BLOCK` rows at a time."""
         for states in self.sequences:
-            for first in range(self.lags, len(states), BLOCK):
-                last = min(first + BLOCK, len(states))
+            frame_count = len(states)
+            for first in range(self.lags, frame_count, BLOCK):
+                last = min(first + BLOCK, frame_count)
+                regressors = self._regressors(states, first, last)
                 responses = states[first:last].astype(np.float64)
-                yield self._regressors(states, first, last), responses
+                yield regressors, responses
 
     def _regressors(self, states: NDArray[np.float32], first: int, last: int) -> Matrix:
         """Return the regressors of frames first to last, shape [row, regressor]."""
+        row_count = last - first
         features = states.shape[1]
-        regressors = np.ones((last - first, 1 + self.lags * features))
+        regressor_count = 1 + self.lags * features
+        regressors = np.ones((row_count, regressor_count))
+        column = 1  # column 0 is that of the intercept
         for lag in range(1, self.lags + 1):
-            column = 1 + (lag - 1) * features
+            next_column = column + features
             lagged = states[first - lag : last - lag]
-            regressors[:, column : column + features] = lagged
+            regressors[:, column:next_column] = lagged
+            column = next_column
         return regressors
 
 
@@ -99,9 +105,12 @@ class Fitted(FrameModel):
 
         The first frame is left out: it has no velocity of its own.
         """
-        exact_position = torch.from_numpy(position).to(torch.float64)
+        stored_position = torch.from_numpy(position)
+        exact_position = stored_position.to(torch.float64)
         state = self.frame_state.standardise(exact_position)
-        return state[1:].flatten(1).to(torch.float32).numpy()
+        rows = state[1:].flatten(1)
+        single_precision_rows = rows.to(torch.float32)
+        return single_precision_rows.numpy()
 
 
 class VAR(Fitted):
@@ -127,8 +136,10 @@ class VAR(Fitted):
 
     def __init__(self, options: Options, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        shape = (1 + options.lags * self.features, self.features)
-        self.register_buffer("coefficients", torch.zeros(shape, dtype=torch.float64))
+        regressor_count = 1 + options.lags * self.features
+        shape = (regressor_count, self.features)
+        coefficients = torch.zeros(shape, dtype=torch.float64)
+        self.register_buffer("coefficients", coefficients)
 
     @property
     def inputs(self) -> int:
@@ -141,7 +152,8 @@ class VAR(Fitted):
         Return condition number, floor and rows of :class:`LeastSquares`.
         """
         sequences = [self.states(position) for position in scenarios]
-        solution = solve(LaggedRows(sequences, lags=self.options.lags))
+        rows = LaggedRows(sequences, lags=self.options.lags)
+        solution = solve(rows)
         self.coefficients = torch.from_numpy(solution.coefficients)
         return {
             "condition": solution.condition,
@@ -152,9 +164,12 @@ class VAR(Fitted):
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
         latest_first = window.state.flip(1)
+        lagged_states = latest_first.flatten(1)
         intercept = self.coefficients[0]
-        predicted = intercept + latest_first.flatten(1) @ self.coefficients[1:]
-        return predicted.view(latest_first.shape[0], *latest_first.shape[2:])
+        lag_coefficients = self.coefficients[1:]
+        predicted = intercept + lagged_states @ lag_coefficients
+        windows, _, *state_shape = latest_first.shape
+        return predicted.view(windows, *state_shape)
 
 
 class StableVAR(Fitted):
@@ -194,11 +209,12 @@ class StableVAR(Fitted):
 
     def __init__(self, options: Options, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        rank = min(options.rank, self.features)
-        self.register_buffer("mean", torch.zeros(self.features))
-        self.register_buffer("drift", torch.zeros(self.features))
-        self.register_buffer("directions", torch.zeros(self.features, rank))
-        self.register_buffer("response", torch.zeros(rank, self.features))
+        features = self.features
+        rank = min(options.rank, features)
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("drift", torch.zeros(features))
+        self.register_buffer("directions", torch.zeros(features, rank))
+        self.register_buffer("response", torch.zeros(rank, features))
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
         """Fit mean, drift, directions and response.
@@ -213,49 +229,58 @@ class StableVAR(Fitted):
             )
         mean, drift, variance = self._moments(rows)
         rank = self.directions.shape[1]
+        centred_states = partial(_centred_states, rows, mean)
         directions, eigenvalues = principal_directions(
-            partial(_centred_states, rows, mean), self.features, rank=rank
+            centred_states, self.features, rank=rank
         )
 
         response = np.zeros((rank, self.features))  # A
-        for x, y in rows:
-            state = x[:, 1:]
-            change = y - state - drift
-            response += ((state - mean) @ directions).T @ change
-        ridge = max(self.options.ridge, EPSILON) * rows.rows
-        response /= (eigenvalues + ridge)[:, None]
+        for regressors, next_state in rows:
+            state = regressors[:, 1:]
+            change = next_state - state - drift
+            component = (state - mean) @ directions
+            response += component.T @ change
+        ridge = max(self.options.ridge, EPSILON)
+        divisor = eigenvalues + ridge * rows.rows
+        response /= divisor[:, None]
 
         self.mean.copy_(torch.from_numpy(mean))
         self.drift.copy_(torch.from_numpy(drift))
         self.directions.copy_(torch.from_numpy(directions))
         self.response.copy_(torch.from_numpy(response))
-        return {"variance": float(eigenvalues.sum() / variance), "rows": rows.rows}
+        variance_share = float(eigenvalues.sum() / variance)
+        return {"variance": variance_share, "rows": rows.rows}
 
     def _moments(self, rows: LaggedRows) -> tuple[Matrix, Matrix, float]:
         """Return mean state, mean change, and the summed variance of all rows."""
         mean = np.zeros(self.features)
         drift = np.zeros(self.features)
         square_sum = 0.0
-        for x, y in rows:
-            state = x[:, 1:]
+        for regressors, next_state in rows:
+            state = regressors[:, 1:]
+            change = next_state - state
             mean += state.sum(0) / rows.rows
-            drift += (y - state).sum(0) / rows.rows
-            square_sum += float(np.square(state).sum())
-        variance = square_sum - rows.rows * float(mean @ mean)
+            drift += change.sum(0) / rows.rows
+            squares = np.square(state)
+            square_sum += float(squares.sum())
+        squared_mean = float(mean @ mean)
+        variance = square_sum - rows.rows * squared_mean
         return mean, drift, variance
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
         state = window.state[:, -1]
         deviation = state.flatten(1) - self.mean
-        change = self.drift + deviation @ self.directions @ self.response
+        component = deviation @ self.directions
+        change = self.drift + component @ self.response
         return state + change.view(state.shape)
 
 
 def _centred_states(rows: LaggedRows, mean: Matrix) -> Iterator[Matrix]:
     """Yield the states of the regressors less the mean, in blocks of rows."""
-    for x, _ in rows:
-        yield x[:, 1:] - mean
+    for regressors, _ in rows:
+        state = regressors[:, 1:]
+        yield state - mean
 
 
 TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
@@ -286,45 +311,69 @@ def solve(blocks: LaggedRows) -> LeastSquares:
             "nothing to fit", expected="scenarios longer than the lags", got="no rows"
         )
     x, y = first_block
-    if blocks.rows >= x.shape[1]:
-        return _solve_overdetermined(blocks, (x.shape[1], y.shape[1]))
-    return _solve_underdetermined(blocks)
+    regressor_count = x.shape[1]
+    response_count = y.shape[1]
+    if blocks.rows < regressor_count:
+        return _solve_underdetermined(blocks)
+    return _solve_overdetermined(blocks, (regressor_count, response_count))
 
 
 def _solve_overdetermined(blocks: LaggedRows, shape: tuple[int, int]) -> LeastSquares:
     """Solve by the Gram matrix of the regressors, from blocks of rows."""
+    regressor_count = shape[0]
 
     def gram() -> Matrix:
-        return _gram((x for x, _ in blocks), shape[0])
+        return _gram(_regressors_of(blocks), regressor_count)
 
     divide, condition, floor = _factor(gram)
-    solution = divide(_products(blocks, shape))
+    products = _products(blocks, shape)
+    solution = divide(products)
 
-    def residuals() -> Iterator[tuple[Matrix, Matrix]]:
-        for x, y in blocks:
-            transposed = blas.dgemm(-1.0, solution, x.T, trans_a=True, beta=1.0, c=y.T)
-            yield x, transposed.T
-
-    solution += divide(_products(residuals(), shape))
+    # The residuals Y - X B of the first solution refine it once.
+    residuals = _residuals(blocks, solution)
+    residual_products = _products(residuals, shape)
+    solution += divide(residual_products)
     return LeastSquares(
         coefficients=solution, condition=condition, floor=floor, rows=blocks.rows
     )
 
 
+def _regressors_of(blocks: LaggedRows) -> Iterator[Matrix]:
+    """Yield the regressors X alone, in blocks of rows."""
+    for x, _ in blocks:
+        yield x
+
+
+def _residuals(blocks: LaggedRows, solution: Matrix) -> Iterator[tuple[Matrix, Matrix]]:
+    """Yield X and Y - X B, in blocks of rows."""
+    for x, y in blocks:
+        transposed = blas.dgemm(-1.0, solution, x.T, trans_a=True, beta=1.0, c=y.T)
+        yield x, transposed.T
+
+
 def _solve_underdetermined(blocks: LaggedRows) -> LeastSquares:
     """Solve by the Gram matrix of the rows, which are few enough for memory."""
-    x_blocks, y_blocks = zip(*blocks, strict=True)
+    x_blocks = []
+    y_blocks = []
+    for x_block, y_block in blocks:
+        x_blocks.append(x_block)
+        y_blocks.append(y_block)
     x = np.concatenate(x_blocks)
     y = np.concatenate(y_blocks)
 
     def gram() -> Matrix:
-        return _gram([np.ascontiguousarray(x.T)], len(x))
+        transposed = np.ascontiguousarray(x.T)
+        return _gram([transposed], len(x))
 
     divide, condition, floor = _factor(gram)
     dual = divide(np.asfortranarray(y))
-    dual += divide(np.asfortranarray(y - x @ (x.T @ dual)))
+    # The residuals of the first solution refine it once.
+    fitted = x @ (x.T @ dual)
+    residual = np.asfortranarray(y - fitted)
+    dual += divide(residual)
+    coefficients = x.T @ dual
     return LeastSquares(
-        coefficients=x.T @ dual, condition=condition, floor=floor, rows=blocks.rows
+        coefficients=coefficients, condition=condition, floor=floor, rows=blocks.rows
     )
 
 
@@ -358,11 +407,13 @@ def _factor(
     """
     matrix = gram()
     size = len(matrix)
-    if not np.isfinite(matrix.diagonal()).all():
+    diagonal = matrix.diagonal()
+    if not np.isfinite(diagonal).all():
         raise WorkFailedError("values are not finite", where="rows to fit")
-    largest = _largest_eigenvalue(lambda v: blas.dsymv(1.0, matrix, v), size)
+    largest = _largest_eigenvalue(partial(blas.dsymv, 1.0, matrix), size)
 
-    for floor in (0.0, size * np.finfo(np.float64).eps):
+    rounding_floor = size * np.finfo(np.float64).eps
+    for floor in (0.0, rounding_floor):
         if floor:
             matrix = gram()  # the first attempt has overwritten it
             matrix[np.diag_indices(size)] += floor * largest
@@ -370,11 +421,12 @@ def _factor(
             upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
         except LinAlgError:
             continue
-        divide: Callable[..., Matrix] = partial(
-            cho_solve, (upper, False), check_finite=False
-        )
-        condition = float(np.sqrt(largest * _largest_eigenvalue(divide, size)))
-        return partial(divide, overwrite_b=True), condition, floor
+        factor = (upper, False)
+        divide: Callable[..., Matrix] = partial(cho_solve, factor, check_finite=False)
+        largest_inverse = _largest_eigenvalue(divide, size)
+        condition = float(np.sqrt(largest * largest_inverse))
+        divide_in_place = partial(divide, overwrite_b=True)
+        return divide_in_place, condition, floor
     raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
 
 
@@ -385,9 +437,12 @@ def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float
     """
     if size < 3:
         columns = [product(unit_vector) for unit_vector in np.eye(size)]
-        return float(np.linalg.eigvalsh(np.column_stack(columns))[-1])
+        matrix = np.column_stack(columns)
+        ascending = np.linalg.eigvalsh(matrix)
+        return float(ascending[-1])
     operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
-    start = np.random.default_rng(0).normal(size=size)
+    rng = np.random.default_rng(0)
+    start = rng.normal(size=size)
     eigenvalues = eigsh(
         operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False
     )
@@ -414,20 +469,27 @@ def principal_directions(
         rank: number of directions.
     """
     width = min(features, rank + OVERSAMPLING)
-    basis = np.random.default_rng(0).normal(size=(features, width))
+    rng = np.random.default_rng(0)
+    basis = rng.normal(size=(features, width))
     for _ in range(ITERATIONS):
         product = _multiply_by_square(blocks(), basis)
         basis, _ = np.linalg.qr(product)
 
-    small = basis.T @ _multiply_by_square(blocks(), basis)
-    eigenvalues, rotation = np.linalg.eigh((small + small.T) / 2)
+    # Rayleigh and Ritz: X'X in the basis, shape [width, width], made diagonal.
+    product = _multiply_by_square(blocks(), basis)
+    projected = basis.T @ product
+    symmetric = (projected + projected.T) / 2
+    ascending, rotation = np.linalg.eigh(symmetric)
+    eigenvalues = ascending[::-1][:rank]
     largest_first = rotation[:, ::-1][:, :rank]
-    return basis @ largest_first, eigenvalues[::-1][:rank].clip(0.0)
+    directions = basis @ largest_first
+    return directions, eigenvalues.clip(0.0)
 
 
 def _multiply_by_square(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
     """Return X'X times a basis."""
     total = np.zeros_like(basis)
     for x in blocks:
-        total = total + x.T @ (x @ basis)
+        component = x @ basis
+        total = total + x.T @ component
     return total
