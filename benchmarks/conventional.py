@@ -52,7 +52,8 @@ class Conventional:
         self.low = parameters.wall
         self.high = parameters.grid - parameters.wall
         self.dx = 1.0 / parameters.grid
-        self.lid = float(state.wall_velocity[WALLS.index("top"), 0])
+        top = WALLS.index("top")
+        self.lid = float(state.wall_velocity[top, 0])
         self.mass = parameters.density * state.area / parameters.particles
         self.pressure = (
             0.5
@@ -63,22 +64,27 @@ class Conventional:
         )
         self.diffusion = state.viscosity * parameters.dt * parameters.grid**2
         self.inset = (self.low + 0.5 + 1e-3) * self.dx
-        n = parameters.particles
-        nodes = (parameters.grid + 1, parameters.grid + 1)
-        self.x = ti.Vector.field(2, ti.f32, n)
-        self.v = ti.Vector.field(2, ti.f32, n)
-        self.c = ti.Matrix.field(2, 2, ti.f32, n)
-        self.j = ti.field(ti.f32, n)
+
+        # Particles: position, velocity, affine velocity and J.
+        count = parameters.particles
+        self.x = ti.Vector.field(2, ti.f32, count)
+        self.v = ti.Vector.field(2, ti.f32, count)
+        self.c = ti.Matrix.field(2, 2, ti.f32, count)
+        self.j = ti.field(ti.f32, count)
+        # Nodes: mass or density, J, momentum or velocity, and acceleration.
+        side = parameters.grid + 1
+        nodes = (side, side)
         self.m = ti.field(ti.f32, nodes)
         self.q = ti.field(ti.f32, nodes)
         self.gv = ti.Vector.field(2, ti.f32, nodes)
         self.ga = ti.Vector.field(2, ti.f32, nodes)
-        for target, values in (
-            (self.x, state.position),
-            (self.v, state.velocity),
-            (self.c, state.affine),
-        ):
-            target.from_numpy(values.astype(np.float32))
+
+        position = state.position.astype(np.float32)
+        velocity = state.velocity.astype(np.float32)
+        affine = state.affine.astype(np.float32)
+        self.x.from_numpy(position)
+        self.v.from_numpy(velocity)
+        self.c.from_numpy(affine)
         self.j.fill(1.0)
 
     @ti.func
@@ -86,20 +92,19 @@ class Conventional:
         """Return base node, offset in cells and quadratic B-spline weights."""
         base = ti.cast(x * self.p.grid - 0.5, ti.i32)
         f = x * self.p.grid - ti.cast(base, ti.f32)
-        return (
-            base,
-            f,
-            [0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2],
-        )
+        first = 0.5 * (1.5 - f) ** 2
+        second = 0.75 - (f - 1) ** 2
+        third = 0.5 * (f - 0.5) ** 2
+        return (base, f, [first, second, third])
 
     @ti.func
     def fold(self, inner, ghost, flip, moved):
         """Add the mirror image of a ghost node to its interior node."""
-        self.m[inner] += self.m[ghost]
+        ghost_mass = self.m[ghost]
+        wall_momentum = ti.Vector([2.0 * moved * ghost_mass, 0.0])
+        self.m[inner] += ghost_mass
         self.q[inner] += self.q[ghost]
-        self.gv[inner] += flip * self.gv[ghost] + ti.Vector(
-            [2.0 * moved * self.m[ghost], 0.0]
-        )
+        self.gv[inner] += flip * self.gv[ghost] + wall_momentum
 
     @ti.kernel
     def substep(self):
@@ -108,26 +113,37 @@ class Conventional:
             self.gv[i, k] = ti.Vector([0.0, 0.0])
             self.m[i, k] = 0.0
             self.q[i, k] = 0.0
+        # P2G: mass, momentum and J of the particles at the nodes.
         for p in self.x:
             base, f, w = self.weights(self.x[p])
             affine = self.c[p] * self.dx
             for i, k in ti.static(ti.ndrange(3, 3)):
                 offset = ti.Vector([i, k])
+                node = base + offset
                 weight = self.mass * w[i][0] * w[k][1]
-                self.gv[base + offset] += weight * (self.v[p] + affine @ (offset - f))
-                self.m[base + offset] += weight
-                self.q[base + offset] += weight * self.j[p]
+                velocity = self.v[p] + affine @ (offset - f)
+                self.gv[node] += weight * velocity
+                self.m[node] += weight
+                self.q[node] += weight * self.j[p]
+
+        # The ghost nodes give their sums to the nodes inside the walls.
         flip = ti.Vector([-1.0, -1.0])
         for k in range(self.low, self.high + 1):
-            self.fold(ti.Vector([self.low + 1, k]), ti.Vector([self.low, k]), flip, 0.0)
-            self.fold(
-                ti.Vector([self.high - 1, k]), ti.Vector([self.high, k]), flip, 0.0
-            )
+            inside_left = ti.Vector([self.low + 1, k])
+            left = ti.Vector([self.low, k])
+            self.fold(inside_left, left, flip, 0.0)
+            inside_right = ti.Vector([self.high - 1, k])
+            right = ti.Vector([self.high, k])
+            self.fold(inside_right, right, flip, 0.0)
         for i in range(self.low + 1, self.high):
-            self.fold(ti.Vector([i, self.low + 1]), ti.Vector([i, self.low]), flip, 0.0)
-            self.fold(
-                ti.Vector([i, self.high - 1]), ti.Vector([i, self.high]), flip, self.lid
-            )
+            inside_bottom = ti.Vector([i, self.low + 1])
+            bottom = ti.Vector([i, self.low])
+            self.fold(inside_bottom, bottom, flip, 0.0)
+            inside_top = ti.Vector([i, self.high - 1])
+            top = ti.Vector([i, self.high])
+            self.fold(inside_top, top, flip, self.lid)
+
+        # Momentum becomes velocity, mass density.
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             mass = self.m[i, k]
             if mass > 0.0:
@@ -137,46 +153,52 @@ class Conventional:
             else:
                 self.q[i, k] = 1.0
         for k in range(self.low + 1, self.high):
-            self.mirror(ti.Vector([self.low, k]), ti.Vector([self.low + 1, k]), 0.0)
-            self.mirror(ti.Vector([self.high, k]), ti.Vector([self.high - 1, k]), 0.0)
+            inside_left = ti.Vector([self.low + 1, k])
+            left = ti.Vector([self.low, k])
+            self.mirror(left, inside_left, 0.0)
+            inside_right = ti.Vector([self.high - 1, k])
+            right = ti.Vector([self.high, k])
+            self.mirror(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            self.mirror(ti.Vector([i, self.low]), ti.Vector([i, self.low + 1]), 0.0)
-            self.mirror(
-                ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i)
-            )
+            inside_bottom = ti.Vector([i, self.low + 1])
+            bottom = ti.Vector([i, self.low])
+            self.mirror(bottom, inside_bottom, 0.0)
+            inside_top = ti.Vector([i, self.high - 1])
+            top = ti.Vector([i, self.high])
+            self.mirror(top, inside_top, self.lid_at(i))
+
+        # Pressure and viscosity accelerate the nodes.
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             q = ti.static(self.q)
             across = q[i + 1, k] - q[i - 1, k]
             along = q[i, k + 1] - q[i, k - 1]
             rising = q[i + 1, k + 1] - q[i - 1, k - 1]
             falling = q[i + 1, k - 1] - q[i - 1, k + 1]
-            gradient = ti.Vector(
-                [
-                    0.75 * across + 0.125 * (rising + falling),
-                    0.75 * along + 0.125 * (rising - falling),
-                ]
-            )
+            gradient_x = 0.75 * across + 0.125 * (rising + falling)
+            gradient_y = 0.75 * along + 0.125 * (rising - falling)
+            gradient = ti.Vector([gradient_x, gradient_y])
+
             v = ti.static(self.gv)
-            laplacian = (
-                v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1] - 4.0 * v[i, k]
-            )
+            neighbours = v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1]
+            laplacian = neighbours - 4.0 * v[i, k]
             self.ga[i, k] = self.pressure * gradient + self.diffusion * laplacian
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             self.gv[i, k] += self.ga[i, k]
         for k in range(self.low + 1, self.high):
-            self.mirror_velocity(
-                ti.Vector([self.low, k]), ti.Vector([self.low + 1, k]), 0.0
-            )
-            self.mirror_velocity(
-                ti.Vector([self.high, k]), ti.Vector([self.high - 1, k]), 0.0
-            )
+            inside_left = ti.Vector([self.low + 1, k])
+            left = ti.Vector([self.low, k])
+            self.mirror_velocity(left, inside_left, 0.0)
+            inside_right = ti.Vector([self.high - 1, k])
+            right = ti.Vector([self.high, k])
+            self.mirror_velocity(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            self.mirror_velocity(
-                ti.Vector([i, self.low]), ti.Vector([i, self.low + 1]), 0.0
-            )
-            self.mirror_velocity(
-                ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i)
-            )
+            inside_bottom = ti.Vector([i, self.low + 1])
+            bottom = ti.Vector([i, self.low])
+            self.mirror_velocity(bottom, inside_bottom, 0.0)
+            inside_top = ti.Vector([i, self.high - 1])
+            top = ti.Vector([i, self.high])
+            self.mirror_velocity(top, inside_top, self.lid_at(i))
+
         for p in self.x:
             self.gather(p)
 
@@ -195,14 +217,16 @@ class Conventional:
     @ti.func
     def mirror(self, ghost, inner, moved):
         """Fill a ghost node's density, J and velocity."""
+        twice_wall_velocity = ti.Vector([2.0 * moved, 0.0])
         self.m[ghost] = self.m[inner]
         self.q[ghost] = self.q[inner]
-        self.gv[ghost] = ti.Vector([2.0 * moved, 0.0]) - self.gv[inner]
+        self.gv[ghost] = twice_wall_velocity - self.gv[inner]
 
     @ti.func
     def mirror_velocity(self, ghost, inner, moved):
         """Fill a ghost node's velocity and acceleration."""
-        self.gv[ghost] = ti.Vector([2.0 * moved, 0.0]) - self.gv[inner]
+        twice_wall_velocity = ti.Vector([2.0 * moved, 0.0])
+        self.gv[ghost] = twice_wall_velocity - self.gv[inner]
         self.ga[ghost] = -self.ga[inner]
 
     @ti.func
@@ -217,33 +241,35 @@ class Conventional:
         smooth = 0.0
         for i, k in ti.static(ti.ndrange(3, 3)):
             offset = ti.Vector([i, k])
+            node = base + offset
             apart = offset - f
             weight = w[i][0] * w[k][1]
-            carried = weight * self.gv[base + offset]
+            carried = weight * self.gv[node]
             v += carried
-            a += weight * self.ga[base + offset]
+            a += weight * self.ga[node]
             c += carried.outer_product(apart)
-            density += weight * self.m[base + offset]
-            thinner += weight * self.m[base + offset] * apart
-            smooth += weight * self.q[base + offset]
+            density += weight * self.m[node]
+            thinner += weight * self.m[node] * apart
+            smooth += weight * self.q[node]
         c *= 4.0 * self.p.grid
         density = ti.max(density, 0.5)
+
+        # Particles move a little to where the matter is thinner.
         limit = 0.1 * self.dx
-        shift = ti.math.clamp(
-            -4.0 * self.p.shift * self.dx * thinner / density, -limit, limit
-        )
+        wanted_shift = -4.0 * self.p.shift * self.dx * thinner / density
+        shift = ti.math.clamp(wanted_shift, -limit, limit)
         moved = self.v[p] + a
-        self.v[p] = moved + self.p.velocity_relaxation * (v - moved) + c @ shift
-        self.x[p] = ti.math.clamp(
-            self.x[p] + self.p.dt * v + shift, self.inset, 1.0 - self.inset
-        )
+        relaxation = self.p.velocity_relaxation * (v - moved)
+        self.v[p] = moved + relaxation + c @ shift
+        position = self.x[p] + self.p.dt * v + shift
+        self.x[p] = ti.math.clamp(position, self.inset, 1.0 - self.inset)
         self.c[p] = c
+
         old = self.j[p]
-        self.j[p] = (
-            old * (1.0 + self.p.dt * c.trace())
-            + self.p.jacobian_relaxation * (smooth - old)
-            + self.p.density_coupling * (1.0 / density - smooth)
-        )
+        expanded = old * (1.0 + self.p.dt * c.trace())
+        smoothing = self.p.jacobian_relaxation * (smooth - old)
+        coupling = self.p.density_coupling * (1.0 / density - smooth)
+        self.j[p] = expanded + smoothing + coupling
 
 
 def main() -> int:
@@ -265,23 +291,28 @@ def main() -> int:
     experiment = plan(
         Case.CAVITY, reynolds=100.0, grid=options.grid, substeps=options.substeps
     )
-    box = Conventional(solver_parameters(experiment), initial_state(experiment))
+    parameters = solver_parameters(experiment)
+    state = initial_state(experiment)
+    box = Conventional(parameters, state)
     box.substep()
     ti.sync()
-    wall = []
-    processor = []
+    wall_times = []  # [s]
+    processor_times = []  # [s]
     for _ in range(options.repeats):
-        start = time.perf_counter(), time.process_time()
+        wall_start = time.perf_counter()
+        processor_start = time.process_time()
         for _ in range(options.substeps):
             box.substep()
         ti.sync()
-        wall.append(time.perf_counter() - start[0])
-        processor.append(time.process_time() - start[1])
-    work = experiment.particles * options.substeps
+        wall_times.append(time.perf_counter() - wall_start)
+        processor_times.append(time.process_time() - processor_start)
+    particle_substeps = experiment.particles * options.substeps
+    velocity = box.v.to_numpy()
+    square_speed = np.sum(velocity**2, axis=-1)
     speed = {
-        "per_core": work / min(wall) / options.threads,
-        "per_processor_second": work / min(processor),
-        "energy": float(0.5 * np.mean(np.sum(box.v.to_numpy() ** 2, axis=-1))),
+        "per_core": particle_substeps / min(wall_times) / options.threads,
+        "per_processor_second": particle_substeps / min(processor_times),
+        "energy": float(0.5 * np.mean(square_speed)),
     }
     print(json.dumps(speed))
     return 0

@@ -60,24 +60,32 @@ class CalibrationScenario:
         self.truth = positions[self.first : self.end]
         self.rng = np.random.Generator(np.random.PCG64(0))
         displacement = np.diff(positions[: self.end], axis=0)
-        self.step = float(np.sqrt(np.mean(displacement**2)))  # [length/frame]
+        mean_square = np.mean(displacement**2)
+        self.step = float(np.sqrt(mean_square))  # [length/frame]
 
     def noise(self) -> Floats:
         """Return white noise of one frame's motion, shape of the truth."""
-        return self.step * self.rng.standard_normal(self.truth.shape)
+        normal = self.rng.standard_normal(self.truth.shape)
+        return self.step * normal
 
     def shifted(self, frames: int) -> Floats:
         """Return the truth of so many frames earlier, shape of the truth."""
-        return self.positions[self.first - frames : self.end - frames]
+        first = self.first - frames
+        end = self.end - frames
+        return self.positions[first:end]
 
     def next_frames(self) -> Floats:
         """Return the truth one frame later; the last frame repeats."""
-        return np.concatenate([self.truth[1:], self.truth[-1:]])
+        later = self.truth[1:]
+        last = self.truth[-1:]
+        return np.concatenate([later, last])
 
     def last_motion(self, first: int) -> tuple[Floats, Floats]:
         """Return position and displacement in the frame before an absolute frame."""
+        before = self.positions[first - 2]
         position = self.positions[first - 1]
-        return position, position - self.positions[first - 2]
+        displacement = position - before
+        return position, displacement
 
     def extrapolate(self, first: int, count: int, decay: float = 1.0) -> Floats:
         """Return ``count`` frames at the velocity before absolute frame ``first``."""
@@ -97,18 +105,23 @@ class CalibrationScenario:
         position, displacement = self.last_motion(first)
         grid = self.scenario.config.grid
         full = self.scenario.full_weight
-        velocity = fields(position, displacement, grid, full=full).velocity
+        grid_fields = fields(position, displacement, grid, full=full)
+        node_velocity = grid_fields.velocity
         frames = []
         for _ in range(count):
-            position = position + sample(velocity, position, grid)
+            velocity = sample(node_velocity, position, grid)
+            position = position + velocity
             frames.append(position)
         return np.stack(frames)
 
     def restart(self, every: int) -> Floats:
         """Return constant velocity, started again from the truth every few frames."""
-        starts = range(self.first, self.end, every)
-        pieces = [self.extrapolate(first, every) for first in starts]
-        return np.concatenate(pieces)[: self.horizon]
+        pieces = []
+        for first in range(self.first, self.end, every):
+            piece = self.extrapolate(first, every)
+            pieces.append(piece)
+        frames = np.concatenate(pieces)
+        return frames[: self.horizon]
 
 
 def sample(velocity: Floats, position: Floats, grid: Grid) -> Floats:
@@ -118,36 +131,53 @@ def sample(velocity: Floats, position: Floats, grid: Grid) -> Floats:
     node = coordinate.astype(int)
     offset = coordinate - node
     x, y = node.T
-    right = offset[:, :1]  # share of the node to the right, shape [particle, 1]
-    top = offset[:, 1:]
-    on_left = velocity[x, y] * (1 - top) + velocity[x, y + 1] * top
-    on_right = velocity[x + 1, y] * (1 - top) + velocity[x + 1, y + 1] * top
-    return np.asarray(on_left * (1 - right) + on_right * right, np.float64)
+    bottom_left = velocity[x, y]
+    top_left = velocity[x, y + 1]
+    bottom_right = velocity[x + 1, y]
+    top_right = velocity[x + 1, y + 1]
+
+    right_share = offset[:, :1]  # of the nodes on the right, shape [particle, 1]
+    left_share = 1 - right_share
+    top_share = offset[:, 1:]
+    bottom_share = 1 - top_share
+    on_left = bottom_left * bottom_share + top_left * top_share
+    on_right = bottom_right * bottom_share + top_right * top_share
+    at_particle = on_left * left_share + on_right * right_share
+    return np.asarray(at_particle, np.float64)
 
 
 def interpolate(test: CalibrationScenario, every: int) -> Floats:
     """Return straight lines between every few true frames."""
     last = test.horizon - 1
     frames = []
-    for start in range(0, test.horizon, every):
-        end = min(start + every, last)
-        displacement = test.truth[end] - test.truth[start]
-        for k in range(every):
-            frames.append(test.truth[start] + displacement * (k / every))
-    return np.stack(frames)[: test.horizon]
+    for first in range(0, test.horizon, every):
+        end = min(first + every, last)
+        start_position = test.truth[first]
+        end_position = test.truth[end]
+        displacement = end_position - start_position
+        for step in range(every):
+            share = step / every
+            position = start_position + displacement * share
+            frames.append(position)
+    positions = np.stack(frames)
+    return positions[: test.horizon]
 
 
 def drift(test: CalibrationScenario, *, smooth: bool) -> Floats:
     """Return the truth plus integrated velocity errors of 2 % of its motion."""
     error = 0.02 * test.noise()
     if smooth:
-        error[:] = 0.02 * test.step * np.sin(6.0 * test.truth[:, :, ::-1])
-    return test.truth + np.cumsum(error, axis=0)
+        swapped_axes = test.truth[:, :, ::-1]
+        waves = np.sin(6.0 * swapped_axes)
+        error[:] = 0.02 * test.step * waves
+    position_error = np.cumsum(error, axis=0)
+    return test.truth + position_error
 
 
 def persistence(test: CalibrationScenario) -> Floats:
     """Return the last given frame, repeated."""
-    return np.broadcast_to(test.positions[test.first - 1], test.truth.shape)
+    last_given = test.positions[test.first - 1]
+    return np.broadcast_to(last_given, test.truth.shape)
 
 
 def constant_velocity(test: CalibrationScenario) -> Floats:
@@ -168,19 +198,27 @@ def fixed_field(test: CalibrationScenario) -> Floats:
 def other_scenario(test: CalibrationScenario) -> Floats:
     """Return the last given frame plus the displacements of another scenario."""
     other = test.other_positions
-    displacement = other[test.first : test.end] - other[test.first - 1]
-    return test.positions[test.first - 1] + displacement
+    last_given = test.first - 1
+    other_start = other[last_given]
+    other_path = other[test.first : test.end]
+    displacement = other_path - other_start
+    return test.positions[last_given] + displacement
 
 
 def field_steps(test: CalibrationScenario) -> Floats:
     """Return one step in the fixed field from every true frame."""
-    steps = [test.follow_field(first, 1) for first in range(test.first, test.end)]
-    return np.concatenate(steps)
+    frames = []
+    for first in range(test.first, test.end):
+        frame = test.follow_field(first, 1)
+        frames.append(frame)
+    return np.concatenate(frames)
 
 
 def moving_average(test: CalibrationScenario) -> Floats:
     """Return the mean of the true frames before, at and after each frame."""
-    return (test.truth + test.shifted(1) + test.next_frames()) / 3.0
+    before = test.shifted(1)
+    after = test.next_frames()
+    return (test.truth + before + after) / 3.0
 
 
 Predict = Callable[[CalibrationScenario], Floats]
@@ -216,13 +254,12 @@ def trace_prediction(test: CalibrationScenario, predicted: Floats) -> Trace:
     """Return the trace of a prediction."""
     scenario = test.scenario
     tracer = Tracer(scenario)
-    frames = zip(
-        scenario.config.predicted_frames,
-        snapshots(scenario, test.truth),
-        snapshots(scenario, predicted),
-        strict=True,
-    )
-    for frame, true_snapshot, predicted_snapshot in frames:
+    frames = scenario.config.predicted_frames
+    true_snapshots = snapshots(scenario, test.truth)
+    predicted_snapshots = snapshots(scenario, predicted)
+    for frame, true_snapshot, predicted_snapshot in zip(
+        frames, true_snapshots, predicted_snapshots, strict=True
+    ):
         pair = FramePair(scenario, frame, true_snapshot, predicted_snapshot)
         tracer.add(pair)
     return tracer.result()
@@ -234,13 +271,14 @@ def read_tests(task: ScoredTask) -> dict[int, CalibrationScenario]:
     positions = []
     for number in task.scenarios:
         with task.opened(number) as opened:
+            position = opened.file.read("position")
+            positions.append(position.astype(np.float64))
             scenarios.append(opened.scenario)
-            positions.append(opened.file.read("position").astype(np.float64))
     tests = {}
     for i, number in enumerate(task.scenarios):
-        tests[number] = CalibrationScenario(
-            scenarios[i], positions[i], positions[i - 1]
-        )
+        other_positions = positions[i - 1]
+        test = CalibrationScenario(scenarios[i], positions[i], other_positions)
+        tests[number] = test
     return tests
 
 
@@ -258,7 +296,8 @@ def open_trained(
 def read_positions(predictions: Predictions, scenario: int) -> Floats:
     """Return the predicted positions of a scenario, shape [frame, particle, 2]."""
     blocks = [block for _, block in predictions.blocks(scenario)]
-    return np.concatenate(blocks).astype(float)
+    positions = np.concatenate(blocks)
+    return positions.astype(float)
 
 
 def main() -> int:
@@ -271,21 +310,28 @@ def main() -> int:
     parser.add_argument("--splits", default=",".join(SPLITS))
     parser.add_argument("--trained", type=Path, nargs="*", default=[])
     options = parser.parse_args()
-    heads = "".join(f"{name:>17s}" for name in (*COLUMNS, "energy", "area"))
+    root = resolve_root(options.root)
+    heads = ""
+    for column in (*COLUMNS, "energy", "area"):
+        heads += f"{column:>17s}"
     print(f"{'prediction':32s} {'split':14s}{heads}  copy_suspect")
+
     tables = {"honest": HONEST, "made from the truth": DISHONEST}
     all_numbers: dict[str, list[list[float]]] = {}
     for kind in (*tables, "trained"):
         all_numbers[kind] = []
     for split in options.splits.split(","):
         size = load().size(split, options.size)
-        tests = read_tests(load_scored_task(size, resolve_root(options.root)))
+        task = load_scored_task(size, root)
+        tests = read_tests(task)
         for kind, table in tables.items():
             print(f"-- {split} {options.size}, {kind}")
             for name, predict in table.items():
                 traces = []
                 for test in tests.values():
-                    traces.append(trace_prediction(test, predict(test)))
+                    predicted = predict(test)
+                    trace = trace_prediction(test, predicted)
+                    traces.append(trace)
                 all_numbers[kind] += print_line(name, split, traces)
 
         print(f"-- {split} {options.size}, trained")
@@ -293,19 +339,27 @@ def main() -> int:
             traces = []
             for number, test in tests.items():
                 predicted = read_positions(predictions, number)
-                traces.append(trace_prediction(test, predicted))
+                trace = trace_prediction(test, predicted)
+                traces.append(trace)
             all_numbers["trained"] += print_line(name, split, traces)
     for kind, numbers in all_numbers.items():
         if numbers:
-            print(f"{'all splits, ' + kind:47s}{format_ranges(numbers)}")
+            ranges = format_ranges(numbers)
+            print(f"{'all splits, ' + kind:47s}{ranges}")
     return 0
 
 
 def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
     """Print the line of a prediction; return its numbers by scenario."""
-    numbers = [numbers_of(trace) for trace in traces]
-    flag = "raised" if judge_copying(traces).raised else "-"
-    print(f"{name:32s} {split:14s}{format_ranges(numbers)}  {flag}", flush=True)
+    numbers = []
+    for trace in traces:
+        scenario_numbers = numbers_of(trace)
+        numbers.append(scenario_numbers)
+    ranges = format_ranges(numbers)
+    flag = "-"
+    if judge_copying(traces).raised:
+        flag = "raised"
+    print(f"{name:32s} {split:14s}{ranges}  {flag}", flush=True)
     return numbers
 
 
@@ -314,9 +368,14 @@ def numbers_of(trace: Trace) -> list[float]:
     copy_evidence = analyse_error(trace)
     numbers = []
     for column in COLUMNS:
-        numbers.append(float(getattr(copy_evidence, column)))
-    numbers.append(float(np.mean(trace.predicted_motion) / np.mean(trace.motion)))
-    numbers.append(float(np.mean(trace.occupancy)))
+        value = getattr(copy_evidence, column)
+        numbers.append(float(value))
+    predicted_motion = np.mean(trace.predicted_motion)
+    true_motion = np.mean(trace.motion)
+    energy_ratio = predicted_motion / true_motion
+    area_ratio = np.mean(trace.occupancy)
+    numbers.append(float(energy_ratio))
+    numbers.append(float(area_ratio))
     return numbers
 
 
@@ -324,10 +383,13 @@ def format_ranges(numbers: Sequence[Sequence[float]]) -> str:
     """Return the least and the greatest of each number; NaN is left out."""
     text = ""
     for column in np.array(numbers).T:
-        values = column[~np.isnan(column)]
+        is_number = ~np.isnan(column)
+        values = column[is_number]
         cell = "-"
         if values.size:
-            cell = f"{min(values):.3g}..{max(values):.3g}"
+            least = min(values)
+            greatest = max(values)
+            cell = f"{least:.3g}..{greatest:.3g}"
         text += f"{cell:>17s}"
     return text
 

@@ -61,6 +61,7 @@ LAST_STATE = 2 / 3  # share of a scenario's frames within which a state may lie
 THINNING = 4  # every so many particles count when parameters are chosen
 MEASURED_EVERY = 10  # frames between those at which the metric is measured
 CHOSEN_EVERY = 30  # the same when parameters are chosen
+GOLDEN_RATIO = 0.6180339887498949  # the smaller one; its multiples spread evenly
 
 Choice = Mapping[str, float]
 Clouds = dict[int, Floats]  # positions by frame [length], each [particle, axis]
@@ -109,14 +110,16 @@ class Case:
     def flown(self, steps: int) -> tuple[Floats, Floats]:
         """Return positions and velocities after free flight, thinned."""
         given = self.given
-        position = ballistic_positions(given, steps) if steps else given.last
+        position = given.last
         before = given.position[-2]
-        if steps == 1:
+        if steps >= 1:
+            position = ballistic_positions(given, steps)
             before = given.last
-        elif steps > 1:
+        if steps > 1:
             before = ballistic_positions(given, steps - 1)
         velocity = given.box.displacement(before, position)
-        return position[:: self.thinning], velocity[:: self.thinning]
+        counted = slice(None, None, self.thinning)
+        return position[counted], velocity[counted]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,9 +134,12 @@ class Attempt:
 
 def grid(**values: Sequence[float]) -> tuple[Choice, ...]:
     """Return all combinations of some values."""
+    names = tuple(values)
     choices = []
     for combination in itertools.product(*values.values()):
-        choices.append(dict(zip(values, combination, strict=True)))
+        pairs = zip(names, combination, strict=True)
+        choice = dict(pairs)
+        choices.append(choice)
     return tuple(choices)
 
 
@@ -142,9 +148,12 @@ def grid(**values: Sequence[float]) -> tuple[Choice, ...]:
 
 def quantiles(values: Floats) -> Floats:
     """Return the quantiles of a cloud along eight directions, one row."""
-    along = FEATURE_DIRECTIONS[values.shape[1]]
-    levels = np.quantile(values @ along, FEATURE_LEVELS, axis=0)
-    return np.asarray(levels.ravel() / math.sqrt(levels.size))
+    dimension = values.shape[1]
+    directions = FEATURE_DIRECTIONS[dimension]
+    projections = values @ directions
+    levels = np.quantile(projections, FEATURE_LEVELS, axis=0)
+    scaled = levels.ravel() / math.sqrt(levels.size)
+    return np.asarray(scaled)
 
 
 def describe(
@@ -158,9 +167,12 @@ def describe(
     parts = []
     for kind in kinds:
         members = material == kind
-        share = math.sqrt(float(np.mean(members)))
-        parts.append(share * quantiles(position[members]))
-        parts.append(share * velocity_weight * quantiles(velocity[members]))
+        share = float(np.mean(members))
+        weight = math.sqrt(share)
+        position_levels = quantiles(position[members])
+        velocity_levels = quantiles(velocity[members])
+        parts.append(weight * position_levels)
+        parts.append(weight * velocity_weight * velocity_levels)
     return np.concatenate(parts)
 
 
@@ -179,7 +191,8 @@ class Library:
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - one library lives as long as the run
     def _image(self, scenario: int, mirror: int) -> tuple[Floats, NDArray[np.int8]]:
-        train = read_train_scenario(self.size.path(self.root, scenario))
+        path = self.size.path(self.root, scenario)
+        train = read_train_scenario(path)
         image = self.mirrors[mirror].positions(train.position)
         return image, train.material
 
@@ -195,12 +208,14 @@ class Library:
         """
         key = (kinds, velocity_weight, is_exact)
         if key not in self._states:
-            self._states[key] = self._build(kinds, velocity_weight, is_exact=is_exact)
+            states = self._build(kinds, velocity_weight, is_exact=is_exact)
+            self._states[key] = states
         return self._states[key]
 
     def _build(
         self, kinds: tuple[int, ...], velocity_weight: float, *, is_exact: bool
     ) -> States | None:
+        box = self.size.box
         states = []
         features = []
         for scenario in long_enough(self.size):
@@ -211,13 +226,18 @@ class Library:
                     continue
                 if not set(kinds) <= set(present):
                     continue
-                for frame in range(1, int(LAST_STATE * len(image)), STRIDE):
+
+                end = int(LAST_STATE * len(image))
+                for frame in range(1, end, STRIDE):
+                    before = image[frame - 1]
                     position = image[frame]
-                    velocity = self.size.box.displacement(image[frame - 1], position)
-                    states.append(State(scenario, mirror, frame))
-                    features.append(
-                        describe(position, velocity, material, kinds, velocity_weight)
+                    velocity = box.displacement(before, position)
+                    feature = describe(
+                        position, velocity, material, kinds, velocity_weight
                     )
+                    features.append(feature)
+                    state = State(scenario, mirror, frame)
+                    states.append(state)
         if not states:
             return None
         return States(tuple(states), np.array(features))
@@ -227,16 +247,22 @@ def nearest(
     states: States, feature: Floats, *, count: int, without: int | None
 ) -> tuple[list[State], list[float]]:
     """Return the nearest states of different mirrored scenarios, and distances."""
-    distance = np.sqrt(np.sum((states.features - feature) ** 2, axis=1))
+    difference = states.features - feature
+    square = np.sum(difference**2, axis=1)
+    distance = np.sqrt(square)
+    nearest_first = np.argsort(distance, kind="stable")
+
     chosen: list[State] = []
     distances = []
-    seen = set()
-    for number in np.argsort(distance, kind="stable").tolist():
+    chosen_images = set()
+    for number in nearest_first.tolist():
         state = states.states[number]
-        image = (state.scenario, state.mirror)
-        if state.scenario == without or image in seen:
+        if state.scenario == without:
             continue
-        seen.add(image)
+        image = (state.scenario, state.mirror)
+        if image in chosen_images:
+            continue
+        chosen_images.add(image)
         chosen.append(state)
         distances.append(float(distance[number]))
         if len(chosen) == count:
@@ -254,7 +280,8 @@ class Predictors:
         self.library = library
 
     def _kinds(self, case: Case) -> tuple[int, ...]:
-        return tuple(np.unique(case.given.material).tolist())
+        kinds = np.unique(case.given.material)
+        return tuple(kinds.tolist())
 
     def _compare(
         self, case: Case, steps: int, choice: Choice, kinds: tuple[int, ...]
@@ -267,27 +294,28 @@ class Predictors:
         if states is None:
             return [], []
         feature = describe(position, velocity, case.material, kinds, weight)
-        return nearest(
-            states, feature, count=int(choice["analogs"]), without=case.without
-        )
+        count = int(choice["analogs"])
+        return nearest(states, feature, count=count, without=case.without)
 
     def _paths(
         self, case: Case, state: State, position: Floats, members: NDArray[np.intp]
     ) -> Callable[[int], Floats]:
         """Return the way of the members' partners: frames on to [member, axis]."""
         image, material = self.library.motion(state)
+        own_position = position[members]
+        own_material = case.material[members]
+        image_position = image[state.frame]
         partner = assign_particles(
-            position[members],
-            image[state.frame],
-            case.material[members],
-            material,
-            case.given.box,
+            own_position, image_position, own_material, material, case.given.box
         )
-        offset = position[members] - image[state.frame, partner]
+        offset = own_position - image_position[partner]
+        last_frame = len(image) - 1
 
         def at(frames_on: int, fading: float = 0.95) -> Floats:
-            frame = min(state.frame + frames_on, len(image) - 1)
-            return np.asarray(image[frame, partner] + offset * fading**frames_on)
+            frame = min(state.frame + frames_on, last_frame)
+            partner_position = image[frame, partner]
+            share = fading**frames_on
+            return np.asarray(partner_position + offset * share)
 
         return at
 
@@ -298,28 +326,34 @@ class Predictors:
         follow: Callable[[int], Floats],
     ) -> Clouds:
         """Return free flight, then what a function of the frames since then gives."""
+        box = case.given.box
         clouds = {}
         for frame in case.frames:
             steps = case.steps(frame)
             if steps <= flown:
-                clouds[frame] = case.flown(steps)[0]
-            else:
-                clouds[frame] = case.given.box.inside(follow(steps - flown))
+                position, _ = case.flown(steps)
+                clouds[frame] = position
+                continue
+            position = follow(steps - flown)
+            clouds[frame] = box.inside(position)
         return clouds
 
     def _flown(self, case: Case, choice: Choice) -> int:
         horizon = len(case.given.predicted_frames)
-        return min(horizon, case.flight + int(choice.get("lag", 0)))
+        lag = int(choice.get("lag", 0))
+        return min(horizon, case.flight + lag)
 
     def shared(self, case: Case, choice: Choice) -> Clouds:
         """Our own: the particles share the nearest states."""
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
-        states, _ = self._compare(case, flown, choice, self._kinds(case))
+        kinds = self._kinds(case)
+        states, _ = self._compare(case, flown, choice, kinds)
         followers = []
         for number, state in enumerate(states):
             members = np.arange(number, len(position), len(states))
-            followers.append((members, self._paths(case, state, position, members)))
+            path = self._paths(case, state, position, members)
+            followers.append((members, path))
         fading = float(choice.get("fading", 0.95))
 
         def follow(frames_on: int) -> Floats:
@@ -329,26 +363,31 @@ class Predictors:
             return cloud
 
         if not followers:
-            return self._after_flight(case, len(case.given.predicted_frames), follow)
+            return self._fly(case)
         return self._after_flight(case, flown, follow)
 
     def weighted(self, case: Case, choice: Choice) -> Clouds:
         """Nearer states get more particles: shares fall with the distance."""
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
-        states, distances = self._compare(case, flown, choice, self._kinds(case))
+        kinds = self._kinds(case)
+        states, distances = self._compare(case, flown, choice, kinds)
         if not states:
             return self._fly(case)
-        weights = _weights(distances, float(choice["sharpness"]))
-        edges = np.cumsum(weights)
+        sharpness = float(choice["sharpness"])
+        weights = _weights(distances, sharpness)
+        upper_ends = np.cumsum(weights)
         # low discrepancy: every stretch of particles has the same shares
-        place = np.mod(np.arange(len(position)) * 0.6180339887498949, 1.0)
-        owner = np.minimum(np.searchsorted(edges, place), len(states) - 1)
+        numbers = np.arange(len(position))
+        place = np.mod(numbers * GOLDEN_RATIO, 1.0)
+        owner = np.searchsorted(upper_ends, place)
+        owner = np.minimum(owner, len(states) - 1)
         followers = []
         for number, state in enumerate(states):
             members = np.flatnonzero(owner == number)
             if members.size:
-                followers.append((members, self._paths(case, state, position, members)))
+                path = self._paths(case, state, position, members)
+                followers.append((members, path))
 
         def follow(frames_on: int) -> Floats:
             cloud = position.copy()
@@ -364,20 +403,28 @@ class Predictors:
         """
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
-        states, distances = self._compare(case, flown, choice, self._kinds(case))
+        kinds = self._kinds(case)
+        states, distances = self._compare(case, flown, choice, kinds)
         if not states:
             return self._fly(case)
-        weights = _weights(distances, float(choice["sharpness"]))
+        sharpness = float(choice["sharpness"])
+        weights = _weights(distances, sharpness)
         everybody = np.arange(len(position))
-        paths = [self._paths(case, state, position, everybody) for state in states]
+        paths = []
+        for state in states:
+            path = self._paths(case, state, position, everybody)
+            paths.append(path)
+        first_path, *other_paths = paths
+        first_weight, *other_weights = weights
         material = case.material
 
         def follow(frames_on: int) -> Floats:
-            first = paths[0](frames_on)
-            total = weights[0] * first
-            for weight, path in zip(weights[1:], paths[1:], strict=True):
+            first = first_path(frames_on)
+            total = first_weight * first
+            for weight, path in zip(other_weights, other_paths, strict=True):
                 other = path(frames_on)
-                total = total + weight * _matched(first, other, material)
+                matched = _matched(first, other, material)
+                total = total + weight * matched
             return np.asarray(total)
 
         return self._after_flight(case, flown, follow)
@@ -388,11 +435,12 @@ class Predictors:
         position, _ = case.flown(flown)
         followers = []
         for kind in self._kinds(case):
-            ours = np.flatnonzero(case.material == kind)
+            of_kind = np.flatnonzero(case.material == kind)
             states, _ = self._compare(case, flown, choice, (kind,))
             for number, state in enumerate(states):
-                members = ours[number :: len(states)]
-                followers.append((members, self._paths(case, state, position, members)))
+                members = of_kind[number :: len(states)]
+                path = self._paths(case, state, position, members)
+                followers.append((members, path))
         if not followers:
             return self._fly(case)
 
@@ -417,21 +465,25 @@ class Predictors:
         everybody = np.arange(len(position))
         start = flown
         path: Callable[[int], Floats] | None = None
+        box = case.given.box
         clouds = {}
         for frame in case.frames:
             steps = case.steps(frame)
             if steps <= flown:
-                clouds[frame] = case.flown(steps)[0]
+                clouds[frame], _ = case.flown(steps)
                 continue
             while path is None or steps - start > window:
                 if path is not None:
+                    before = path(window - 1)
                     position = path(window)
-                    velocity = position - path(window - 1)
+                    velocity = position - before
                     start += window
                 feature = describe(position, velocity, case.material, kinds, weight)
-                (state, *_), _ = nearest(states, feature, count=1, without=case.without)
-                path = self._paths(case, state, position, everybody)
-            clouds[frame] = case.given.box.inside(path(steps - start))
+                analogs, _ = nearest(states, feature, count=1, without=case.without)
+                analog = analogs[0]
+                path = self._paths(case, analog, position, everybody)
+            cloud = path(steps - start)
+            clouds[frame] = box.inside(cloud)
         return clouds
 
     def from_the_start(self, case: Case, choice: Choice) -> Clouds:
@@ -441,22 +493,23 @@ class Predictors:
         states = self.library.states(kinds, weight, is_exact=True)
         if states is None:
             return self._fly(case)
-        first_frames = [
-            number for number, state in enumerate(states.states) if state.frame == 1
-        ]
-        starts = States(
-            tuple(states.states[number] for number in first_frames),
-            states.features[first_frames],
-        )
+        first_states = []
+        rows = []
+        for row, state in enumerate(states.states):
+            if state.frame == 1:
+                first_states.append(state)
+                rows.append(row)
+        starts = States(tuple(first_states), states.features[rows])
+
         position, velocity = case.flown(0)
         feature = describe(position, velocity, case.material, kinds, weight)
-        chosen, _ = nearest(
-            starts, feature, count=int(choice["analogs"]), without=case.without
-        )
+        count = int(choice["analogs"])
+        chosen, _ = nearest(starts, feature, count=count, without=case.without)
         followers = []
         for number, state in enumerate(chosen):
             members = np.arange(number, len(position), len(chosen))
-            followers.append((members, self._paths(case, state, position, members)))
+            path = self._paths(case, state, position, members)
+            followers.append((members, path))
 
         def follow(frames_on: int) -> Floats:
             cloud = position.copy()
@@ -473,20 +526,23 @@ class Predictors:
         given = case.given
         low = given.box.lower_walls
         high = given.box.upper_walls
+        friction = float(choice["friction"])
+        bounce = float(choice["bounce"])
         position, velocity = case.flown(0)
         position = position.copy()
         velocity = velocity + 0.5 * given.fall
         clouds = {}
         wanted = set(case.frames)
         for steps, frame in enumerate(given.predicted_frames, start=1):
-            velocity = (velocity + given.fall * (steps > 1)) * (
-                1.0 - float(choice["friction"]) * (steps > case.flight)
-            )
+            has_fallen = steps > 1
+            has_touched = steps > case.flight
+            velocity = velocity + given.fall * has_fallen
+            velocity = velocity * (1.0 - friction * has_touched)
             position = position + velocity
             for axis in range(position.shape[1]):
-                below = position[:, axis] < low[axis]
-                above = position[:, axis] > high[axis]
-                velocity[below | above, axis] *= -float(choice["bounce"])
+                is_below = position[:, axis] < low[axis]
+                is_above = position[:, axis] > high[axis]
+                velocity[is_below | is_above, axis] *= -bounce
             position = np.clip(position, low, high)
             if frame in wanted:
                 clouds[frame] = position.copy()
@@ -497,8 +553,7 @@ class Predictors:
         clouds = self.shared(case, choice)
         pool = _pool(case)
         for frame in case.frames:
-            since = max(0, case.steps(frame) - case.flight)
-            share = float(choice["most"]) * -math.expm1(-since / float(choice["time"]))
+            share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
             target = _matched(cloud, pool, case.material)
             clouds[frame] = (1.0 - share) * cloud + share * target
@@ -512,40 +567,69 @@ class Predictors:
             if scenario == case.without:
                 continue
             for mirror in range(len(self.library.mirrors)):
-                images.append(State(scenario, mirror, 0))
-        count = len(case.material)
+                image = State(scenario, mirror, 0)
+                images.append(image)
         for frame in case.frames:
-            climate = np.empty((count, case.given.box.dimension))
-            for kind in self._kinds(case):
-                ours = np.flatnonzero(case.material == kind)
-                pools = []
-                for state in images:
-                    image, material = self.library.motion(state)
-                    if (material == kind).any():
-                        pools.append(image[frame][material == kind])
-                pool = np.concatenate(pools)
-                climate[ours] = pool[np.arange(len(ours)) * len(pool) // len(ours)]
-            since = max(0, case.steps(frame) - case.flight)
-            share = float(choice["most"]) * -math.expm1(-since / float(choice["time"]))
+            climate = self._mean_cloud(case, frame, images)
+            share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
             target = _matched(cloud, climate, case.material)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
+    def _mean_cloud(self, case: Case, frame: int, images: Sequence[State]) -> Floats:
+        """Return particles spread over the clouds of train at a frame.
+
+        The shape is [particle, axis]; materials are those of the case.
+        """
+        particles = len(case.material)
+        climate = np.empty((particles, case.given.box.dimension))
+        for kind in self._kinds(case):
+            clouds = []
+            for state in images:
+                image, material = self.library.motion(state)
+                is_kind = material == kind
+                if is_kind.any():
+                    position = image[frame]
+                    clouds.append(position[is_kind])
+            train_particles = np.concatenate(clouds)
+
+            members = np.flatnonzero(case.material == kind)
+            numbers = np.arange(len(members))
+            drawn = numbers * len(train_particles) // len(members)
+            climate[members] = train_particles[drawn]
+        return climate
+
     def _fly(self, case: Case) -> Clouds:
-        return {frame: case.flown(case.steps(frame))[0] for frame in case.frames}
+        """Return free flight in every frame."""
+        clouds = {}
+        for frame in case.frames:
+            steps = case.steps(frame)
+            clouds[frame], _ = case.flown(steps)
+        return clouds
+
+
+def _share_since_flight(case: Case, frame: int, choice: Choice) -> float:
+    """Return how far a prediction is drawn to a target: more with time since flight."""
+    most = float(choice["most"])
+    time_scale = float(choice["time"])  # [frame]
+    frames_since = max(0, case.steps(frame) - case.flight)
+    return most * -math.expm1(-frames_since / time_scale)
 
 
 def _weights(distances: Sequence[float], sharpness: float) -> Floats:
     """Return weights that fall with the distance over the least one, sum 1."""
-    relative = np.array(distances) / max(distances[0], 1e-12)
+    least = max(distances[0], 1e-12)
+    relative = np.array(distances) / least
     weights = relative**-sharpness
-    return np.asarray(weights / weights.sum())
+    total = weights.sum()
+    return np.asarray(weights / total)
 
 
 def _matched(here: Floats, there: Floats, material: NDArray[np.int8]) -> Floats:
     """Return the other cloud in the order in which it lies nearest to this one."""
-    return np.asarray(there[assign_particles(here, there, material, material)])
+    partner = assign_particles(here, there, material, material)
+    return np.asarray(there[partner])
 
 
 def _pool(case: Case) -> Floats:
@@ -556,11 +640,15 @@ def _pool(case: Case) -> Floats:
     width = high[0] - low[0]
     height = case.given.area / width
     count = len(case.material)
-    columns = max(1, round(math.sqrt(count * width / height)))
-    number = np.arange(count)
+    even_columns = math.sqrt(count * width / height)
+    columns = max(1, round(even_columns))
     rows = math.ceil(count / columns)
-    x = low[0] + width * (number % columns + 0.5) / columns
-    y = low[1] + height * (number // columns + 0.5) / rows
+
+    number = np.arange(count)
+    column = number % columns
+    row = number // columns
+    x = low[0] + width * (column + 0.5) / columns
+    y = low[1] + height * (row + 0.5) / rows
     return np.stack([x, y], axis=1)
 
 
@@ -650,15 +738,21 @@ def active_frames(path: Path) -> int | None:
     """Return the predicted frames until a scenario rests; None where it says none."""
     with read_scenario(path) as file:
         stated = file.header.parameters.get("active_frames")
-    return None if stated is None else int(str(stated))
+    if stated is None:
+        return None
+    return int(str(stated))
 
 
 def measured_frames(size: Size, every: int, active: int | None) -> tuple[int, ...]:
     """Return the absolute frames at which clouds are compared."""
     first = size.task.input_frames
-    last = size.task.horizon if active is None else min(active, size.task.horizon)
-    frames = range(first + MEASURED_EVERY - 1, first + last, every)
-    return tuple(frames) or (first + last - 1,)
+    count = size.task.horizon
+    if active is not None:
+        count = min(active, count)
+    end = first + count
+    first_measured = first + MEASURED_EVERY - 1
+    frames = range(first_measured, end, every)
+    return tuple(frames) or (end - 1,)
 
 
 def cases_of_train(size: Size, root: Path) -> dict[int, Case]:
@@ -668,11 +762,10 @@ def cases_of_train(size: Size, root: Path) -> dict[int, Case]:
         path = size.path(root, scenario)
         with read_scenario(path) as file:
             given = given_in(file, size, root)
+        active = active_frames(path)
+        frames = measured_frames(size, CHOSEN_EVERY, active)
         cases[scenario] = Case(
-            given=given,
-            frames=measured_frames(size, CHOSEN_EVERY, active_frames(path)),
-            without=scenario,
-            thinning=THINNING,
+            given=given, frames=frames, without=scenario, thinning=THINNING
         )
     return cases
 
@@ -684,45 +777,59 @@ def error_on_train(
     errors = []
     for scenario, case in cases.items():
         clouds = attempt.predict(case, choice)
-        truth, _ = library.motion(State(scenario, 0, 0))
-        for_frames = []
+        unmirrored = State(scenario, 0, 0)
+        truth, _ = library.motion(unmirrored)
+        frame_errors = []
         for frame in case.frames:
             true_cloud = truth[frame][::THINNING]
-            error = 0.0
-            for kind in np.unique(case.material):
-                members = case.material == kind
-                distance = sliced_wasserstein2(
-                    clouds[frame][members], true_cloud[members]
-                )
-                error += float(np.mean(members)) * distance
-            for_frames.append(error)
-        errors.append(float(np.mean(for_frames)))
+            error = cloud_error(clouds[frame], true_cloud, case.material)
+            frame_errors.append(error)
+        errors.append(float(np.mean(frame_errors)))
     return float(np.mean(errors))
+
+
+def cloud_error(cloud: Floats, true_cloud: Floats, material: NDArray[np.int8]) -> float:
+    """Return the distance of clouds of each material, weighted by its particles."""
+    error = 0.0
+    for kind in np.unique(material):
+        members = material == kind
+        share = float(np.mean(members))
+        distance = sliced_wasserstein2(cloud[members], true_cloud[members])
+        error += share * distance
+    return error
 
 
 def score_on_test(size: Size, root: Path, attempt: Attempt, choice: Choice) -> float:
     """Return the ranking metric on test."""
     task = load_scored_task(size, root, is_hashed=True)
     frames = measured_frames(size, MEASURED_EVERY, None)
+    first = size.task.input_frames
+    horizon = range(first, first + size.task.horizon)
     tallies = {}
     for scenario in task.scenarios:
         with task.opened(scenario) as truth:
             given = given_in(truth.file, size, root)
         case = Case(given=given, frames=frames, without=None, thinning=1)
         clouds = attempt.predict(case, choice)
-        horizon = range(
-            size.task.input_frames, size.task.input_frames + size.task.horizon
-        )
-        position = np.empty((len(horizon), *given.last.shape), np.float32)
+        shape = (len(horizon), *given.last.shape)
+        position = np.empty(shape, np.float32)
         for row, frame in enumerate(horizon):
-            # the metric is not measured at the frames between
-            later = [one for one in frames if one >= frame] or [frames[-1]]
-            position[row] = given.box.inside(clouds[later[0]])
+            # The metric is not measured at the frames between.
+            measured = next_measured(frames, frame)
+            position[row] = given.box.inside(clouds[measured])
         tallies[scenario] = score_positions(task, scenario, position, METRIC)
     result = score(METRICS[METRIC], tallies)
     if result is None:
         raise ValueError(f"{size.split}: no value of {METRIC}")
     return result.mean
+
+
+def next_measured(frames: Sequence[int], frame: int) -> int:
+    """Return the first measured frame that is no earlier, or the last one."""
+    for measured in frames:
+        if measured >= frame:
+            return measured
+    return frames[-1]
 
 
 def baseline_score(size: Size) -> float:
@@ -742,17 +849,19 @@ def run(
     library: Library,
 ) -> dict[str, object]:
     """Return the chosen parameters of an attempt and its errors."""
-    errors = {}
-    for number, choice in enumerate(attempt.choices):
-        errors[number] = error_on_train(cases, library, attempt, choice)
-    number = min(errors, key=lambda number: errors[number])
-    choice = attempt.choices[number]
+    errors = []
+    for choice in attempt.choices:
+        error = error_on_train(cases, library, attempt, choice)
+        errors.append(error)
+    least_error = min(errors)
+    best = errors.index(least_error)
+    best_choice = attempt.choices[best]
     return {
         "what": attempt.what,
-        "chosen": dict(choice),
+        "chosen": dict(best_choice),
         "choices": len(attempt.choices),
-        "train": errors[number],
-        "test": score_on_test(size, root, attempt, choice),
+        "train": least_error,
+        "test": score_on_test(size, root, attempt, best_choice),
     }
 
 
@@ -782,16 +891,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.attempt and attempt.name not in options.attempt:
                 continue
             if attempt.name not in results:
-                results[attempt.name] = run(
-                    size, root, attempt, cases=cases, library=library
-                )
-                sys.stderr.write(f"{split} {attempt.name}: {results[attempt.name]}\n")
+                result = run(size, root, attempt, cases=cases, library=library)
+                results[attempt.name] = result
+                sys.stderr.write(f"{split} {attempt.name}: {result}\n")
                 if options.output:
-                    data = json.dumps(kept, indent=1).encode()
-                    write_atomically(options.output, data, option="--output")
-            rows.append(_row(split, attempt.name, results[attempt.name], baseline))
+                    text = json.dumps(kept, indent=1)
+                    write_atomically(options.output, text.encode(), option="--output")
+            row = _row(split, attempt.name, results[attempt.name], baseline)
+            rows.append(row)
     heads = ("data set", "attempt", "what", "chosen on train", "train", "test", "ratio")
-    sys.stdout.write(f"{markdown(heads, rows)}\n")
+    table = markdown(heads, rows)
+    sys.stdout.write(f"{table}\n")
     return 0
 
 
@@ -799,19 +909,21 @@ def _row(
     split: str, attempt: str, result: Mapping[str, object], baseline: float
 ) -> tuple[str, ...]:
     chosen = result["chosen"]
-    words = []
+    parameters = []
     if isinstance(chosen, dict):
         for key, value in chosen.items():
-            words.append(f"{key} {value:g}")
-    test = float(str(result["test"]))
+            parameters.append(f"{key} {value:g}")
+    train_error = float(str(result["train"]))
+    test_score = float(str(result["test"]))
+    ratio = test_score / baseline
     return (
         f"{split} mini",
         attempt,
         str(result["what"]),
-        ", ".join(words),
-        f"{float(str(result['train'])):.4f}",
-        f"{test:.4f}",
-        f"{test / baseline:.2f}",
+        ", ".join(parameters),
+        f"{train_error:.4f}",
+        f"{test_score:.4f}",
+        f"{ratio:.2f}",
     )
 
 

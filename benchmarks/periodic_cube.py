@@ -49,16 +49,26 @@ class Conventional:
         self.mass = 1.0 / parameters.particles
         self.pressure = 0.5 * self.n * parameters.dt * 5.0
         self.diffusion = state.viscosity * parameters.dt * self.n**2
+
+        # Particles: position, velocity, affine velocity and J.
         count = parameters.particles
-        nodes = (self.n,) * 3
-        self.x, self.v = (ti.Vector.field(3, ti.f32, count) for _ in range(2))
+        self.x = ti.Vector.field(3, ti.f32, count)
+        self.v = ti.Vector.field(3, ti.f32, count)
         self.c = ti.Matrix.field(3, 3, ti.f32, count)
         self.j = ti.field(ti.f32, count)
-        self.m, self.q = (ti.field(ti.f32, nodes) for _ in range(2))
-        self.gv, self.ga = (ti.Vector.field(3, ti.f32, nodes) for _ in range(2))
-        self.x.from_numpy(state.position.astype(np.float32))
-        self.v.from_numpy(state.velocity.astype(np.float32))
-        self.c.from_numpy(state.affine.astype(np.float32))
+        # Nodes: mass or density, J, momentum or velocity, and acceleration.
+        nodes = (self.n, self.n, self.n)
+        self.m = ti.field(ti.f32, nodes)
+        self.q = ti.field(ti.f32, nodes)
+        self.gv = ti.Vector.field(3, ti.f32, nodes)
+        self.ga = ti.Vector.field(3, ti.f32, nodes)
+
+        position = state.position.astype(np.float32)
+        velocity = state.velocity.astype(np.float32)
+        affine = state.affine.astype(np.float32)
+        self.x.from_numpy(position)
+        self.v.from_numpy(velocity)
+        self.c.from_numpy(affine)
         self.j.fill(1.0)
 
     @ti.func
@@ -67,11 +77,10 @@ class Conventional:
         scaled = x * self.n - 0.5
         base = ti.cast(ti.floor(scaled - 0.5), ti.i32)
         f = scaled - ti.cast(base, ti.f32)
-        return (
-            base,
-            f,
-            [0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2],
-        )
+        first = 0.5 * (1.5 - f) ** 2
+        second = 0.75 - (f - 1) ** 2
+        third = 0.5 * (f - 0.5) ** 2
+        return (base, f, [first, second, third])
 
     @ti.func
     def wrapped(self, node):
@@ -85,16 +94,20 @@ class Conventional:
             self.gv[node] = ti.Vector([0.0, 0.0, 0.0])
             self.m[node] = 0.0
             self.q[node] = 0.0
+        # P2G: mass, momentum and J of the particles at the nodes.
         for p in self.x:
             base, f, w = self.weights(self.x[p])
             affine = self.c[p] * self.dx
             for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
                 offset = ti.Vector([i, j, k])
-                weight = self.mass * w[i][0] * w[j][1] * w[k][2]
                 node = self.wrapped(base + offset)
-                self.gv[node] += weight * (self.v[p] + affine @ (offset - f))
+                weight = self.mass * w[i][0] * w[j][1] * w[k][2]
+                velocity = self.v[p] + affine @ (offset - f)
+                self.gv[node] += weight * velocity
                 self.m[node] += weight
                 self.q[node] += weight * self.j[p]
+
+        # Momentum becomes velocity, mass density.
         for node in ti.grouped(self.m):
             mass = self.m[node]
             if mass > 0.0:
@@ -103,12 +116,15 @@ class Conventional:
                 self.m[node] = mass / self.dx**3
             else:
                 self.q[node] = 1.0
+
+        # Pressure and viscosity accelerate the nodes.
         for node in ti.grouped(self.m):
             gradient = ti.Vector([0.0, 0.0, 0.0])
-            around = -6.0 * self.gv[node]
+            laplacian = -6.0 * self.gv[node]
             for i, j, k in ti.static(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
                 offset = ti.Vector([i, j, k])
-                q = self.q[self.wrapped(node + offset)]
+                neighbour = self.wrapped(node + offset)
+                q = self.q[neighbour]
                 near = ti.static([0.125, 0.75, 0.125])
                 if ti.static(i != 0):
                     gradient[0] += i * near[j + 1] * near[k + 1] * q
@@ -117,8 +133,8 @@ class Conventional:
                 if ti.static(k != 0):
                     gradient[2] += k * near[i + 1] * near[j + 1] * q
                 if ti.static(i * i + j * j + k * k == 1):
-                    around += self.gv[self.wrapped(node + offset)]
-            self.ga[node] = self.pressure * gradient + self.diffusion * around
+                    laplacian += self.gv[neighbour]
+            self.ga[node] = self.pressure * gradient + self.diffusion * laplacian
         for node in ti.grouped(self.m):
             self.gv[node] += self.ga[node]
         for p in self.x:
@@ -148,27 +164,31 @@ class Conventional:
             smooth += weight * self.q[node]
         c *= 4.0 * self.n
         density = ti.max(density, 0.5)
+
+        # Particles move a little to where the matter is thinner.
         limit = 0.1 * self.dx
-        shift = ti.math.clamp(
-            -4.0 * self.p.shift * self.dx * thinner / density, -limit, limit
-        )
+        wanted_shift = -4.0 * self.p.shift * self.dx * thinner / density
+        shift = ti.math.clamp(wanted_shift, -limit, limit)
         moved = self.v[p] + a
-        self.v[p] = moved + self.p.velocity_relaxation * (v - moved) + c @ shift
+        relaxation = self.p.velocity_relaxation * (v - moved)
+        self.v[p] = moved + relaxation + c @ shift
         x = self.x[p] + self.p.dt * v + shift
         self.x[p] = x - ti.floor(x)
         self.c[p] = c
+
         old = self.j[p]
-        self.j[p] = (
-            old * (1.0 + self.p.dt * c.trace())
-            + self.p.jacobian_relaxation * (smooth - old)
-            + self.p.density_coupling * (1.0 / density - smooth)
-        )
+        expanded = old * (1.0 + self.p.dt * c.trace())
+        smoothing = self.p.jacobian_relaxation * (smooth - old)
+        coupling = self.p.density_coupling * (1.0 / density - smooth)
+        self.j[p] = expanded + smoothing + coupling
 
 
 def start(grid: int):
     """Return constants and state: curl noise in a cube, four particles in a cell."""
-    box = Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3)
+    bounds = [(0.0, 1.0)] * 3
+    box = Box.from_bounds(bounds, [True] * 3)
     position = lattice(box, (2 * grid, 2 * grid, grid))
+    count = len(position)
     rng = generator("periodic-cube", "benchmark", 1, 0)
     flow = curl_noise_3d.draw_noise(rng, position, 2)
     flow = curl_noise_3d.scaled_to(flow, 0.15)
@@ -176,12 +196,13 @@ def start(grid: int):
         position=position,
         velocity=flow.velocity,
         affine=flow.affine,
-        material=np.zeros(len(position), np.int8),
+        material=np.zeros(count, np.int8),
         area=1.0,
         viscosity=5e-4,
         wall_velocity=np.zeros((6, 3)),
     )
-    return constants(box, grid, len(position)), state
+    parameters = constants(box, grid, count)
+    return parameters, state
 
 
 def run_side(side: str, grid: int, substeps: int) -> dict[str, float]:
@@ -191,10 +212,10 @@ def run_side(side: str, grid: int, substeps: int) -> dict[str, float]:
         solver = build(parameters)
         solver.load([state])
         solver.advance(1)
-        begun = time.process_time()
+        start_time = time.process_time()
         solver.advance(substeps)
-        seconds = time.process_time() - begun
-        velocity = solver.velocity()[0]
+        seconds = time.process_time() - start_time
+        (velocity,) = solver.velocity()
     else:
         ti.init(
             arch=ti.cpu,
@@ -205,14 +226,17 @@ def run_side(side: str, grid: int, substeps: int) -> dict[str, float]:
         cube = Conventional(parameters, state)
         cube.substep()
         ti.sync()
-        begun = time.process_time()
+        start_time = time.process_time()
         for _ in range(substeps):
             cube.substep()
         ti.sync()
-        seconds = time.process_time() - begun
+        seconds = time.process_time() - start_time
         velocity = cube.v.to_numpy()
-    energy = 0.5 * float(np.mean(np.sum(velocity.astype(np.float64) ** 2, axis=1)))
-    return {"rate": parameters.particles * substeps / seconds, "energy": energy}
+    exact_velocity = velocity.astype(np.float64)
+    square_speed = np.sum(exact_velocity**2, axis=1)
+    energy = 0.5 * float(np.mean(square_speed))
+    rate = parameters.particles * substeps / seconds
+    return {"rate": rate, "energy": energy}
 
 
 def main() -> int:
@@ -226,7 +250,8 @@ def main() -> int:
     parser.add_argument("--side", choices=["ours", "conventional"])
     options = parser.parse_args()
     if options.side:
-        print(json.dumps(run_side(options.side, options.grid, options.substeps)))
+        result = run_side(options.side, options.grid, options.substeps)
+        print(json.dumps(result))
         return 0
 
     best = {"ours": 0.0, "conventional": 0.0}
@@ -237,12 +262,14 @@ def main() -> int:
             command += ["--grid", str(options.grid)]
             command += ["--substeps", str(options.substeps)]
             output = subprocess.run(command, check=True, capture_output=True, text=True)
-            result = json.loads(output.stdout.splitlines()[-1])
+            last_line = output.stdout.splitlines()[-1]
+            result = json.loads(last_line)
             best[side] = max(best[side], result["rate"])
             energies[side] = result["energy"]
     ratio = best["ours"] / best["conventional"]
     for side, rate in best.items():
-        print(f"{side}: {rate / 1e6:.2f} M, energy {energies[side]:.6g}")
+        millions = rate / 1e6
+        print(f"{side}: {millions:.2f} M, energy {energies[side]:.6g}")
     print(f"ratio {ratio:.2f}")
     return int(ratio < TARGET)
 

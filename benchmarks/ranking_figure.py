@@ -46,11 +46,16 @@ def flow(position: Floats, *, largest: int = 99, shift: float = 0.0) -> Floats:
     for (m, n), amplitude in MODES.items():
         if max(m, n) > largest:
             continue
-        phase_x = np.pi * m * (position[:, 0] - shift)
-        phase_y = np.pi * n * position[:, 1]
-        scale = SPEED * amplitude / np.hypot(m, n)
-        velocity[:, 0] += scale * n * np.sin(phase_x) * np.cos(phase_y)
-        velocity[:, 1] -= scale * m * np.cos(phase_x) * np.sin(phase_y)
+        x = position[:, 0] - shift
+        y = position[:, 1]
+        phase_x = np.pi * m * x
+        phase_y = np.pi * n * y
+        wave_number = np.hypot(m, n)
+        scale = SPEED * amplitude / wave_number
+        u = scale * n * np.sin(phase_x) * np.cos(phase_y)
+        v = scale * m * np.cos(phase_x) * np.sin(phase_y)
+        velocity[:, 0] += u
+        velocity[:, 1] -= v
     return velocity
 
 
@@ -62,6 +67,7 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
     """Return the pair of a true and a predicted frame."""
     position, velocity = truth
     predicted_position, predicted_velocity = prediction
+    particles = len(position)
     config = TaskConfig(
         grid=Grid(40, placement),
         input_frames=2,
@@ -70,37 +76,45 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
         attribute_std=(0.3, 0.3, SPEED, SPEED),
         radius=0.03,
     )
-    given_positions = np.stack([position - 2 * velocity, position - velocity])
+    before = position - velocity
+    two_frames_before = position - 2 * velocity
+    area = 0.12
+    if config.is_full_box:
+        area = 1.0
     scenario = Scenario(
         config=config,
-        input_positions=given_positions,
-        material=np.zeros(len(position), np.int8),
-        particle_mass=1.0 / len(position),
-        area=1.0 if config.is_full_box else 0.12,
+        input_positions=np.stack([two_frames_before, before]),
+        material=np.zeros(particles, np.int8),
+        particle_mass=1.0 / particles,
+        area=area,
     )
-    true_snapshot = scenario.snapshot(position, position - velocity)
-    predicted_snapshot = scenario.snapshot(
-        predicted_position, predicted_position - predicted_velocity
-    )
+    true_snapshot = scenario.snapshot(position, before)
+    predicted_before = predicted_position - predicted_velocity
+    predicted_snapshot = scenario.snapshot(predicted_position, predicted_before)
     return FramePair(scenario, 2, true_snapshot, predicted_snapshot)
 
 
 def format_scores(pair: FramePair) -> str:
     """Return the shown scores of a pair, one line each."""
-    names = SHOWN[Placement(pair.scenario.config.grid.placement)]
+    placement = Placement(pair.scenario.config.grid.placement)
+    names = SHOWN[placement]
     metrics = select(names)
-    scores = aggregate(metrics, {0: tally([pair], metrics, (2,))})
+    statistics = tally([pair], metrics, (2,))
+    scores = aggregate(metrics, {0: statistics})
     lines = []
     for name in names:
         value = round(scores[name].mean, 12)
-        lines.append(f"{name.replace('_', ' ')} {value:.2g}")
+        words = name.replace("_", " ")
+        lines.append(f"{words} {value:.2g}")
     return "\n".join(lines)
 
 
 def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
     """Return predictions of a box full of eddies."""
     axis = (np.arange(90) + 0.5) / 90
-    lattice = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    coordinates = np.meshgrid(axis, axis, indexing="ij")
+    lattice = np.stack(coordinates, axis=-1)
+    lattice = lattice.reshape(-1, 2)
     jitter = rng.uniform(-0.004, 0.004, lattice.shape)
     position = np.clip(lattice + jitter, 0.0, 1.0)
     velocity = flow(position)
@@ -115,14 +129,17 @@ def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
     for name, predicted_flow in predicted_flows.items():
         # the positions after ten frames with such an error
         velocity_error = predicted_flow(position) - velocity
-        predicted = np.clip(position + 10.0 * velocity_error, 0.0, 1.0)
-        predictions[name] = predicted, predicted_flow(predicted)
-    predictions["particles permuted"] = position[order], velocity[order]
-    truth = position, velocity
-    return {
-        name: make_pair(truth, prediction, Placement.CELL_CENTRES)
-        for name, prediction in predictions.items()
-    }
+        moved = position + 10.0 * velocity_error
+        predicted_position = np.clip(moved, 0.0, 1.0)
+        predicted_velocity = predicted_flow(predicted_position)
+        predictions[name] = (predicted_position, predicted_velocity)
+    predictions["particles permuted"] = (position[order], velocity[order])
+
+    truth = (position, velocity)
+    pairs = {}
+    for name, prediction in predictions.items():
+        pairs[name] = make_pair(truth, prediction, Placement.CELL_CENTRES)
+    return pairs
 
 
 POOL = 900
@@ -132,16 +149,19 @@ DROP = 300  # particles of the pool and of the drop
 def splash(rng: np.random.Generator) -> dict[str, FramePair]:
     """Return predictions of a splash: a pool and a drop."""
     pool = rng.uniform((0.05, 0.05), (0.95, 0.17), (POOL, 2))
-    radius = 0.08 * np.sqrt(rng.random(DROP))
+    area_share = rng.random(DROP)
+    radius = 0.08 * np.sqrt(area_share)
     angle = rng.uniform(0, 2 * np.pi, DROP)
     drop_x = 0.35 + radius * np.cos(angle)
     drop_y = 0.5 + radius * np.sin(angle)
-    position = np.concatenate([pool, np.stack([drop_x, drop_y], axis=1)])
+    drop = np.stack([drop_x, drop_y], axis=1)
+    position = np.concatenate([pool, drop])
     velocity = np.zeros_like(position)
     order = rng.permutation(len(position))
     smear = rng.normal(0.0, 0.05, position.shape)
     # 1 for particles of the drop, shape [particle, 1]
-    is_drop = np.concatenate([np.zeros((POOL, 1)), np.ones((DROP, 1))])
+    is_drop = np.zeros((POOL + DROP, 1))
+    is_drop[POOL:] = 1.0
     predictions: dict[str, Floats] = {
         "truth": position,
         "good: drop 2 % low": position - is_drop * [0.0, 0.02],
@@ -149,23 +169,19 @@ def splash(rng: np.random.Generator) -> dict[str, FramePair]:
         "smeared": np.clip(position + smear, 0.0, 1.0),
         "particles permuted": position[order],
     }
-    truth = position, velocity
-    return {
-        name: make_pair(truth, (predicted, velocity), Placement.NODES)
-        for name, predicted in predictions.items()
-    }
+    truth = (position, velocity)
+    pairs = {}
+    for name, predicted_position in predictions.items():
+        prediction = (predicted_position, velocity)
+        pairs[name] = make_pair(truth, prediction, Placement.NODES)
+    return pairs
 
 
 def draw_prediction(axes: Axes, pair: FramePair, limit: float) -> None:
     """Draw the vorticity of a full box, or the particles on a free surface."""
     if pair.scenario.config.is_full_box:
-        axes.imshow(
-            pair.predicted_fields.vorticity.T,
-            origin="lower",
-            cmap="RdBu_r",
-            vmin=-limit,
-            vmax=limit,
-        )
+        vorticity = pair.predicted_fields.vorticity
+        axes.imshow(vorticity.T, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit)
     else:
         x, y = pair.prediction.position.T
         axes.scatter(x, y, s=1.2, c="#20639b", linewidths=0)
@@ -175,11 +191,15 @@ def draw_prediction(axes: Axes, pair: FramePair, limit: float) -> None:
 def main() -> int:
     """Draw the figure."""
     rng = np.random.Generator(np.random.PCG64(1))
-    rows = (full_box(rng), splash(rng))
+    full_box_pairs = full_box(rng)
+    splash_pairs = splash(rng)
+    true_vorticity = full_box_pairs["truth"].true_vorticity
+    limit = float(np.max(np.abs(true_vorticity)))
+
     figure, all_axes = plt.subplots(2, 5, figsize=(11, 5.9), layout="constrained")
-    limit = float(np.max(np.abs(rows[0]["truth"].true_vorticity)))
-    for line, row in zip(all_axes, rows, strict=True):
-        for axes, (name, pair) in zip(line, row.items(), strict=True):
+    rows = (full_box_pairs, splash_pairs)
+    for row_axes, pairs in zip(all_axes, rows, strict=True):
+        for axes, (name, pair) in zip(row_axes, pairs.items(), strict=True):
             draw_prediction(axes, pair, limit)
             axes.set(xticks=[], yticks=[])
             axes.set_title(name, fontsize=9)

@@ -33,26 +33,55 @@ REDRAWS = 200_000
 def expected_best(values: NDArray[np.float64], tries: int) -> float:
     """Return the expected maximum of so many independent draws from values."""
     ordered = np.sort(values)
-    rank = np.arange(1, len(ordered) + 1) / len(ordered)
-    weights = np.diff(np.concatenate([[0.0], rank**tries]))
-    return float(np.sum(weights * ordered))
+    count = len(ordered)
+    # Probability that one draw is no greater than each value; of all draws its power.
+    one_draw = np.arange(1, count + 1) / count
+    all_draws = one_draw**tries
+    distribution = np.concatenate([[0.0], all_draws])
+    weights = np.diff(distribution)
+    weighted = weights * ordered
+    return float(np.sum(weighted))
 
 
 def draw(count: int, scenarios: int) -> NDArray[np.intp]:
     """Return redraws of scenarios with replacement, shape [redraw, scenario]."""
     generator = np.random.Generator(np.random.PCG64(0))
     uniform = generator.random((REDRAWS, scenarios))
-    return np.floor(uniform * count).astype(np.intp)
+    numbers = np.floor(uniform * count)
+    return numbers.astype(np.intp)
 
 
 def leaders(tab: Tab, metric: str) -> list[tuple[str, NDArray[np.float64]]]:
     """Return the two best methods that are no variants, with their values."""
-    rows = []
+    methods = []
     for row in tab.rows:
-        if row.variant_of is None and row.current and metric in row.values:
-            values = np.array(row.values[metric].per_scenario)
-            rows.append((row.entry.method, values))
-    return sorted(rows, key=lambda row: float(np.mean(row[1])))[:2]
+        if row.variant_of is not None or not row.current:
+            continue
+        if metric in row.values:
+            score = row.values[metric]
+            values = np.array(score.per_scenario)
+            methods.append((row.entry.method, values))
+    methods.sort(key=_mean_score)
+    return methods[:2]
+
+
+def _mean_score(method: tuple[str, NDArray[np.float64]]) -> float:
+    """Return the mean score of a method over the scenarios."""
+    _, values = method
+    return float(np.mean(values))
+
+
+def naive_values(tab: Tab, metric: str) -> NDArray[np.float64] | None:
+    """Return the scores of the best naive predictor by scenario, None without any."""
+    references = shipped(tab.size) or {}
+    naive = {}
+    for name, reference in references.items():
+        if name in NAIVE and metric in reference.scores:
+            naive[name] = reference.scores[metric]
+    best = best_reference(naive)
+    if best is None:
+        return None
+    return naive[best].values
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,42 +103,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if tab.size.name != options.size:
             continue
         metric = tab.ranking
-        naive = {}
-        for name, reference in (shipped(tab.size) or {}).items():
-            if name in NAIVE and metric in reference.scores:
-                naive[name] = reference.scores[metric]
-        best = best_reference(naive)
-        if best is None:
+        base = naive_values(tab, metric)
+        if base is None:
             continue
-        base = naive[best].values
         chosen = draw(len(base), options.scenarios)
-        denominator = base[chosen].mean(axis=1)
-        rows = leaders(tab, metric)
+        base_means = base[chosen].mean(axis=1)
+        methods = leaders(tab, metric)
         place = f"{tab.size.split} {tab.size.name}"
-        method, values = rows[0]
-        skills = 1.0 - values[chosen].mean(axis=1) / denominator
-        middle = float(np.mean(skills))
-        cells = [f"{middle:.3f}", f"{float(np.std(skills)):.3f}"]
-        for tries in options.tries[1:]:
-            cells.append(f"{expected_best(skills, tries) - middle:+.3f}")
-        gains.append((place, method, *cells))
-        if len(rows) > 1:
-            other, other_values = rows[1]
-            others = 1.0 - other_values[chosen].mean(axis=1) / denominator
-            lead = others - skills
-            share = float(np.mean(lead > 0.0))
-            cells = [f"{float(np.mean(skills - others)):.3f}"]
-            for tries in options.tries:
-                cells.append(f"{1.0 - (1.0 - share) ** tries:.3f}")
-            swaps.append((place, method, other, *cells))
 
-    counts = [str(tries) for tries in options.tries]
-    head = ["data set", "leader", "skill", "deviation of a redraw"]
-    gain_head = [*head, *(f"gain, best of {count}" for count in counts[1:])]
+        method, values = methods[0]
+        means = values[chosen].mean(axis=1)
+        skills = 1.0 - means / base_means
+        mean_skill = float(np.mean(skills))
+        deviation = float(np.std(skills))
+        cells = [f"{mean_skill:.3f}", f"{deviation:.3f}"]
+        for tries in options.tries[1:]:
+            gain = expected_best(skills, tries) - mean_skill
+            cells.append(f"{gain:+.3f}")
+        gains.append((place, method, *cells))
+
+        if len(methods) > 1:
+            next_method, next_values = methods[1]
+            next_means = next_values[chosen].mean(axis=1)
+            next_skills = 1.0 - next_means / base_means
+            lead = float(np.mean(skills - next_skills))
+            is_ahead = next_skills - skills > 0.0
+            share_ahead = float(np.mean(is_ahead))
+            cells = [f"{lead:.3f}"]
+            for tries in options.tries:
+                probability = 1.0 - (1.0 - share_ahead) ** tries
+                cells.append(f"{probability:.3f}")
+            swaps.append((place, method, next_method, *cells))
+
+    gain_head = ["data set", "leader", "skill", "deviation of a redraw"]
+    for tries in options.tries[1:]:
+        gain_head.append(f"gain, best of {tries}")
     swap_head = ["data set", "leader", "next", "lead in skill"]
-    swap_head += [f"next wins, best of {count}" for count in counts]
-    sys.stdout.write(markdown(gain_head, gains) + "\n\n")
-    sys.stdout.write(markdown(swap_head, swaps) + "\n")
+    for tries in options.tries:
+        swap_head.append(f"next wins, best of {tries}")
+    gain_table = markdown(gain_head, gains)
+    swap_table = markdown(swap_head, swaps)
+    sys.stdout.write(f"{gain_table}\n\n")
+    sys.stdout.write(f"{swap_table}\n")
     return 0
 
 
