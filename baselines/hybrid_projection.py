@@ -77,11 +77,10 @@ class ClosedGrid(StaggeredGrid):
             return rates
         at_rest = np.zeros_like(wall_velocity)
         for component, values in enumerate(velocity):
-            ghosted = self._with_ghosts(values, component, wall_velocity)
-            laplacian = self._laplacian(ghosted)
-            bilaplacian = self._laplacian(
-                self._with_ghosts(laplacian, component, at_rest)
-            )
+            ghosted_velocity = self._with_ghosts(values, component, wall_velocity)
+            laplacian = self._laplacian(ghosted_velocity)
+            ghosted_laplacian = self._with_ghosts(laplacian, component, at_rest)
+            bilaplacian = self._laplacian(ghosted_laplacian)
             change = -self.hyperviscosity * bilaplacian
             if not self.box.periodic[component]:
                 # Nothing flows through a wall.
@@ -106,9 +105,11 @@ class ClosedGrid(StaggeredGrid):
             viscosity=viscosity,
             wall_velocity=wall_velocity,
         )
-        fastest_laplacian = float((4.0 / self.spacing**2).sum())
+        fastest_of_axes = 4.0 / self.spacing**2
+        fastest_laplacian = float(fastest_of_axes.sum())
         rate = abs(self.hyperviscosity) * fastest_laplacian**2
-        return max(steps, int(np.ceil(duration * rate / STABLE_SHARE)))
+        stable_steps = np.ceil(duration * rate / STABLE_SHARE)
+        return max(steps, int(stable_steps))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +125,9 @@ class FlowState:
 
     def wall_velocity(self, frame: int) -> Floats:
         """Return the wall velocities towards a frame; the last known ones stay."""
-        return np.asarray(self.walls[min(frame, len(self.walls) - 1)])
+        last_known = len(self.walls) - 1
+        known_frame = min(frame, last_known)
+        return np.asarray(self.walls[known_frame])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +199,8 @@ class HybridProjection(Baseline):
         flows = []
         for window in range(given.windows):
             is_inside = given.sample == window
-            flows.append(self._begin(given, window, is_inside, values))
+            flow = self._begin(given, window, is_inside, values)
+            flows.append(flow)
         return Flows(flows=tuple(flows), device=given.position.device)
 
     def _begin(
@@ -205,9 +209,11 @@ class HybridProjection(Baseline):
         """Return the flow of one window, brought to its last given frame."""
         interval = self.info.frame_interval
         frames = given.position[is_inside].double().cpu().numpy()
-        walls = np.zeros((1, 2 * frames.shape[2], frames.shape[2]))
+        _, frame_count, dimension = frames.shape
+        walls = np.zeros((1, 2 * dimension, dimension))
         if given.wall_velocity is not None:
-            walls = given.wall_velocity[window].double().cpu().numpy()
+            known_walls = given.wall_velocity[window]
+            walls = known_walls.double().cpu().numpy()
         viscosity, hyperviscosity = self._closure(given, window, coefficients)
         box = self.info.box
         grid = ClosedGrid(
@@ -216,24 +222,26 @@ class HybridProjection(Baseline):
             no_slip=bool(walls.any()),
             hyperviscosity=hyperviscosity,
         )
-        last = frames.shape[1] - 1
-        step = box.displacement(frames[:, -2], frames[:, -1])
+        last_frame = frame_count - 1
+        before = frames[:, -2]
+        position = frames[:, -1]
         flow = FlowState(
             grid=grid,
             field=[],
-            position=frames[:, -1],
+            position=position,
             walls=walls,
-            frame=last,
+            frame=last_frame,
             viscosity=viscosity,
         )
-        wall_velocity = flow.wall_velocity(last)
-        middle = box.inside(frames[:, -1] - step / 2.0)
-        if not box.is_periodic:
-            middle = (frames[:, -1] + frames[:, -2]) / 2
+        wall_velocity = flow.wall_velocity(last_frame)
+        step = box.displacement(before, position)
+        velocity = step / interval
+        if box.is_periodic:
+            middle = box.inside(position - step / 2.0)
+        else:
+            middle = (position + before) / 2
         # The velocities of the last step hold half a frame before its end.
-        field = grid.from_particles(
-            middle, step / interval, wall_velocity=wall_velocity
-        )
+        field = grid.from_particles(middle, velocity, wall_velocity=wall_velocity)
         field = grid.advance(
             field,
             duration=0.5 * interval,
@@ -256,16 +264,23 @@ class HybridProjection(Baseline):
             )
         # A file states it in float64; the solver's steps may hang on the last digit.
         stated = float(given.viscosity[window])
-        relative, added, hyper = (float(value) for value in coefficients)
+        relative, added, hyper = coefficients.tolist()  # a, b, c
         box = self.info.box
-        spacing = float((box.lengths / np.asarray(self._cell_counts(box))).min())
+        cell_counts = np.asarray(self._cell_counts(box))
+        cell_lengths = box.lengths / cell_counts
+        spacing = float(cell_lengths.min())
         interval = self.info.frame_interval
         viscosity = (1.0 + relative) * stated + added * spacing**2 / interval
-        return max(viscosity, 0.0), max(hyper, 0.0) * spacing**4 / interval
+        hyperviscosity = max(hyper, 0.0) * spacing**4 / interval
+        return max(viscosity, 0.0), hyperviscosity
 
     def _cell_counts(self, box: Box) -> tuple[int, ...]:
-        density = self.options.resolution * self.info.score_cells
-        return tuple(max(4, round(density * length)) for length in box.lengths)
+        cells_per_length = self.options.resolution * self.info.score_cells
+        counts = []
+        for length in box.lengths:
+            nearest = round(cells_per_length * length)
+            counts.append(max(4, nearest))
+        return tuple(counts)
 
     def advance(self, state: Flows) -> tuple[Flows, Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
@@ -275,13 +290,16 @@ class HybridProjection(Baseline):
             moved = self._advance_flow(flow)
             flows.append(moved)
             positions.append(moved.position)
-        position = torch.from_numpy(np.concatenate(positions)).float()
-        return replace(state, flows=tuple(flows)), position.to(state.device)
+        all_positions = np.concatenate(positions)
+        position = torch.from_numpy(all_positions).float()
+        state = replace(state, flows=tuple(flows))
+        return state, position.to(state.device)
 
     def _advance_flow(self, flow: FlowState) -> FlowState:
         """Return a flow one frame later."""
         interval = self.info.frame_interval
-        wall_velocity = flow.wall_velocity(flow.frame + 1)
+        next_frame = flow.frame + 1
+        wall_velocity = flow.wall_velocity(next_frame)
         field = flow.grid.advance(
             flow.field,
             duration=interval,
@@ -295,7 +313,7 @@ class HybridProjection(Baseline):
             duration=interval,
             wall_velocity=wall_velocity,
         )
-        return replace(flow, field=field, position=position, frame=flow.frame + 1)
+        return replace(flow, field=field, position=position, frame=next_frame)
 
     # --- the fit ------------------------------------------------------------------
 
@@ -310,8 +328,11 @@ class HybridProjection(Baseline):
         """
         samples = []
         for scenario in islice(scenarios, self.options.scenarios):
-            samples.append(self._prepare(scenario))
-        size = 3 if self.options.numerical else 1
+            sample = self._prepare(scenario)
+            samples.append(sample)
+        size = 1
+        if self.options.numerical:
+            size = 3
 
         def measure(values: NDArray[np.float64]) -> float:
             coefficients = np.zeros(3)
@@ -321,11 +342,13 @@ class HybridProjection(Baseline):
             errors = [self._error(sample, coefficients) for sample in samples]
             return float(np.mean(errors))
 
-        plain_error = measure(np.zeros(size))
-        simplex = np.vstack([np.zeros(size), FIRST_STEP * np.eye(size)])
-        found = minimize(
+        start = np.zeros(size)
+        plain_error = measure(start)
+        steps = FIRST_STEP * np.eye(size)
+        simplex = np.vstack([start, steps])
+        minimum = minimize(
             measure,
-            np.zeros(size),
+            start,
             method="Nelder-Mead",
             options={
                 "maxfev": self.options.evaluations,
@@ -335,12 +358,17 @@ class HybridProjection(Baseline):
             },
         )
         best = torch.zeros(3)
-        if found.fun < plain_error:
-            best[:size] = torch.from_numpy(found.x).float()
+        if minimum.fun < plain_error:
+            best[:size] = torch.from_numpy(minimum.x).float()
         self.coefficients.copy_(best)
-        names = ("relative", "added", "hyper")
-        numbers = dict(zip(names, best.tolist(), strict=True))
-        return {"error_without": plain_error, "error": float(found.fun)} | numbers
+        relative, added, hyper = best.tolist()
+        return {
+            "error_without": plain_error,
+            "error": float(minimum.fun),
+            "relative": relative,
+            "added": added,
+            "hyper": hyper,
+        }
 
     def _prepare(self, scenario: Batch) -> tuple[Batch, list[Floats]]:
         """Return the first frames of a scenario, and its true vorticity later on."""
@@ -351,7 +379,8 @@ class HybridProjection(Baseline):
         for frame in range(given_frames, last):
             window = scenario.part(slice(0, frame + 1))
             flow = self._observe(window)
-            vorticity.append(compute_vorticity(flow.field, flow.grid))
+            true_vorticity = compute_vorticity(flow.field, flow.grid)
+            vorticity.append(true_vorticity)
         return given, vorticity
 
     def _observe(self, window: Batch) -> FlowState:
@@ -360,12 +389,13 @@ class HybridProjection(Baseline):
         box = self.info.box
         flow = self._begin_at_rest(window)
         frames = window.position[:, -2:].double().numpy()
-        step = box.displacement(frames[:, 0], frames[:, 1])
-        field = flow.grid.from_particles(
-            box.inside(frames[:, 1] - step / 2.0),
-            step / interval,
-            wall_velocity=flow.wall_velocity(window.frames - 1),
-        )
+        before = frames[:, 0]
+        position = frames[:, 1]
+        step = box.displacement(before, position)
+        middle = box.inside(position - step / 2.0)
+        velocity = step / interval
+        wall_velocity = flow.wall_velocity(window.frames - 1)
+        field = flow.grid.from_particles(middle, velocity, wall_velocity=wall_velocity)
         return replace(flow, field=field)
 
     def _begin_at_rest(self, window: Batch) -> FlowState:
@@ -393,34 +423,42 @@ class HybridProjection(Baseline):
     def _error(self, sample: tuple[Batch, list[Floats]], coefficients: Floats) -> float:
         """Return the error of a rollout with some coefficients [1]."""
         given, true_vorticity = sample
-        flow = self._begin(
-            given, 0, torch.ones(len(given.position), dtype=torch.bool), coefficients
-        )
+        particles = len(given.position)
+        everybody = torch.ones(particles, dtype=torch.bool)
+        flow = self._begin(given, 0, everybody, coefficients)
         interval = self.info.frame_interval
         squared_error = 0.0
         squared_truth = 0.0
         field = flow.field
         for step, truth in enumerate(true_vorticity, start=1):
+            wall_velocity = flow.wall_velocity(flow.frame + step)
             later = flow.grid.advance(
                 field,
                 duration=interval,
                 viscosity=flow.viscosity,
-                wall_velocity=flow.wall_velocity(flow.frame + step),
+                wall_velocity=wall_velocity,
             )
             # The mean of both ends stands for the step between two frames.
-            middle = [(a + b) / 2 for a, b in zip(field, later, strict=True)]
-            difference = compute_vorticity(middle, flow.grid) - truth
+            middle = []
+            for start, end in zip(field, later, strict=True):
+                middle.append((start + end) / 2)
+            vorticity = compute_vorticity(middle, flow.grid)
+            difference = vorticity - truth
             squared_error += float(np.square(difference).sum())
             squared_truth += float(np.square(truth).sum())
             field = later
         if not np.isfinite(squared_error) or squared_truth == 0.0:
             return WORST_ERROR
-        return min(WORST_ERROR, float(np.sqrt(squared_error / squared_truth)))
+        relative_error = float(np.sqrt(squared_error / squared_truth))
+        return min(WORST_ERROR, relative_error)
 
 
 def compute_vorticity(velocity: Velocity, grid: StaggeredGrid) -> Floats:
     """Return dv/dx - du/dy at the inner corners of a grid in two dimensions [1/s]."""
     u, v = velocity
-    dv_dx = np.diff(v, axis=0)[:, 1:-1] / grid.spacing[0]
-    du_dy = np.diff(u, axis=1)[1:-1] / grid.spacing[1]
+    width, height = grid.spacing
+    v_differences = np.diff(v, axis=0)
+    u_differences = np.diff(u, axis=1)
+    dv_dx = v_differences[:, 1:-1] / width
+    du_dy = u_differences[1:-1] / height
     return np.asarray(dv_dx - du_dy)

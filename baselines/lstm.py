@@ -60,13 +60,17 @@ class LSTM(FrameNetwork):
         encoder_widths = (self.input_features, *options.encoder, latent)
         decoder_widths = (latent, *options.decoder, self.features)
 
-        self.encoder = nn.Sequential(*dense(encoder_widths, Activation.ELU), nn.ELU())
+        encoder_layers = dense(encoder_widths, Activation.ELU)
+        self.encoder = nn.Sequential(*encoder_layers, nn.ELU())
         self.first = nn.LSTM(latent, latent, batch_first=True)
         self.between: nn.Module | None = None
         if self.interleaved:
-            self.between = nn.Sequential(nn.Linear(latent, latent), nn.ELU())
+            layer = nn.Linear(latent, latent)
+            self.between = nn.Sequential(layer, nn.ELU())
         self.second = nn.LSTM(latent, latent, batch_first=True)
-        self.dropout = nn.ModuleList(nn.Dropout(rate) for rate in options.dropout)
+        self.dropout = nn.ModuleList()
+        for rate in options.dropout:
+            self.dropout.append(nn.Dropout(rate))
         self.decoder = dense(decoder_widths, Activation.ELU)
 
     @property
@@ -90,30 +94,38 @@ class LSTM(FrameNetwork):
         true_density = self._density(truth)
         predicted_density = self._density(predicted)
 
-        squared_error = (predicted_density - true_density).square().sum()
-        density_error = squared_error / true_density.square().sum()
-        return {**errors, "density": density_error}
+        difference = predicted_density - true_density
+        squared_error = difference.square().sum()
+        true_square = true_density.square().sum()
+        errors["density"] = squared_error / true_square
+        return errors
 
     def _density(self, state: Tensor) -> Tensor:
         """Return the weights at the nodes of the scorer's grid [1]."""
-        grid = Grid(self.info.score_cells, Placement(self.info.score_placement))
+        placement = Placement(self.info.score_placement)
+        grid = Grid(self.info.score_cells, placement)
         position = self.frame_state.position(state)
         at_rest = torch.zeros_like(position)
-        return transfer(position, at_rest, grid).weight
+        sums = transfer(position, at_rest, grid)
+        return sums.weight
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
-        encoded = self.encoder(self.network_inputs(window))
+        inputs = self.network_inputs(window)
+        encoded = self.encoder(inputs)
         latent = encoded.mean(dim=2)  # over the particles, [window, frame, latent]
 
+        first_dropout, second_dropout = self.dropout
         latent, _ = self.first(latent)
-        latent = self.dropout[0](latent)
+        latent = first_dropout(latent)
         if self.between is not None:
             latent = self.between(latent)
         latent, _ = self.second(latent)
 
-        last_frame = self.dropout[1](latent[:, -1])
-        return self.decode_state(self.decoder(last_frame), window)
+        last_frame = latent[:, -1]
+        last_frame = second_dropout(last_frame)
+        output = self.decoder(last_frame)
+        return self.decode_state(output, window)
 
 
 class LSTMWithMLP(LSTM):

@@ -41,7 +41,10 @@ class ProcessorLayer(nn.Module):
         super().__init__()
         self.sum_messages = sum_messages
         self.message = EdgeMLP(latent, hidden)
-        self.operator = operator((1 + sum_messages) * latent, latent, hidden)
+        operator_inputs = latent
+        if sum_messages:
+            operator_inputs = 2 * latent
+        self.operator = operator(operator_inputs, latent, hidden)
         self.update = mlp([2 * latent, hidden, hidden, latent])
 
     def forward(
@@ -64,7 +67,9 @@ class ProcessorLayer(nn.Module):
         aggregate, losses = output
 
         update = self.update(torch.cat([node, aggregate], dim=-1))
-        return node + update, edge + message, losses
+        next_node = node + update
+        next_edge = edge + message
+        return next_node, next_edge, losses
 
 
 def _check_output(output: object, operator: Operator, *, nodes: int) -> None:
@@ -161,12 +166,14 @@ class EncodeProcessDecode(nn.Module):
         mean_losses = {}
         for name in layer_losses[0]:
             values = [losses[name] for losses in layer_losses]
-            mean_losses[name] = torch.stack(values).mean()
+            of_layers = torch.stack(values)
+            mean_losses[name] = of_layers.mean()
 
         # Every frame adds the output to velocities: the three digits of bfloat16 are
         # too few for that.
         with torch.autocast(node.device.type, enabled=False):
-            prediction = self.decoder(node.to(input_dtype))
+            node = node.to(input_dtype)
+            prediction = self.decoder(node)
         return prediction, mean_losses
 
 
@@ -290,13 +297,20 @@ def edge_map(
 
 
 def _sum_of_ends(edge_index: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
-    sums = receiver.index_select(0, edge_index[1])
-    sums += sender.index_select(0, edge_index[0])
+    """Return ``s_j + r_i`` of each edge, shape [edge, hidden]."""
+    senders, receivers = edge_index
+    sums = receiver.index_select(0, receivers)
+    sums += sender.index_select(0, senders)
     return sums
 
 
 def _split_edges(edges: int) -> list[slice]:
-    return [slice(start, start + PIECE) for start in range(0, edges, PIECE)]
+    """Return the pieces of so many edges."""
+    pieces = []
+    for start in range(0, edges, PIECE):
+        end = start + PIECE
+        pieces.append(slice(start, end))
+    return pieces
 
 
 class Recomputed(torch.autograd.Function):
@@ -382,13 +396,13 @@ class EdgeMLP(nn.Module):
     def __init__(self, latent: int, hidden: int) -> None:
         super().__init__()
         self.first = nn.Linear(3 * latent, hidden)
-        self.rest = nn.Sequential(nn.ReLU(inplace=True), *mlp([hidden, hidden, latent]))
+        later_layers = mlp([hidden, hidden, latent])
+        self.rest = nn.Sequential(nn.ReLU(inplace=True), *later_layers)
 
     def forward(self, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
         """Return the update of each edge, shape [edge, latent]."""
-        edge_weight, receiver_weight, sender_weight = self.first.weight.tensor_split(
-            3, dim=1
-        )
+        parts = self.first.weight.tensor_split(3, dim=1)
+        edge_weight, receiver_weight, sender_weight = parts
         sender = linear(node, sender_weight)
         receiver = linear(node, receiver_weight, self.first.bias)
         if self._is_too_large(edge):

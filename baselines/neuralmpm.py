@@ -77,7 +77,8 @@ class NeuralMPM(Baseline):
             multiple=NODES_PER_COARSE_NODE,
             periodic=periodic,
         )
-        unit = (self.grid.spacing / info.radius) ** info.box.dimension
+        cells_per_radius = self.grid.spacing / info.radius
+        unit = cells_per_radius**info.box.dimension
         self.speed = _isotropic_std(info, "velocity_std")
         self.change = _isotropic_std(info, "acceleration_std")
         self.encoder = FieldEncoder(
@@ -124,7 +125,8 @@ class NeuralMPM(Baseline):
     @property
     def future(self) -> int:
         """Frames of all calls in training, with gradients and without."""
-        return self.options.bundle * (self.options.calls + self.options.pushforward)
+        calls = self.options.calls + self.options.pushforward
+        return self.options.bundle * calls
 
     @property
     def origin(self) -> bool:
@@ -155,7 +157,8 @@ class NeuralMPM(Baseline):
             batch = augment(self, batch, generator)
             if self.options.shift:
                 batch = shift_batch(batch, self.box, generator)
-        state = self.start(batch.part(slice(self.history)), average=False)
+        given = batch.part(slice(self.history))
+        state = self.start(given, average=False)
         next_frame = self.history  # the first frame whose error counts
         if generator is not None and self.options.pushforward:
             state, frame_count = self._push_forward(state, generator)
@@ -167,28 +170,32 @@ class NeuralMPM(Baseline):
             state, frames = self.call(state, average=False)
             for position, velocity in frames:
                 true_position = batch.position[:, next_frame - 1]
-                true_velocity = self.box.displacement(
-                    true_position, batch.position[:, next_frame]
-                )
+                next_true_position = batch.position[:, next_frame]
+                true_velocity = self.box.displacement(true_position, next_true_position)
                 gap = self.box.displacement(reached.detach(), true_position)
-                target = true_velocity + velocity_towards_path(
+                way_back = velocity_towards_path(
                     gap, self.options.recovery, acceleration_std=self.change
                 )
+                target = true_velocity + way_back
                 error = (velocity - target) / self.change
-                errors.append(error.square().mean())
+                squared_error = error.square()
+                errors.append(squared_error.mean())
                 reached = position
                 next_frame += 1
-        return {"velocity": torch.stack(errors).mean()}
+        frame_errors = torch.stack(errors)
+        return {"velocity": frame_errors.mean()}
 
     @torch.no_grad()
     def _push_forward(
         self, state: GridState, generator: torch.Generator
     ) -> tuple[GridState, int]:
         """Return the state after a random number of calls, and their frames."""
-        most = self.options.pushforward + 1
-        drawn = torch.randint(most, (), generator=generator, device=generator.device)
+        device = generator.device
+        end = self.options.pushforward + 1
+        drawn = torch.randint(end, (), generator=generator, device=device)
+        call_count = int(drawn)
         frame_count = 0
-        for _ in range(int(drawn)):
+        for _ in range(call_count):
             state, frames = self.call(state, average=False)
             frame_count += len(frames)
         return state, frame_count
@@ -227,8 +234,10 @@ class NeuralMPM(Baseline):
         """Return the velocities of the walls from the last frame on [length/frame]."""
         if not self.options.wall_velocity or given.wall_velocity is None:
             dimension = given.position.shape[2]
-            return given.position.new_zeros(given.windows, 1, 2 * dimension, dimension)
-        per_second = given.wall_velocity[:, given.frames - 1 :]
+            wall_count = 2 * dimension
+            return given.position.new_zeros(given.windows, 1, wall_count, dimension)
+        last_frame = given.frames - 1
+        per_second = given.wall_velocity[:, last_frame:]
         return per_second * self.info.frame_interval
 
     def _coming_force(self, given: Batch) -> Tensor | None:
@@ -247,8 +256,9 @@ class NeuralMPM(Baseline):
                 got="none",
                 fix="train without it: --set model.body_force=false",
             )
-        per_second = given.body_force[:, given.frames - 1 :]
-        return per_second * self.info.frame_interval**2
+        last_frame = given.frames - 1
+        per_square_second = given.body_force[:, last_frame:]
+        return per_square_second * self.info.frame_interval**2
 
     def _scaled_viscosity(self, given: Batch) -> Tensor:
         """Return the logarithm of the viscosity of each window, shape [window, 1].
@@ -270,7 +280,8 @@ class NeuralMPM(Baseline):
                 fix="train without it: --set model.viscosity=false",
             )
         viscosity = given.viscosity.clamp(min=LEAST_VISCOSITY)
-        return torch.log(viscosity / VISCOSITY_UNIT)[:, None]
+        logarithm = torch.log(viscosity / VISCOSITY_UNIT)
+        return logarithm[:, None]
 
     def _rest_shape(self, given: Batch, layer: Tensor) -> RestShape | None:
         """Return the rest shape of solids; None where strain is not asked for."""
@@ -295,17 +306,21 @@ class NeuralMPM(Baseline):
             images = []
             for matrix in self._mirror_matrices():
                 blocks = self.encoder.mirror_fields(matrix)
-                images.append(mirror_field(fields, matrix, blocks))
+                image = mirror_field(fields, matrix, blocks)
+                images.append(image)
         contexts = [network(image) for image in images]
-        return torch.stack(contexts).mean(dim=0)
+        of_images = torch.stack(contexts)
+        return of_images.mean(dim=0)
 
     def advance(self, state: GridState) -> tuple[GridState, Tensor]:
         """Return the next state and positions [length]; call once for every bundle."""
         if not state.coming:
             state, frames = self.call(state)
-            state = replace(state, coming=tuple(position for position, _ in frames))
-        next_position, *later = state.coming
-        return replace(state, coming=tuple(later)), next_position
+            positions = [position for position, _ in frames]
+            state = replace(state, coming=tuple(positions))
+        next_position, *later_positions = state.coming
+        state = replace(state, coming=tuple(later_positions))
+        return state, next_position
 
     def call(
         self, state: GridState, *, average: bool = True
@@ -323,22 +338,25 @@ class NeuralMPM(Baseline):
         else:
             output = self.network(inputs)
 
+        output = output * self.change
         velocity, accelerations = self.decoder.decode(
-            state, stencil, output * self.change, grid_velocity
+            state, stencil, output, grid_velocity
         )
         if self.fall is not None:
             accelerations = self._add_fall(accelerations, self.fall)
         frames = self._integrate(state, velocity, accelerations)
-        return self._after(state, frames), frames
+        next_state = self._after(state, frames)
+        return next_state, frames
 
     def _add_fall(
         self, accelerations: Sequence[Tensor], fall: Tensor
     ) -> Sequence[Tensor]:
         """Return the accelerations of all frames with the fall g."""
-        fall_vector = torch.stack([0.0 * fall, fall])
-        falling = torch.stack(list(accelerations), dim=1)
-        falling = falling + FALL_UNIT * self.change * fall_vector
-        return falling.unbind(dim=1)
+        unit = FALL_UNIT * self.change  # [length/frame^2]
+        direction = torch.stack([0.0 * fall, fall])
+        without_fall = torch.stack(list(accelerations), dim=1)
+        with_fall = without_fall + unit * direction
+        return with_fall.unbind(dim=1)
 
     def _mirror_matrices(self) -> Tensor:
         """Return the matrices of all mirror images, shape [image, axis, axis]."""
@@ -350,13 +368,16 @@ class NeuralMPM(Baseline):
         These are fields, context, viscosity and forcing.
         """
         constants = torch.cat([state.context, state.viscosity], dim=1)
-        one_node = constants.view(*constants.shape, *[1] * self.grid.dimension)
+        node_axes = [1] * self.grid.dimension
+        one_node = constants.view(*constants.shape, *node_axes)
         constant_fields = one_node.expand(-1, -1, *self.grid.shape)
         parts = [fields, constant_fields]
         if self.options.wall_velocity:
-            parts.append(self.encoder.forcing(state.walls))
+            forcing = self.encoder.forcing(state.walls)
+            parts.append(forcing)
         if state.body_force is not None:
-            parts.append(self.encoder.force(state.body_force))
+            force = self.encoder.force(state.body_force)
+            parts.append(force)
         return torch.cat(parts, dim=1)
 
     def _predict_mirror_averaged(self, inputs: Tensor) -> Tensor:
@@ -365,17 +386,22 @@ class NeuralMPM(Baseline):
         A rollout of an image is then the image of the rollout: frame averaging over the
         whole group (Puny et al. 2022, arXiv 2110.03336).
         """
+        constant_count = self.options.context + self.options.viscosity
         outputs = []
         for matrix in self._mirror_matrices():
             input_blocks = [
                 *self.encoder.mirror_fields(matrix),
-                torch.eye(self.options.context + self.options.viscosity),
+                torch.eye(constant_count),
                 *self.encoder.mirror_forcing(matrix),
             ]
-            image_output = self.network(mirror_field(inputs, matrix, input_blocks))
-            output_blocks = self.decoder.mirror(matrix.T)
-            outputs.append(mirror_field(image_output, matrix.T, output_blocks))
-        return torch.stack(outputs).mean(dim=0)
+            image = mirror_field(inputs, matrix, input_blocks)
+            image_output = self.network(image)
+            inverse = matrix.T
+            output_blocks = self.decoder.mirror(inverse)
+            output = mirror_field(image_output, inverse, output_blocks)
+            outputs.append(output)
+        of_images = torch.stack(outputs)
+        return of_images.mean(dim=0)
 
     def _integrate(
         self, state: GridState, grid_velocity: Tensor, accelerations: Sequence[Tensor]
@@ -392,36 +418,49 @@ class NeuralMPM(Baseline):
         velocity = state.velocity[:, -1]
         frames: list[Frame] = []
         for acceleration in accelerations:
-            velocity = (
-                (1.0 - smoothing) * velocity + smoothing * grid_velocity + acceleration
-            )
+            own_velocity = (1.0 - smoothing) * velocity
+            smooth_velocity = smoothing * grid_velocity
+            velocity = own_velocity + smooth_velocity + acceleration
             if self.projection is not None and state.projection is not None:
-                corrected = self.projection(state.projection, position + velocity)
+                moved = position + velocity
+                corrected = self.projection(state.projection, moved)
                 velocity = self.box.displacement(position, corrected)
             velocity = self.box.stop_at_walls(position, velocity)
+            moved = position + velocity
             # The sum may round to a number beyond the wall.
-            position = self.box.inside(position + velocity)
+            position = self.box.inside(moved)
             grid_velocity = grid_velocity + acceleration
             frames.append((position, velocity))
         return frames
 
     def _after(self, state: GridState, frames: list[Frame]) -> GridState:
         """Return the state after the frames of a bundle."""
+        frame_count = len(frames)
         last_position, _ = frames[-1]
-        new_velocities = torch.stack([velocity for _, velocity in frames], dim=1)
-        velocities = torch.cat([state.velocity, new_velocities], dim=1)
-        last_wall_frame = state.walls.shape[1] - 1
-        walls = state.walls[:, min(len(frames), last_wall_frame) :]
+        new_velocities = [velocity for _, velocity in frames]
+        new_velocity = torch.stack(new_velocities, dim=1)
+        velocity = torch.cat([state.velocity, new_velocity], dim=1)
+        walls = _skip_frames(state.walls, frame_count)
         force = state.body_force
         if force is not None:
-            force = force[:, min(len(frames), force.shape[1] - 1) :]
+            force = _skip_frames(force, frame_count)
         return replace(
             state,
             position=last_position,
-            velocity=velocities[:, -self.options.velocities :],
+            velocity=velocity[:, -self.options.velocities :],
             walls=walls,
             body_force=force,
         )
+
+
+def _skip_frames(forcing: Tensor, count: int) -> Tensor:
+    """Return the forcing after some frames; the last one always stays.
+
+    The shape of ``forcing`` is [window, frame, ...].
+    """
+    last_frame = forcing.shape[1] - 1
+    skipped = min(count, last_frame)
+    return forcing[:, skipped:]
 
 
 def _isotropic_std(info: DatasetInfo, name: str) -> float:
@@ -429,7 +468,8 @@ def _isotropic_std(info: DatasetInfo, name: str) -> float:
 
     A model that is trained on mirror images must not distinguish the axes.
     """
+    dimension = info.box.dimension
     mean_square = 0.0
     for std in info.statistics[name]:
-        mean_square += std**2 / info.box.dimension
+        mean_square += std**2 / dimension
     return float(mean_square**0.5)

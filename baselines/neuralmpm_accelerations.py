@@ -93,10 +93,13 @@ class FieldAccelerations(Accelerations):
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles."""
         axes = self.grid.dimension
-        accelerations = output.reshape(-1, axes * self.frames, *self.grid.shape)
+        particles = len(stencil.weight)
+        channels = axes * self.frames  # of a layer
+        accelerations = output.reshape(-1, channels, *self.grid.shape)
         # One transfer serves the velocity and all frames.
         field = torch.cat([grid_velocity, accelerations], dim=1)
-        gathered = self.grid.gather(stencil, field).view(len(stencil.weight), -1, axes)
+        gathered = self.grid.gather(stencil, field)
+        gathered = gathered.view(particles, -1, axes)
         velocity, *particle_accelerations = gathered.unbind(dim=1)
         return velocity, particle_accelerations
 
@@ -107,34 +110,45 @@ class StressAccelerations(Accelerations):
     @property
     def channels(self) -> int:
         """Three stresses of each material and two accelerations in each frame."""
-        return (3 * self.material_count + 2) * self.frames
+        return self._stress_channels + 2 * self.frames
+
+    @property
+    def _stress_channels(self) -> int:
+        """Three stresses of each material in each frame."""
+        return 3 * self.material_count * self.frames
 
     def mirror(self, matrix: Tensor) -> list[Tensor]:
         """Return the images of the stresses, then those of the accelerations."""
-        stresses = [strain_matrix(matrix)] * (self.material_count * self.frames)
-        return stresses + [matrix] * self.frames
+        stress_count = self.material_count * self.frames
+        stresses = [strain_matrix(matrix)] * stress_count
+        accelerations = [matrix] * self.frames
+        return stresses + accelerations
 
     def decode(
         self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles."""
-        velocity = self.grid.gather(stencil, grid_velocity)
-        stress_channels = 3 * self.material_count * self.frames
-        stress, wall_push = output.tensor_split([stress_channels], dim=1)
-        stress = stress.reshape(-1, 3 * self.frames, *self.grid.shape)
+        grid = self.grid
+        velocity = grid.gather(stencil, grid_velocity)
+        stress, wall_push = output.tensor_split([self._stress_channels], dim=1)
+        stress = stress.reshape(-1, 3 * self.frames, *grid.shape)
         node_stress = STRESS_UNIT * stress  # (xx, xy, yy) [length cell/frame^2]
 
         # All materials of a window move on one layer.
-        shared = self.grid.stencil(state.position, state.sample)
-        one = torch.ones_like(state.position[:, :1])
-        mass = self.grid.spread(shared, one, len(output))
-        particle_stress = self.grid.gather(stencil, node_stress)
-        particle_stress = particle_stress * self._load(shared, mass)
+        windows = len(output)
+        position = state.position
+        shared = grid.stencil(position, state.sample)
+        one = torch.ones_like(position[:, :1])
+        mass = grid.spread(shared, one, windows)
+        load = self._load(shared, mass)
+        particle_stress = grid.gather(stencil, node_stress)
+        particle_stress = particle_stress * load
         particle_stress = particle_stress.view(-1, self.frames, 3)
 
-        inner = self.grid.accelerate(shared, state.position, particle_stress, mass)
-        node_acceleration = inner + self._wall_nearness() * wall_push
-        acceleration = self.grid.gather(shared, node_acceleration)
+        inner_acceleration = grid.accelerate(shared, position, particle_stress, mass)
+        wall_acceleration = self._wall_nearness() * wall_push
+        node_acceleration = inner_acceleration + wall_acceleration
+        acceleration = grid.gather(shared, node_acceleration)
         by_frame = acceleration.view(-1, self.frames, 2)
         return velocity, by_frame.unbind(dim=1)
 
@@ -143,10 +157,15 @@ class StressAccelerations(Accelerations):
 
         The shape is [particle, 1].
         """
-        filled = self.grid.gather(shared, mass / self.unit) / FULL_WEIGHT
-        return filled.clamp(max=1.0).square()
+        weight = self.grid.gather(shared, mass / self.unit)
+        filled_share = weight / FULL_WEIGHT
+        filled_share = filled_share.clamp(max=1.0)
+        return filled_share.square()
 
     def _wall_nearness(self) -> Tensor:
         """Return 1 at walls, falling to 0 at their reach, shape [x node, y node]."""
-        distance = self.grid.wall_distance(WALL_REACH * self.grid.spacing)
-        return (1.0 - distance.amin(dim=0)).clamp(0.0, 1.0)
+        reach = WALL_REACH * self.grid.spacing
+        distance = self.grid.wall_distance(reach)
+        nearest_distance = distance.amin(dim=0)
+        nearness = 1.0 - nearest_distance
+        return nearness.clamp(0.0, 1.0)

@@ -139,12 +139,9 @@ def predict(
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = resolve_root(root)
     known_splits = load_rooted_registry(root_folder, registry)
+    where = str(checkpoint)
     info = check_data(
-        trained,
-        root=root_folder,
-        registry=known_splits,
-        size=size,
-        where=str(checkpoint),
+        trained, root=root_folder, registry=known_splits, size=size, where=where
     )
     machine = choose_device(device)
     bound_memory()
@@ -159,20 +156,14 @@ def predict(
     side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
 
     with use_threads(threads), explain_memory_errors("lower --batch"):
-        model = restore_for_size(
-            trained, info, settings, known_splits, where=str(checkpoint)
-        ).to(machine)
+        model = restore_for_size(trained, info, settings, known_splits, where=where)
+        model = model.to(machine)
+        viscosity = known_splits.size(info.split, info.size).viscosity()
         rollouts = _TimedRollouts(
-            model,
-            info,
-            paths,
-            side_by_side,
-            machine,
-            viscosity=known_splits.size(info.split, info.size).viscosity(),
+            model, info, paths, side_by_side, machine, viscosity=viscosity
         )
         label = method or model.method
         _check_method(output_path, label)
-        parameters = count_parameters(model)
         hardware_label = _describe_hardware(machine)
         writer = PredictionsWriter(
             output,
@@ -184,33 +175,58 @@ def predict(
             root=root_folder,
             registry=known_splits,
             device=hardware_label,
-            parameters=parameters,
+            parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
         solver_seconds_per_frame = _write_rollouts(
             writer, rollouts, info, time_solver=time_solver, progress=progress
         )
 
-    result = PredictionResult(
-        path=output_path,
-        split=info.split,
-        size=info.size,
+    result = _summarise(
+        rollouts,
+        output=output_path,
         trained_size=trained.info.size,
         settings=tuple(settings),
         method=label,
-        scenarios=len(paths),
-        frames=info.horizon,
-        batch=side_by_side,
-        seconds_per_frame=rollouts.seconds_per_frame,
-        seconds_without_search=rollouts.seconds_per_frame - rollouts.search_per_frame,
-        clock=rollouts.clock,
-        solver_seconds_per_frame=solver_seconds_per_frame,
         device=hardware_label,
-        parameters=parameters,
-        diverged=rollouts.diverged,
+        solver_seconds_per_frame=solver_seconds_per_frame,
     )
     _write_costs(result)
     return result
+
+
+def _summarise(
+    rollouts: _TimedRollouts,
+    *,
+    output: Path,
+    trained_size: str,
+    settings: tuple[str, ...],
+    method: str,
+    device: str,
+    solver_seconds_per_frame: float | None,
+) -> PredictionResult:
+    """Return the result of rollouts that were written."""
+    info = rollouts.info
+    seconds = rollouts.seconds_per_frame
+    seconds_without_search = seconds - rollouts.search_per_frame
+    return PredictionResult(
+        path=output,
+        split=info.split,
+        size=info.size,
+        trained_size=trained_size,
+        settings=settings,
+        method=method,
+        scenarios=len(rollouts.paths),
+        frames=info.horizon,
+        batch=rollouts.side_by_side,
+        seconds_per_frame=seconds,
+        seconds_without_search=seconds_without_search,
+        clock=rollouts.clock,
+        solver_seconds_per_frame=solver_seconds_per_frame,
+        device=device,
+        parameters=count_parameters(rollouts.model),
+        diverged=rollouts.diverged,
+    )
 
 
 def _write_rollouts(
@@ -377,28 +393,31 @@ class _TimedRollouts:
         # scenario id to the absolute frame from which its rollout is frozen
         self.diverged: dict[int, int] = {}
         self.paths = paths  # scenario files
-        self._model = model
-        self._info = info
+        self.side_by_side = side_by_side  # scenarios of a group
+        self.model = model
+        self.info = info
         self._machine = machine
         # of scenarios whose files state none [length^2/s]
         self._viscosity = viscosity
         self._groups = []
         for first in range(0, len(paths), side_by_side):
-            self._groups.append(paths[first : first + side_by_side])
+            end = first + side_by_side
+            self._groups.append(paths[first:end])
         self._search_seconds: list[float] = []  # per frame of one scenario
 
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
-        input_frames = slice(0, self._info.input_frames)
+        input_frames = slice(0, self.info.input_frames)
         for number, group in enumerate(self._groups):
             given_frames = scenario_batch(
                 group, input_frames, viscosity=self._viscosity
-            ).to(self._machine)
+            )
+            given_frames = given_frames.to(self._machine)
             if number == 0:
-                roll_out(self._model, given_frames, 1)  # to warm up
-            started = self._read_clock()
-            rollouts = roll_out(self._model, given_frames, self._info.horizon)
-            self.seconds += self._read_clock() - started
+                roll_out(self.model, given_frames, 1)  # to warm up
+            start_time = self._read_clock()
+            rollouts = roll_out(self.model, given_frames, self.info.horizon)
+            self.seconds += self._read_clock() - start_time
             for rollout in rollouts:
                 self._count_frames(rollout)
             self._time_searches(given_frames, rollouts)
@@ -406,31 +425,31 @@ class _TimedRollouts:
 
     def _count_frames(self, rollout: Rollout) -> None:
         if rollout.diverged_at is None:
-            self.frames += self._info.horizon
+            self.frames += self.info.horizon
             return
         # The model predicted the first frame that is not finite, too.
-        self.frames += rollout.diverged_at - self._info.input_frames + 1
+        self.frames += rollout.diverged_at - self.info.input_frames + 1
         self.diverged[rollout.scenario] = rollout.diverged_at
 
     def _time_searches(self, given: Batch, rollouts: list[Rollout]) -> None:
         """Search neighbours once more in some frames, and take the time."""
-        radius = getattr(self._model, "radius", None)
+        radius = getattr(self.model, "radius", None)
         if radius is None:
             return
-        most = getattr(self._model.options, "neighbours", None)
+        most = getattr(self.model.options, "neighbours", None)
         positions = torch.cat([rollout.position for rollout in rollouts], dim=1)
         positions = positions.to(self._machine)
         stride = max(1, len(positions) // TIMED_SEARCHES)
         for frame in range(0, len(positions), stride):
-            started = self._read_clock()
+            start_time = self._read_clock()
             radius_graph(
                 positions[frame],
                 float(radius),
                 given.sample,
                 most=most,
-                box=self._info.box,
+                box=self.info.box,
             )
-            elapsed = self._read_clock() - started
+            elapsed = self._read_clock() - start_time
             self._search_seconds.append(elapsed / len(rollouts))
 
     @property

@@ -62,10 +62,13 @@ class Schedule(Settings):
         """
         rise = min(1.0, (step + 1) / (warmup + 1))
         if self.kind == "exponential":
-            return float(rise * self.factor ** (step / self.every))
+            decay = self.factor ** (step / self.every)
+            return float(rise * decay)
         if self.kind == "constant":
             return rise
-        progress = min(1.0, max(0, step - warmup) / max(1, steps - warmup))
+        steps_since_warmup = max(0, step - warmup)
+        cosine_steps = max(1, steps - warmup)
+        progress = min(1.0, steps_since_warmup / cosine_steps)
         cosine = (1 + math.cos(math.pi * progress)) / 2
         return rise * (self.floor + (1 - self.floor) * cosine)
 

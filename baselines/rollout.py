@@ -83,9 +83,10 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     sample = given.sample.cpu()
     rollouts = []
     for window, scenario in enumerate(given.scenario):
+        is_inside = sample == window
         rollout = Rollout(
             scenario=int(scenario),
-            position=predicted[:, sample == window],
+            position=predicted[:, is_inside],
             diverged_at=diverged_at,
         )
         rollouts.append(rollout)
@@ -95,25 +96,27 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
 def select_window(batch: Batch, window: int) -> Batch:
     """Return one window of a batch as a batch of its own."""
     is_inside = batch.sample == window
+    row = slice(window, window + 1)
     walls = batch.wall_velocity
     if walls is not None:
-        walls = walls[window : window + 1]
+        walls = walls[row]
     force = batch.body_force
     if force is not None:
-        force = force[window : window + 1]
+        force = force[row]
     origin = batch.origin
     if origin is not None:
         origin = origin[is_inside]
     viscosity = batch.viscosity
     if viscosity is not None:
-        viscosity = viscosity[window : window + 1]
+        viscosity = viscosity[row]
+    sample = batch.sample[is_inside]
     return Batch(
         position=batch.position[is_inside],
-        sample=torch.zeros_like(batch.sample[is_inside]),
+        sample=torch.zeros_like(sample),
         material=batch.material[is_inside],
         wall_velocity=walls,
-        scenario=batch.scenario[window : window + 1],
-        frame=batch.frame[window : window + 1],
+        scenario=batch.scenario[row],
+        frame=batch.frame[row],
         origin=origin,
         viscosity=viscosity,
         body_force=force,
@@ -128,13 +131,14 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
     particles, _, dimension = given.position.shape
     predicted = torch.empty((frames, particles, dimension), dtype=torch.float32)
     state = model.start(given)
-    for frame in range(frames):
+    for frame, row in enumerate(predicted):
         output: object = model.advance(state)
-        state, position = _check_advance(model, output, predicted[frame].shape)
-        predicted[frame] = position
+        state, position = _check_advance(model, output, row.shape)
+        row.copy_(position)
         # The scorer refuses positions farther out. Comparisons with NaN are false.
-        distance = (predicted[frame] - 0.5).abs()
-        if not (distance <= MAX_DISTANCE).all():
+        distance = (row - 0.5).abs()
+        is_near = distance <= MAX_DISTANCE
+        if not is_near.all():
             return predicted, frame
     return predicted, frames
 
@@ -154,7 +158,9 @@ def _check_advance(
             return state, position
     shapes = []
     for part in output:
-        shapes.append(str(getattr(part, "shape", type(part).__name__)))
+        type_name = type(part).__name__
+        shape_or_type = getattr(part, "shape", type_name)
+        shapes.append(str(shape_or_type))
     raise UsageError(
         "a model returned no positions of the next frame",
         where=f"{type(model).__qualname__}.advance",
@@ -185,7 +191,8 @@ def round_parameters(model: nn.Module) -> AbstractContextManager[None]:
     """Round the parameters to bfloat16 for a while."""
     rounded: dict[Tensor, Tensor] = {}
     for parameter in model.parameters():
-        rounded[parameter] = parameter.detach().to(torch.bfloat16)
+        value = parameter.detach()
+        rounded[parameter] = value.to(torch.bfloat16)
     return replace_parameters(rounded)
 
 
@@ -208,7 +215,8 @@ def scenario_batch(
     """
     if isinstance(paths, Path):
         paths = [paths]
-    return collate([_read_window(path, frames, viscosity) for path in paths])
+    windows = [_read_window(path, frames, viscosity) for path in paths]
+    return collate(windows)
 
 
 def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWindow:
@@ -222,24 +230,29 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
                 expected=f"frames of 0:{file.header.frames}",
                 got=frames,
             )
-        position = file.read("position", slice(numbers.start, numbers.stop))
+        first = numbers.start
+        own_frames = slice(first, numbers.stop)
+        # The forcing of all later frames too: a rollout from these knows it.
+        later_frames = slice(first, None)
+        position = file.read("position", own_frames)
         if "material" in file.variables:
             material = file.read("material")
         else:
-            material = np.zeros(position.shape[1], np.int8)
+            particles = position.shape[1]
+            material = np.zeros(particles, np.int8)
         walls = None
         if "wall_velocity" in file.variables:
-            # The forcing of all later frames too: a rollout from these knows it.
-            walls = file.read("wall_velocity", slice(numbers.start, None))
+            walls = file.read("wall_velocity", later_frames)
         force = None
         if "body_force" in file.variables:
-            force = file.read("body_force", slice(numbers.start, None))
+            force = file.read("body_force", later_frames)
         scenario = file.header.key.scenario
         stated = file.header.viscosity
     if stated is not None:
         viscosity = stated
-    window = copy_window(list(position), material, walls, scenario, numbers.start)
-    return tensors(window._replace(viscosity=viscosity, body_force=force))
+    window = copy_window(list(position), material, walls, scenario, first)
+    window = window._replace(viscosity=viscosity, body_force=force)
+    return tensors(window)
 
 
 def scenario_paths(
@@ -276,7 +289,10 @@ class Validation:
         scenario after the other, as predictions are. A rollout that diverges counts
         with its frozen frames.
         """
-        device = next((p.device for p in model.parameters()), torch.device("cpu"))
+        device = torch.device("cpu")  # where a model has no parameters
+        for parameter in model.parameters():
+            device = parameter.device
+            break
         ids = list(self.frames)
         groups = [ids]
         if device.type == "cpu":
@@ -314,7 +330,9 @@ class Validation:
         with self.task.opened(rollout.scenario) as truth:
             # A generator, so that one pair of frames is in memory at a time.
             pairs = _pair_frames(rollout, truth, frames)
-            return round_statistics(tally(pairs, select([self.metric]), frames))
+            metrics = select([self.metric])
+            statistics = tally(pairs, metrics, frames)
+            return round_statistics(statistics)
 
 
 def _pair_frames(
@@ -322,9 +340,11 @@ def _pair_frames(
 ) -> Iterator[FramePair]:
     """Yield true and predicted frames."""
     scenario = truth.scenario
-    predicted_frames = snapshots(scenario, rollout.position.numpy())
+    position = rollout.position.numpy()
+    predicted_frames = snapshots(scenario, position)
+    true_frames = truth.snapshots()
     for frame, predicted, true in zip(
-        frames, predicted_frames, truth.snapshots(), strict=False
+        frames, predicted_frames, true_frames, strict=False
     ):
         yield FramePair(scenario, frame, true, predicted)
 
@@ -337,10 +357,15 @@ def load_validation(
         return None
     size = registry.size(info.split, info.size)
     task = load_scored_task(size, root, subset="valid")
-    horizon = min(options.validation_frames or info.horizon, info.horizon)
-    task = replace(task, config=replace(task.config, horizon=horizon))
+    horizon = info.horizon
+    if options.validation_frames:
+        horizon = min(options.validation_frames, horizon)
+    config = replace(task.config, horizon=horizon)
+    task = replace(task, config=config)
+    scenarios = task.scenarios[: options.validation_scenarios]
     frames = {}
-    for scenario in task.scenarios[: options.validation_scenarios]:
+    for scenario in scenarios:
         with task.opened(scenario) as truth:
-            frames[scenario] = len(truth.scenario.moving_frames)
+            moving_frames = truth.scenario.moving_frames
+        frames[scenario] = len(moving_frames)
     return Validation(task=task, frames=frames, is_compiled=options.compile)

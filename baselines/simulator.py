@@ -76,7 +76,8 @@ class ParticleState:
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
-        velocities = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
+        later_velocities = self.velocity[:, 1:]
+        velocities = torch.cat([later_velocities, velocity.unsqueeze(1)], dim=1)
         walls = self.wall_velocity
         if walls is not None and walls.shape[1] > 1:
             walls = walls[:, 1:]
@@ -142,7 +143,9 @@ def loss_terms(
     terms: dict[str, Tensor] = {}
     for name in PARTICLE_TERMS:
         with _record_graph(weights, name):
-            error = getattr(predicted, name) - getattr(target, name)
+            predicted_value = getattr(predicted, name)
+            true_value = getattr(target, name)
+            error = predicted_value - true_value
             terms[name] = mean_norm(error / scales[name], norm)
     if grid.dimension != 2 or grid.box.is_periodic:
         return terms
@@ -155,11 +158,15 @@ def loss_terms(
     with _record_graph(weights, "density"):
         error = predicted_fields.density - true_fields.density
         terms["density"] = mean_norm(error.unsqueeze(-1), norm)
-    node_count = true_fields.differentiable.sum().clamp(min=1)
-    speed = (scales["velocity"] ** 2).mean().sqrt()
+    node_count = true_fields.differentiable.sum()
+    node_count = node_count.clamp(min=1)
+    variance = scales["velocity"] ** 2
+    speed = variance.mean().sqrt()
     for name in ("divergence", "vorticity"):
         with _record_graph(weights, name):
-            difference = getattr(predicted_fields, name) - getattr(true_fields, name)
+            predicted_value = getattr(predicted_fields, name)
+            true_value = getattr(true_fields, name)
+            difference = predicted_value - true_value
             error = difference / speed
             terms[name] = mean_norm(error.unsqueeze(-1), norm, node_count)
     return terms
@@ -175,7 +182,9 @@ def _target_fields(target: Motion, grid: Grid, sample: Tensor) -> TensorFields:
     sums = transfer(
         target.position, target.velocity, grid, sample=sample, windows=windows
     )
-    full_weight = float((sums.weight**2).sum() / sums.weight.sum())
+    square_sum = (sums.weight**2).sum()
+    weight_sum = sums.weight.sum()
+    full_weight = float(square_sum / weight_sum)
     return tensor_fields(sums, grid, full_weight)
 
 
@@ -194,7 +203,8 @@ def _predicted_fields(
 def _record_graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
     """Record a graph only if torch records one and one of the terms has a weight."""
     is_weighted = any(weights.get(name, 1.0) != 0.0 for name in names)
-    return torch.set_grad_enabled(torch.is_grad_enabled() and is_weighted)
+    is_recorded = torch.is_grad_enabled() and is_weighted
+    return torch.set_grad_enabled(is_recorded)
 
 
 class GraphTarget(enum.StrEnum):
@@ -307,20 +317,19 @@ class GraphNetwork(Baseline):
         self.radius = info.radius
         if options.radius is not None:
             self.radius = options.radius
-        self.grid = Grid(
-            info.score_cells, Placement(info.score_placement), self._grid_box
-        )
+        placement = Placement(info.score_placement)
+        self.grid = Grid(info.score_cells, placement, self._grid_box)
         # Noise on the inputs widens velocities and accelerations.
+        noise = options.noise_std
         self.position = self._standardisation("position", noise=0.0)
-        self.velocity = self._standardisation("velocity", noise=options.noise_std)
-        self.acceleration = self._standardisation(
-            "acceleration", noise=options.noise_std
-        )
+        self.velocity = self._standardisation("velocity", noise=noise)
+        self.acceleration = self._standardisation("acceleration", noise=noise)
+        wall_reach = options.wall_reach * self.radius
         self.features = NodeFeatures(
             info.bounds,
             self.velocity,
             self.acceleration,
-            options.wall_reach * self.radius,
+            wall_reach,
             velocities=options.velocities,
             moving_walls=options.wall_velocity,
             periodic=info.box.periodic,
@@ -334,14 +343,16 @@ class GraphNetwork(Baseline):
             layers=options.layers,
             sum_messages=options.sum_messages,
         )
-        for parameter in self.network.decoder[-1].parameters():
+        last_layer = self.network.decoder[-1]
+        for parameter in last_layer.parameters():
             nn.init.zeros_(parameter)
 
     @property
     def acceleration_std(self) -> float:
         """Deviation of true accelerations, of one component [length/frame^2]."""
         deviations = self.info.statistics["acceleration_std"]
-        return float(np.sqrt(np.mean(np.square(deviations))))
+        variance = np.mean(np.square(deviations))
+        return float(np.sqrt(variance))
 
     @property
     def _grid_box(self) -> Box:
@@ -405,8 +416,10 @@ class GraphNetwork(Baseline):
         if generator is not None:
             batch = augment(self, batch, generator)
             if self.options.noise_std > 0.0:
-                batch = replace(batch, position=self._keep_inside(batch.position))
-        state = self.start(batch.part(slice(self.history)))
+                position = self._keep_inside(batch.position)
+                batch = replace(batch, position=position)
+        given = batch.part(slice(self.history))
+        state = self.start(given)
         if generator is not None:
             state = self._forget(state, batch.windows, generator)
         first_frame = self.history  # the first frame whose error counts
@@ -415,17 +428,20 @@ class GraphNetwork(Baseline):
             first_frame += frame_count
 
         step_terms = []
-        for frame in range(first_frame, first_frame + self.options.rollout_loss_steps):
+        end_frame = first_frame + self.options.rollout_loss_steps
+        for frame in range(first_frame, end_frame):
             following, operator_losses = self.step(state, generator)
             terms = self._step_terms(state, following, batch, frame)
             self._check_names(terms, operator_losses)
-            step_terms.append(terms | dict(operator_losses))
+            terms.update(operator_losses)
+            step_terms.append(terms)
             state = following
 
         means = {}
         for name in step_terms[0]:
             values = [terms[name] for terms in step_terms]
-            means[name] = torch.stack(values).mean()
+            of_steps = torch.stack(values)
+            means[name] = of_steps.mean()
         return means
 
     @torch.no_grad()
@@ -433,8 +449,9 @@ class GraphNetwork(Baseline):
         self, state: ParticleState, generator: torch.Generator
     ) -> tuple[ParticleState, int]:
         """Return the state after a random number of own steps, and their number."""
-        most = self.options.pushforward + 1
-        drawn = torch.randint(most, (), generator=generator, device=generator.device)
+        device = generator.device
+        end = self.options.pushforward + 1
+        drawn = torch.randint(end, (), generator=generator, device=device)
         frame_count = int(drawn)
         for _ in range(frame_count):
             state, _ = self.step(state)
@@ -453,22 +470,31 @@ class GraphNetwork(Baseline):
         target_velocity = self.box.displacement(true_position, target_position)
         if self.options.recovery is not None:
             gap = self.box.displacement(state.position.detach(), true_position)
-            target_velocity = target_velocity + velocity_towards_path(
+            way_back = velocity_towards_path(
                 gap, self.options.recovery, acceleration_std=self.acceleration_std
             )
-        predicted_velocity = following.velocity[:, -1]
+            target_velocity = target_velocity + way_back
+
         # Both accelerations start from the state's velocity.
         last_velocity = state.velocity[:, -1]
+        target_acceleration = target_velocity - last_velocity
+        target = Motion(target_position, target_velocity, target_acceleration)
+        predicted_velocity = following.velocity[:, -1]
+        predicted_acceleration = predicted_velocity - last_velocity
+        predicted = Motion(
+            following.position, predicted_velocity, predicted_acceleration
+        )
+        scales = {
+            "acceleration": self.acceleration.std,
+            "velocity": self.velocity.std,
+            "position": self.position.std,
+        }
         return loss_terms(
-            Motion(
-                following.position,
-                predicted_velocity,
-                predicted_velocity - last_velocity,
-            ),
-            Motion(target_position, target_velocity, target_velocity - last_velocity),
+            predicted,
+            target,
             state.sample,
             grid=self.grid,
-            scales={name: getattr(self, name).std for name in PARTICLE_TERMS},
+            scales=scales,
             norm=self.options.loss_norm,
             weights=self.weights,
         )
@@ -500,12 +526,18 @@ class GraphNetwork(Baseline):
             1, velocities, (windows,), generator=generator, device=device
         )
         chance = torch.rand(windows, generator=generator, device=device)
-        forgotten *= chance < self.options.forgetful
+        is_forgetful = chance < self.options.forgetful
+        forgotten *= is_forgetful
 
-        first = forgotten.to(state.sample.device)[state.sample, None]  # [particle, 1]
-        places = torch.arange(velocities, device=first.device).expand(len(first), -1)
-        index = places.clamp(min=first)
-        velocity = state.velocity.gather(1, index[..., None].expand_as(state.velocity))
+        sample = state.sample
+        forgotten = forgotten.to(sample.device)
+        first = forgotten[sample, None]  # first velocity that is left, [particle, 1]
+        particles = len(first)
+        places = torch.arange(velocities, device=sample.device)
+        places = places.expand(particles, -1)
+        source = places.clamp(min=first)
+        source = source[..., None].expand_as(state.velocity)
+        velocity = state.velocity.gather(1, source)
         return replace(state, velocity=velocity)
 
     def start(self, given: Batch) -> ParticleState:
@@ -541,7 +573,8 @@ class GraphNetwork(Baseline):
         if self.options.target is GraphTarget.VELOCITY:
             velocity = self.velocity.inverse(output)
         else:
-            velocity = state.velocity[:, -1] + self.acceleration.inverse(output)
+            acceleration = self.acceleration.inverse(output)
+            velocity = state.velocity[:, -1] + acceleration
 
         position = state.position + velocity
         inside = self._keep_inside(position)
@@ -585,8 +618,10 @@ class GraphNetwork(Baseline):
         """
         if not self.options.clamp:
             return position
-        clamped = self.box.inside(position.detach())
-        return clamped + (position - position.detach())
+        constant = position.detach()
+        clamped = self.box.inside(constant)
+        zero = position - constant
+        return clamped + zero
 
 
 _CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

@@ -57,15 +57,18 @@ class RestShape:
         """
         position = grid.box.inside(position)
         stencil = grid.stencil(position, layer)
-        weight_sum = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
-        offset = stencil.weight[:, :, None] * grid.offsets(stencil, position)
-        slack = SLACK * grid.spacing**2 * torch.eye(2, device=position.device)
+        one = torch.ones_like(position[:, :1])
+        weight_sum = grid.spread(stencil, one, layers)
+        weighted_offset = stencil.weight[:, :, None] * grid.offsets(stencil, position)
+        identity = torch.eye(2, device=position.device)
+        slack = SLACK * grid.spacing**2 * identity
 
         # The three digits of bfloat16 are too few for a strain.
         with torch.autocast(position.device.type, enabled=False):
             mean_offset = _relative_means(grid, stencil, weight_sum, position)
-            spread = torch.einsum("pnd,pne->pde", mean_offset, offset)
-            lever = offset @ torch.linalg.inv(spread + slack)
+            spread = torch.einsum("pnd,pne->pde", mean_offset, weighted_offset)
+            inverse_spread = torch.linalg.inv(spread + slack)
+            lever = weighted_offset @ inverse_spread
         if is_solid is not None:
             lever = lever * is_solid[:, None, None]
         return cls(grid, position, stencil, weight_sum, lever)
@@ -83,7 +86,8 @@ class RestShape:
             gradient = torch.einsum("pnd,pne->pde", mean_offset, self.lever)  # F - 1
             strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
         components = strain.flatten(1)[:, [0, 1, 3]]
-        return (components / UNIT).tanh()
+        scaled = components / UNIT
+        return scaled.tanh()
 
 
 def first_frame(given: Batch) -> Tensor:
@@ -112,8 +116,12 @@ def _relative_means(
 
     ``value`` has shape [particle, channel], the result shape [particle, 9, channel].
     """
-    channels = value.shape[1]
-    mean = grid.spread(stencil, value, len(weight_sum)) / weight_sum.clamp(min=1e-6)
-    by_node = mean.permute(0, 2, 3, 1).reshape(-1, channels)
+    particles, channels = value.shape
+    layers = len(weight_sum)
+    sums = grid.spread(stencil, value, layers)
+    mean = sums / weight_sum.clamp(min=1e-6)
+    by_node = mean.permute(0, 2, 3, 1)
+    by_node = by_node.reshape(-1, channels)
     nearby = by_node.index_select(0, stencil.node)
-    return nearby.view(len(value), 9, -1) - value[:, None]
+    nearby = nearby.view(particles, 9, -1)
+    return nearby - value[:, None]

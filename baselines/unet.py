@@ -45,19 +45,21 @@ class Frame(nn.Module):
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the field with its frame."""
-        return pad(pad(field, self.wrapped, mode="circular"), self.walled)
+        with_ends = pad(field, self.wrapped, mode="circular")
+        return pad(with_ends, self.walled)
 
 
 def convolve_three(
     inputs: int, outputs: int, periodic: Sequence[bool], *, stride: int = 1
 ) -> nn.Module:
     """Return a convolution over three nodes along each axis of a grid."""
-    convolution = CONVOLUTIONS[len(periodic)]
+    dimension = len(periodic)
+    convolution = CONVOLUTIONS[dimension]
     if not any(periodic):
         return convolution(inputs, outputs, 3, stride=stride, padding=1)
-    return nn.Sequential(
-        Frame(periodic), convolution(inputs, outputs, 3, stride=stride)
-    )
+    frame = Frame(periodic)
+    layer = convolution(inputs, outputs, 3, stride=stride)
+    return nn.Sequential(frame, layer)
 
 
 class ResidualBlock(nn.Module):
@@ -70,12 +72,14 @@ class ResidualBlock(nn.Module):
         self.second = convolve_three(outputs, outputs, periodic)
         self.shortcut: nn.Module = nn.Identity()
         if inputs != outputs:
-            self.shortcut = CONVOLUTIONS[len(periodic)](inputs, outputs, 1)
+            convolution = CONVOLUTIONS[len(periodic)]
+            self.shortcut = convolution(inputs, outputs, 1)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the field after the block, shape [window, outputs, x node, y node]."""
         hidden = self.first(gelu(field))
-        residual: Tensor = self.second(gelu(self.norm(hidden)))
+        hidden = self.norm(hidden)
+        residual: Tensor = self.second(gelu(hidden))
         shortcut: Tensor = self.shortcut(field)
         return residual + shortcut
 
@@ -98,8 +102,9 @@ class UNet(nn.Module):
         periodic: Sequence[bool] = (False, False),
     ) -> None:
         super().__init__()
-        convolution = CONVOLUTIONS[len(periodic)]
-        transposed = TRANSPOSED[len(periodic)]
+        dimension = len(periodic)
+        convolution = CONVOLUTIONS[dimension]
+        transposed = TRANSPOSED[dimension]
         fine = width
         middle = 2 * width
         coarse = 4 * width
@@ -109,10 +114,9 @@ class UNet(nn.Module):
         self.down_middle = ResidualBlock(middle, middle, periodic)
         self.halve_fine = convolution(fine, middle, 2, stride=2)
         self.halve_middle = convolution(middle, coarse, 2, stride=2)
-        self.bottom = nn.Sequential(
-            ResidualBlock(coarse, coarse, periodic),
-            ResidualBlock(coarse, coarse, periodic),
-        )
+        first_block = ResidualBlock(coarse, coarse, periodic)
+        second_block = ResidualBlock(coarse, coarse, periodic)
+        self.bottom = nn.Sequential(first_block, second_block)
         self.double_coarse = transposed(coarse, middle, 2, stride=2)
         self.double_middle = transposed(middle, fine, 2, stride=2)
         self.up_middle = ResidualBlock(2 * middle, middle, periodic)
@@ -127,19 +131,25 @@ class UNet(nn.Module):
         In three dimensions there is an axis of z nodes too. The number of nodes along
         each axis is a multiple of 4.
         """
-        fine = self.down_fine(self.begin(field))
-        middle = self.down_middle(self.halve_fine(fine))
-        coarse = self.bottom(self.halve_middle(middle))
+        fine = self.begin(field)
+        fine = self.down_fine(fine)
+        middle = self.halve_fine(fine)
+        middle = self.down_middle(middle)
+        coarse = self.halve_middle(middle)
+        coarse = self.bottom(coarse)
 
         doubled = self.double_coarse(coarse)
-        middle = self.up_middle(torch.cat([doubled, middle], dim=1))
+        both = torch.cat([doubled, middle], dim=1)
+        middle = self.up_middle(both)
         doubled = self.double_middle(middle)
-        fine = self.up_fine(torch.cat([doubled, fine], dim=1))
+        both = torch.cat([doubled, fine], dim=1)
+        fine = self.up_fine(both)
 
         # Every frame adds the output to velocities: the three digits of bfloat16 are
         # too few for that.
         with torch.autocast(field.device.type, enabled=False):
-            output: Tensor = self.end(gelu(fine.to(field.dtype)))
+            fine = fine.to(field.dtype)
+            output: Tensor = self.end(gelu(fine))
         return output
 
 
@@ -162,13 +172,14 @@ class ContextNetwork(nn.Module):
             convolve_three(width, width, periodic),
             nn.GELU(),
         )
-        self.numbers = nn.Sequential(
-            nn.Linear(width, width), nn.GELU(), nn.Linear(width, outputs)
-        )
+        hidden = nn.Linear(width, width)
+        last = nn.Linear(width, outputs)
+        self.numbers = nn.Sequential(hidden, nn.GELU(), last)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the numbers, shape [window, outputs]."""
         encoded = self.fields(field)
-        box_mean = encoded.flatten(2).mean(dim=2)
+        by_channel = encoded.flatten(2)
+        box_mean = by_channel.mean(dim=2)
         numbers: Tensor = self.numbers(box_mean)
         return numbers.to(field.dtype)

@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -176,34 +177,18 @@ def make_entry(size: Size, target: Path, number: int, *, first: int) -> None:
         first: number of the first entry on that data set, which supersedes others.
     """
     rng = np.random.Generator(np.random.PCG64(number))
-    place = (size.split, size.name, f"model-{number}")
+    method = f"model-{number}"
     seeds: list[int | None] = [None]
     if number % 5 == 0:
         seeds = list(range(SEEDS))
-    flags: tuple[EntryFlag, ...] = ()
-    if number % 7 == 0:
-        flags = (EntryFlag(name="physics", reasons=("made up",)),)
 
     cards = []
     for i in range(len(seeds)):
         quality = 10.0 ** rng.uniform(-1.5, 0.3)
-        cards.append(make_card(size, place[2], number * SEEDS + i, quality))
-
-    files = []
+        card = make_card(size, method, number * SEEDS + i, quality)
+        cards.append(card)
     predictions = []
-    tallies = []
-    paths = score_paths(place, seeds)
-    for seed, card, inner_path in zip(seeds, cards, paths, strict=True):
-        path = target / inner_path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_statistics(card, path)
-        tallies.append(read_score_file(path).scores.tallies)
-        scored_file = ScoredFile(
-            sha256=file_sha256(path),
-            predictions_sha256=card.predictions_sha256,
-            flags=flags,
-        )
-        files.append(scored_file)
+    for seed, card in zip(seeds, cards, strict=True):
         prediction = Prediction(
             seed=seed,
             sha256=card.predictions_sha256,
@@ -211,60 +196,97 @@ def make_entry(size: Size, target: Path, number: int, *, first: int) -> None:
             bytes=1_000_000,
         )
         predictions.append(prediction)
+    place = (size.split, size.name, method)
+    paths = [target / inner_path for inner_path in score_paths(place, seeds)]
+    score = write_scores(cards, paths, number)
     if number == first:
         write_references(cards[0], Folder(target))
 
-    status = Status.ACTIVE
-    successor = None
-    reason = ""
-    if number % 13 == 12:
-        status = Status.SUPERSEDED
-        successor = f"model-{first}"
-        reason = "made up"
-    elif number % 11 == 10:
-        status = Status.WITHDRAWN
-        reason = "made up"
-
-    solver_seconds = None
-    if number % 3:
-        solver_seconds = 0.05
+    status, successor, reason = make_status(number, first=first)
     header = cards[0].header
+    parameters = int(10.0 ** rng.uniform(4, 8))
+    cost = make_cost(rng, number)
     entry = Entry(
         format=2,
         split=size.split,
         size=size.name,
-        method=place[2],
+        method=method,
         name=f"{NAMES[number % len(NAMES)]} {number}",
         authors=("A. Author", "B. <script>alert(1)</script>", f"C. {number}"),
         affiliation="An institute",
-        code=f"https://example.org/{place[2]}",
+        code=f"https://example.org/{method}",
         date=datetime.date(2026, 1, 1) + datetime.timedelta(days=number),
         notes="Made up. " * (number % 9),
         training="a little noise",
         budget=EntryBudget(windows=1000 * number, cpu_hours=0.25),
-        parameters=int(10.0 ** rng.uniform(4, 8)),
+        parameters=parameters,
         hardware="none",
         command=f"python benchmarks/board.py  # number {number}",
-        cost=EntryCost(
-            seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
-            device="a machine",
-            solver_seconds_per_frame=solver_seconds,
-        ),
+        cost=cost,
         status=status,
         superseded_by=successor,
         reason=reason,
         dataset=DataSet(version=header.dataset_version, sha256=header.dataset_sha256),
         predictions=tuple(predictions),
-        score=ScoreBlock(
-            lagbench="0.0.0",
-            dataset_sha256=header.dataset_sha256,
-            ranking_metric=cards[0].ranking,
-            files=tuple(files),
-            metrics=summarise(combine(tallies)),
-        ),
+        score=score,
     )
-    (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)
-    (target / entry.yaml_path).write_bytes(entry_bytes(entry))
+    path = target / entry.yaml_path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(entry_bytes(entry))
+
+
+def write_scores(
+    cards: Sequence[ScoreCard], paths: Sequence[Path], number: int
+) -> ScoreBlock:
+    """Write the score files of a made-up entry; return what the entry says of them."""
+    flags: tuple[EntryFlag, ...] = ()
+    if number % 7 == 0:
+        flags = (EntryFlag(name="physics", reasons=("made up",)),)
+    files = []
+    tallies = []
+    for card, path in zip(cards, paths, strict=True):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_statistics(card, path)
+        score_file = read_score_file(path)
+        tallies.append(score_file.scores.tallies)
+        scored_file = ScoredFile(
+            sha256=file_sha256(path),
+            predictions_sha256=card.predictions_sha256,
+            flags=flags,
+        )
+        files.append(scored_file)
+    return ScoreBlock(
+        lagbench="0.0.0",
+        dataset_sha256=cards[0].header.dataset_sha256,
+        ranking_metric=cards[0].ranking,
+        files=tuple(files),
+        metrics=summarise(combine(tallies)),
+    )
+
+
+def make_status(number: int, *, first: int) -> tuple[Status, str | None, str]:
+    """Return the status of a made-up entry, its successor and the reason.
+
+    Most entries are active, some superseded by the first one, some withdrawn.
+    """
+    if number % 13 == 12:
+        return Status.SUPERSEDED, f"model-{first}", "made up"
+    if number % 11 == 10:
+        return Status.WITHDRAWN, None, "made up"
+    return Status.ACTIVE, None, ""
+
+
+def make_cost(rng: np.random.Generator, number: int) -> EntryCost:
+    """Return the cost of a made-up entry; a third have no time of the solver."""
+    solver_seconds = None
+    if number % 3:
+        solver_seconds = 0.05
+    seconds = 10.0 ** rng.uniform(-3, 0)
+    return EntryCost(
+        seconds_per_frame=float(f"{seconds:.4g}"),
+        device="a machine",
+        solver_seconds_per_frame=solver_seconds,
+    )
 
 
 def make_card(size: Size, method: str, seed: int, quality: float) -> ScoreCard:

@@ -49,8 +49,12 @@ class Conventional:
     def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
         """Take the memory and load the particles."""
         self.p = parameters
+        # numbers of the nodes on the walls, and of those beside them in the box
         self.low = parameters.wall
         self.high = parameters.grid - parameters.wall
+        self.first = self.low + 1
+        self.last = self.high - 1
+        self.inside = (self.first, self.high)
         self.dx = 1.0 / parameters.grid
         top = WALLS.index("top")
         self.lid = float(state.wall_velocity[top, 0])
@@ -129,22 +133,22 @@ class Conventional:
         # The ghost nodes give their sums to the nodes inside the walls.
         flip = ti.Vector([-1.0, -1.0])
         for k in range(self.low, self.high + 1):
-            inside_left = ti.Vector([self.low + 1, k])
+            inside_left = ti.Vector([self.first, k])
             left = ti.Vector([self.low, k])
             self.fold(inside_left, left, flip, 0.0)
-            inside_right = ti.Vector([self.high - 1, k])
+            inside_right = ti.Vector([self.last, k])
             right = ti.Vector([self.high, k])
             self.fold(inside_right, right, flip, 0.0)
-        for i in range(self.low + 1, self.high):
-            inside_bottom = ti.Vector([i, self.low + 1])
+        for i in range(self.first, self.high):
+            inside_bottom = ti.Vector([i, self.first])
             bottom = ti.Vector([i, self.low])
             self.fold(inside_bottom, bottom, flip, 0.0)
-            inside_top = ti.Vector([i, self.high - 1])
+            inside_top = ti.Vector([i, self.last])
             top = ti.Vector([i, self.high])
             self.fold(inside_top, top, flip, self.lid)
 
         # Momentum becomes velocity, mass density.
-        for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
+        for i, k in ti.ndrange(self.inside, self.inside):
             mass = self.m[i, k]
             if mass > 0.0:
                 self.gv[i, k] /= mass
@@ -152,23 +156,23 @@ class Conventional:
                 self.m[i, k] = mass / (self.p.density * self.dx * self.dx)
             else:
                 self.q[i, k] = 1.0
-        for k in range(self.low + 1, self.high):
-            inside_left = ti.Vector([self.low + 1, k])
+        for k in range(self.first, self.high):
+            inside_left = ti.Vector([self.first, k])
             left = ti.Vector([self.low, k])
             self.mirror(left, inside_left, 0.0)
-            inside_right = ti.Vector([self.high - 1, k])
+            inside_right = ti.Vector([self.last, k])
             right = ti.Vector([self.high, k])
             self.mirror(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            inside_bottom = ti.Vector([i, self.low + 1])
+            inside_bottom = ti.Vector([i, self.first])
             bottom = ti.Vector([i, self.low])
             self.mirror(bottom, inside_bottom, 0.0)
-            inside_top = ti.Vector([i, self.high - 1])
+            inside_top = ti.Vector([i, self.last])
             top = ti.Vector([i, self.high])
             self.mirror(top, inside_top, self.lid_at(i))
 
         # Pressure and viscosity accelerate the nodes.
-        for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
+        for i, k in ti.ndrange(self.inside, self.inside):
             q = ti.static(self.q)
             across = q[i + 1, k] - q[i - 1, k]
             along = q[i, k + 1] - q[i, k - 1]
@@ -182,20 +186,20 @@ class Conventional:
             neighbours = v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1]
             laplacian = neighbours - 4.0 * v[i, k]
             self.ga[i, k] = self.pressure * gradient + self.diffusion * laplacian
-        for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
+        for i, k in ti.ndrange(self.inside, self.inside):
             self.gv[i, k] += self.ga[i, k]
-        for k in range(self.low + 1, self.high):
-            inside_left = ti.Vector([self.low + 1, k])
+        for k in range(self.first, self.high):
+            inside_left = ti.Vector([self.first, k])
             left = ti.Vector([self.low, k])
             self.mirror_velocity(left, inside_left, 0.0)
-            inside_right = ti.Vector([self.high - 1, k])
+            inside_right = ti.Vector([self.last, k])
             right = ti.Vector([self.high, k])
             self.mirror_velocity(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            inside_bottom = ti.Vector([i, self.low + 1])
+            inside_bottom = ti.Vector([i, self.first])
             bottom = ti.Vector([i, self.low])
             self.mirror_velocity(bottom, inside_bottom, 0.0)
-            inside_top = ti.Vector([i, self.high - 1])
+            inside_top = ti.Vector([i, self.last])
             top = ti.Vector([i, self.high])
             self.mirror_velocity(top, inside_top, self.lid_at(i))
 
@@ -208,7 +212,7 @@ class Conventional:
         the corners.
         """
         speed = self.lid
-        if i == self.low + 1 or i == self.high - 1:
+        if i == self.first or i == self.last:
             speed = 0.5 * self.lid
         if i == self.low or i == self.high:
             speed = 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,11 +82,14 @@ def list_command(
 
 def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
     """Show the sizes of one split and the references that were measured on them."""
+    # the table of all splits needs no references, which take longer to load
+    from .reference_scores import measured_references, print_references
+
     name, folder, registry = locate_split(split, root=root)
     entry = registry.split(name)
     sizes = [registry.size(name, size) for size in entry.sizes]
     overviews = [overview(size, folder) for size in sizes]
-    references = {size.name: _measured_references(size) for size in sizes}
+    references = {size.name: measured_references(size) for size in sizes}
     if as_json:
         print_json({"root": folder, "sizes": overviews, "references": references})
         return
@@ -97,46 +100,9 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
     for line in (*LEGEND, *_describe_times(overviews)):
         print_line(line)
     print_line("")
-    _print_references(sizes, references)
+    print_references(sizes, references)
     print_line(f"more: lagbench info {split}")
     print_line(f"data sets live in {url_of(folder) or folder}")
-
-
-def _measured_references(size: Size) -> dict[str, float]:
-    """Return the mean ranking score of each reference that was measured, by name."""
-    # the table of all splits needs no metrics, which take longer to load
-    from lagbench.metrics.table import ranking_metric
-    from lagbench.references.shipped import shipped
-
-    ranking = ranking_metric(size)
-    means = {}
-    for name, reference in (shipped(size) or {}).items():
-        means[name] = reference.scores[ranking].mean
-    return means
-
-
-def _print_references(
-    sizes: Sequence[Size], references: Mapping[str, Mapping[str, float]]
-) -> None:
-    """Print the ranking scores of the references, a column for each size."""
-    from lagbench.metrics.table import ranking_metric
-    from lagbench.references.table import CLASSICAL, REFERENCES
-
-    if not any(references.values()):
-        print_line("references: none recorded; they are measured with each score")
-        return
-    rows = []
-    for name in REFERENCES:
-        cells = []
-        for size in sizes:
-            value = references[size.name].get(name)
-            cells.append("-" if value is None else f"{value:.3g}")
-        if any(cell != "-" for cell in cells):
-            kind = "classical" if name in CLASSICAL else "naive"
-            rows.append((name, kind, *cells))
-    columns = ("reference", "kind", *(size.name for size in sizes))
-    print_line(f"{ranking_metric(sizes[0])} of the references, less is better")
-    print_table("", columns, rows, is_narrow=True)
 
 
 def _list_overviews(folder: Path) -> list[Overview]:

@@ -25,48 +25,56 @@ from .solver_bench import SolverBench, bench_apart
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
 
+WeightsArgument = Annotated[
+    Path, typer.Argument(metavar="FILE", help="weights.pt, safetensors, or ONNX.")
+]
+PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]
+OnnxSplitOption = Annotated[
+    str | None, option("--split NAME", "Split to predict: of an ONNX file only.")
+]
+PredictedSizeOption = Annotated[
+    str | None,
+    option("--size NAME", "Size to predict; by default that of the training."),
+]
+SubsetOption = Annotated[
+    str, option("--subset NAME", "test, or shift, which lies outside train.")
+]
+ModelChangesOption = Annotated[
+    list[str] | None,
+    option(
+        "--set KEY=VALUE",
+        "Change the model, as in model.average=true; repeatable.",
+    ),
+]
+BatchOption = Annotated[
+    int | None,
+    option(
+        "--batch N",
+        "Scenarios to predict together; by default 1 on a CPU, all on a GPU.",
+        min=1,
+    ),
+]
+MethodOption = Annotated[
+    str | None, option("--method NAME", "Name of the method on a leaderboard.")
+]
+BenchFlag = Annotated[
+    bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
+]
+
 
 def predict_command(
-    checkpoint: Annotated[
-        Path, typer.Argument(metavar="FILE", help="weights.pt, safetensors, or ONNX.")
-    ],
-    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
-        "predictions.nc"
-    ),
-    split: Annotated[
-        str | None, option("--split NAME", "Split to predict: of an ONNX file only.")
-    ] = None,
-    size: Annotated[
-        str | None,
-        option("--size NAME", "Size to predict; by default that of the training."),
-    ] = None,
-    subset: Annotated[
-        str, option("--subset NAME", "test, or shift, which lies outside train.")
-    ] = "test",
-    settings: Annotated[
-        list[str] | None,
-        option(
-            "--set KEY=VALUE",
-            "Change the model, as in model.average=true; repeatable.",
-        ),
-    ] = None,
+    checkpoint: WeightsArgument,
+    output: PredictionsOption = Path("predictions.nc"),
+    split: OnnxSplitOption = None,
+    size: PredictedSizeOption = None,
+    subset: SubsetOption = "test",
+    settings: ModelChangesOption = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
-    batch: Annotated[
-        int | None,
-        option(
-            "--batch N",
-            "Scenarios to predict together; by default 1 on a CPU, all on a GPU.",
-            min=1,
-        ),
-    ] = None,
-    method: Annotated[
-        str | None, option("--method NAME", "Name of the method on a leaderboard.")
-    ] = None,
-    bench: Annotated[
-        bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
-    ] = True,
+    batch: BatchOption = None,
+    method: MethodOption = None,
+    bench: BenchFlag = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

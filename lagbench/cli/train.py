@@ -38,52 +38,61 @@ if TYPE_CHECKING:
 
 SECONDS_PER_LINE = 10.0  # time between two lines of progress that go to a file [s]
 
+BaselineOption = Annotated[
+    str | None,
+    option("--baseline NAME", "Reference model, as in gns; see docs/baselines.md."),
+]
+RecipeOption = Annotated[
+    str | None,
+    option("--recipe NAME", "Variant of the recipe, as in short; or a YAML file."),
+]
+RecipeChangesOption = Annotated[
+    list[str] | None,
+    option(
+        "--set KEY=VALUE",
+        "Change the recipe, as in training.steps=100; repeatable.",
+    ),
+]
+SeedOption = Annotated[
+    int | None, option("--seed N", "Seed of all random numbers.", min=0)
+]
+StartOption = Annotated[
+    Path | None,
+    option(
+        "--start FILE",
+        "weights.pt to start from; they may be of another size.",
+    ),
+]
+RunFolderOption = Annotated[
+    Path | None,
+    option(
+        "--output -o FOLDER",
+        "Folder of the run; by default in runs/, named after recipe, baseline and "
+        "seed.",
+    ),
+]
+FreshFlag = Annotated[
+    bool, option("--fresh", "Start anew and replace an earlier training.")
+]
+ProcessesOption = Annotated[
+    int, option("--processes N", "Processes, each with a device (DDP).", min=1)
+]
+
 
 @accept_split
 def train_command(
     split: str,
-    baseline: Annotated[
-        str | None,
-        option("--baseline NAME", "Reference model, as in gns; see docs/baselines.md."),
-    ] = None,
+    baseline: BaselineOption = None,
     size: PresentSizeOption = None,
-    recipe: Annotated[
-        str | None,
-        option("--recipe NAME", "Variant of the recipe, as in short; or a YAML file."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        option(
-            "--set KEY=VALUE",
-            "Change the recipe, as in training.steps=100; repeatable.",
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, option("--seed N", "Seed of all random numbers.", min=0)
-    ] = None,
-    start: Annotated[
-        Path | None,
-        option(
-            "--start FILE",
-            "weights.pt to start from; they may be of another size.",
-        ),
-    ] = None,
+    recipe: RecipeOption = None,
+    settings: RecipeChangesOption = None,
+    seed: SeedOption = None,
+    start: StartOption = None,
     root: RootOption = None,
-    output: Annotated[
-        Path | None,
-        option(
-            "--output -o FOLDER",
-            "Folder of the run; by default in runs/, named after recipe, baseline and "
-            "seed.",
-        ),
-    ] = None,
-    fresh: Annotated[
-        bool, option("--fresh", "Start anew and replace an earlier training.")
-    ] = False,
+    output: RunFolderOption = None,
+    fresh: FreshFlag = False,
     device: DeviceOption = "auto",
-    processes: Annotated[
-        int, option("--processes N", "Processes, each with a device (DDP).", min=1)
-    ] = 1,
+    processes: ProcessesOption = 1,
     threads: ThreadsOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,

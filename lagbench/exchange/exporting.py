@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -123,7 +123,8 @@ def export(
     file_of = {}
     for subset in HASHED_SUBSETS:
         file_of[subset] = target / f"{subset}{ENDINGS[form]}"
-    _check_target(target, list(file_of.values()), force=force)
+    paths = tuple(file_of.values())
+    _check_target(target, paths, force=force)
 
     frames_of = _frames_by_subset(entry, folder)
     statistics, dataset_sha256 = _recorded_statistics(entry, folder)
@@ -137,7 +138,9 @@ def export(
         has_unit_box = from_walls is False and form is Format.LAGRANGEBENCH_H5
         _check_walls(entry, is_closed=is_closed, has_unit_box=has_unit_box)
         walls = WallParticles(entry.bounds, spacing)
-    wall_thickness = None if walls is None else walls.thickness
+    wall_thickness = None
+    if walls is not None:
+        wall_thickness = walls.thickness
     origin = (0.0,) * entry.dimension
     if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
         origin = _lower_corner(entry, wall_thickness or 0.0)
@@ -149,14 +152,13 @@ def export(
     meter.begin("exporting", total=len(frames_of), scenarios=scenario_count)
     shapes: dict[str, list[tuple[int, int]]] = {}
     for subset, frames in frames_of.items():
+        path = file_of[subset]
         runs = _read_runs(frames, form, entry.frame_interval, walls)
         if form is Format.GNS_NPZ:
-            shapes[subset] = gns_npz.write(file_of[subset], runs)
+            shapes[subset] = gns_npz.write(path, runs)
         else:
             shortest = min(frames.values())
-            shapes[subset] = _write_h5(
-                file_of[subset], runs, length=shortest, origin=origin
-            )
+            shapes[subset] = _write_h5(path, runs, length=shortest, origin=origin)
         meter.count(1, scenarios=len(frames))
 
     info = ExportInfo(
@@ -169,26 +171,49 @@ def export(
         is_free_slip=_is_free_slip(entry),
         wall_thickness=wall_thickness,
     )
-    metadata_path = write_metadata(target, describe_export(entry, form, shapes, info))
+    metadata = describe_export(entry, form, shapes, info)
+    metadata_path = write_metadata(target, metadata)
+    written = (*paths, metadata_path)
+    return _summarise(entry, form, target, written, frames_of, shapes)
 
+
+def _summarise(
+    size: Size,
+    form: Format,
+    folder: Path,
+    files: tuple[Path, ...],
+    frames_of: Mapping[str, Mapping[Path, int]],
+    shapes: Mapping[str, Sequence[tuple[int, int]]],
+) -> ExportResult:
+    """Return what was written.
+
+    Args:
+        size: the data set.
+        form: format of the files.
+        folder: folder of the files.
+        files: the files, metadata.json too.
+        frames_of: frames of each scenario file by subset.
+        shapes: frames and particles of each trajectory that was written, by subset.
+    """
     trajectory_counts = {}
     frame_counts = {}
     left_out = 0
-    for subset, subset_shapes in shapes.items():
-        trajectory_counts[subset] = len(subset_shapes)
-        frame_counts[subset] = sum(frames for frames, _ in subset_shapes)
-        left_out += sum(frames_of[subset].values()) - frame_counts[subset]
-    written = (*file_of.values(), metadata_path)
+    for subset, trajectories in shapes.items():
+        written_frames = sum(frames for frames, _ in trajectories)
+        present_frames = sum(frames_of[subset].values())
+        trajectory_counts[subset] = len(trajectories)
+        frame_counts[subset] = written_frames
+        left_out += present_frames - written_frames
     return ExportResult(
         format=form.value,
-        split=entry.split,
-        size=entry.name,
-        folder=target,
-        files=written,
+        split=size.split,
+        size=size.name,
+        folder=folder,
+        files=files,
         trajectories=trajectory_counts,
         frames=frame_counts,
         left_out=left_out,
-        bytes=sum(path.stat().st_size for path in written),
+        bytes=sum(path.stat().st_size for path in files),
     )
 
 

@@ -336,46 +336,60 @@ def _seconds_of_rollout() -> float:
 
 def _board_targets(folder: Path) -> list[Target]:
     """Return the targets on leaderboards."""
-    board = ("--board", "b")
-    check = ("leaderboard", "check", *board)
-    show = ("leaderboard", "show", "--json", *board)
-    build = ("leaderboard", "build", *board)
-    # Checking all of a board takes ten times as long as showing it.
-    readers = [check, *[show] * 6, *[build] * 3]
-    show_season = ("season", "show", SEASON, *board)
-    run_season = ("season", "run", SEASON, "--check", *board, "-q")
-    season_readers = [check, *[show_season] * 8, run_season]
+    return [*_season_targets(), *_entry_targets(), *_record_targets(folder)]
+
+
+BOARD = ("--board", "b")
+CHECK = ("leaderboard", "check", *BOARD)
+SHOW = ("leaderboard", "show", "--json", *BOARD)
+BUILD = ("leaderboard", "build", *BOARD)
+# Checking all of a board takes ten times as long as showing it.
+BOARD_READERS = [CHECK, *[SHOW] * 6, *[BUILD] * 3]
+BOARD_TEXT = (*YAML, *YAML, *BYTES, *PLACES)
+HASHED_FILE = (*BYTES, *PLACES[:7])
+
+
+def _season_targets() -> list[Target]:
+    """Return the targets on the files of a blind season."""
+    show = ("season", "show", SEASON, *BOARD)
+    run = ("season", "run", SEASON, "--check", *BOARD, "-q")
+    readers = [CHECK, *[show] * 8, run]
     season = f"b/{SEASONS}/{SEASON}"
-    vortices = "decaying-vortices/tiny/straight"
-    text_mutations = (*YAML, *YAML, *BYTES, *PLACES)
-    hashed_mutations = (*BYTES, *PLACES[:7])
-    submission = (
-        *("submit", "p.nc", "--from", "meta.yaml", "--weights", "model.onnx"),
-        *("--replace", *board, "-q"),
-    )
-    targets = [
+    return [
         Target(
             name="season.yaml",
             source="board",
             victim=f"{season}/season.yaml",
-            mutations=text_mutations,
-            commands=season_readers,
+            mutations=BOARD_TEXT,
+            commands=readers,
             weight=10,
         ),
         Target(
             name="scores.yaml of a season",
             source="board",
             victim=f"{season}/scores.yaml",
-            mutations=text_mutations,
-            commands=season_readers,
+            mutations=BOARD_TEXT,
+            commands=readers,
             weight=8,
         ),
+    ]
+
+
+def _entry_targets() -> list[Target]:
+    """Return the targets on an entry with a model, and on the lock of its board."""
+    vortices = "decaying-vortices/tiny/straight"
+    reproduce = ("leaderboard", "reproduce", "--all", *BOARD, "-q")
+    submit = (
+        *("submit", "p.nc", "--from", "meta.yaml", "--weights", "model.onnx"),
+        *("--replace", *BOARD, "-q"),
+    )
+    return [
         Target(
             name="ONNX model on a board",
             source="board",
             victim=f"b/{WEIGHTS}/{vortices}_0.onnx",
-            mutations=hashed_mutations,
-            commands=[check, ("leaderboard", "reproduce", "--all", *board, "-q")],
+            mutations=HASHED_FILE,
+            commands=[CHECK, reproduce],
             weight=4,
             is_hashed=True,
         ),
@@ -383,8 +397,8 @@ def _board_targets(folder: Path) -> list[Target]:
             name="entry with a model",
             source="board",
             victim=f"b/{SUBMISSIONS}/{vortices}.yaml",
-            mutations=text_mutations,
-            commands=readers,
+            mutations=BOARD_TEXT,
+            commands=BOARD_READERS,
             weight=6,
         ),
         Target(
@@ -392,32 +406,38 @@ def _board_targets(folder: Path) -> list[Target]:
             source="board",
             victim="b/.lock",
             mutations=(*PLACES, empty_and_locked),
-            commands=[submission, build],
+            commands=[submit, BUILD],
             weight=3,
         ),
     ]
+
+
+def _record_targets(folder: Path) -> list[Target]:
+    """Return the targets on the records of a board, and on a score file."""
+    targets = []
     records = (
-        (SHIFT, "shift record", 8),
-        (VERIFIED, "record of costs", 8),
-        (GATES, "record of gates", 8),
+        (SHIFT, "shift record"),
+        (VERIFIED, "record of costs"),
+        (GATES, "record of gates"),
     )
-    for victim, name, weight in records:
+    for victim, name in records:
         target = Target(
             name=name,
             source="records",
             victim=f"b/{victim}",
-            mutations=text_mutations,
-            commands=readers,
-            weight=weight,
+            mutations=BOARD_TEXT,
+            commands=BOARD_READERS,
+            weight=8,
         )
         targets.append(target)
-    score_file = sorted((folder / f"records/b/{SCORES}" / PLACE).glob("*.nc"))[0]
+    score_files = sorted((folder / f"records/b/{SCORES}" / PLACE).glob("*.nc"))
+    victim = score_files[0].relative_to(folder / "records")
     target = Target(
         name="score file",
         source="records",
-        victim=score_file.relative_to(folder / "records").as_posix(),
-        mutations=hashed_mutations,
-        commands=[check],
+        victim=victim.as_posix(),
+        mutations=HASHED_FILE,
+        commands=[CHECK],
         weight=2,
         is_hashed=True,
     )
