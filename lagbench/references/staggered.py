@@ -60,7 +60,8 @@ class StaggeredGrid:
             modes, rates = poisson_modes(count, periodic=box.periodic[axis])
             shape = [1] * box.dimension
             shape[axis] = count
-            eigenvalues += rates.reshape(shape) / self.spacing[axis] ** 2
+            rates_along_axis = rates.reshape(shape)
+            eigenvalues += rates_along_axis / self.spacing[axis] ** 2
             self._modes.append(modes)
         # The pressure is known up to a constant: its mean mode is left out.
         eigenvalues.flat[0] = np.inf
@@ -82,11 +83,16 @@ class StaggeredGrid:
         """Return where the first face of a component lies [length], shape [axis]."""
         offset = np.full(self.dimension, 0.5)
         offset[component] = 0.0
-        return np.asarray(np.asarray(self.box.low) + offset * self.spacing)
+        low = np.asarray(self.box.low)
+        return np.asarray(low + offset * self.spacing)
 
     def rest(self) -> Velocity:
         """Return the velocity of a fluid at rest [length/s]."""
-        return [np.zeros(self.face_shape(axis)) for axis in range(self.dimension)]
+        velocity = []
+        for component in range(self.dimension):
+            shape = self.face_shape(component)
+            velocity.append(np.zeros(shape))
+        return velocity
 
     # --- the equations ---------------------------------------------------------------
 
@@ -95,7 +101,8 @@ class StaggeredGrid:
         total = np.zeros(self.cells)
         for axis, values in enumerate(velocity):
             if self.box.periodic[axis]:
-                change = np.roll(values, -1, axis) - values
+                upper = np.roll(values, -1, axis)
+                change = upper - values
             else:
                 change = np.diff(values, axis=axis)
             total += change / self.spacing[axis]
@@ -106,18 +113,21 @@ class StaggeredGrid:
 
         ``u - grad p`` with ``lap p = div u``; walls stay impermeable.
         """
-        pressure = self._solve_poisson(self.divergence(velocity))
+        source = self.divergence(velocity)
+        pressure = self._solve_poisson(source)
         projected = []
         for axis, values in enumerate(velocity):
             h = self.spacing[axis]
             if self.box.periodic[axis]:
-                gradient = (pressure - np.roll(pressure, 1, axis)) / h
-                projected.append(values - gradient)
+                lower = np.roll(pressure, 1, axis)
+                gradient = (pressure - lower) / h
+                corrected = values - gradient
             else:
-                corrected = values.copy()
+                gradient = np.diff(pressure, axis=axis) / h
                 inner = _slice(self.dimension, axis, 1, -1)
-                corrected[inner] -= np.diff(pressure, axis=axis) / h
-                projected.append(corrected)
+                corrected = values.copy()
+                corrected[inner] -= gradient
+            projected.append(corrected)
         return projected
 
     def _solve_poisson(self, source: Floats) -> Floats:
@@ -150,19 +160,27 @@ class StaggeredGrid:
         """
         padded = []
         for component, values in enumerate(velocity):
-            padded.append(self._with_ghosts(values, component, wall_velocity))
-        result = []
+            ghosted = self._with_ghosts(values, component, wall_velocity)
+            padded.append(ghosted)
+        rates = []
         for component, ghosted in enumerate(padded):
             rate = viscosity * self._laplacian(ghosted)
             for axis in range(self.dimension):
                 rate -= self._flux_divergence(padded, component, axis)
             if force is not None:
                 rate += self._force_at_faces(np.asarray(force), component)
-            if not self.box.periodic[component]:
-                rate[_slice(self.dimension, component, None, 1)] = 0.0
-                rate[_slice(self.dimension, component, -1, None)] = 0.0
-            result.append(rate)
-        return result
+            self._stop_at_walls(rate, component)
+            rates.append(rate)
+        return rates
+
+    def _stop_at_walls(self, values: Floats, component: int) -> None:
+        """Set a component to 0 at the walls that it would cross."""
+        if self.box.periodic[component]:
+            return
+        low_wall = _slice(self.dimension, component, None, 1)
+        high_wall = _slice(self.dimension, component, -1, None)
+        values[low_wall] = 0.0
+        values[high_wall] = 0.0
 
     def _force_at_faces(self, force: Floats, component: int) -> Floats:
         """Return the acceleration at the faces of a component [length/s^2].
@@ -171,10 +189,13 @@ class StaggeredGrid:
         """
         layers = np.atleast_2d(force)[:, component]
         row_count = self.face_shape(component)[1]
-        row = np.minimum(np.arange(row_count), self.cells[1] - 1)
+        cell_count = self.cells[1]
+        rows = np.arange(row_count)
+        cell = np.minimum(rows, cell_count - 1)
+        layer = cell * len(layers) // cell_count
         shape = [1] * self.dimension
         shape[1] = row_count
-        at_rows = layers[row * len(layers) // self.cells[1]]
+        at_rows = layers[layer]
         return np.asarray(at_rows.reshape(shape))
 
     def _with_ghosts(
@@ -209,11 +230,12 @@ class StaggeredGrid:
     def _laplacian(self, padded: Floats) -> Floats:
         """Return lap u of a component with ghosts, without them [1/(length s)]."""
         core = (slice(1, -1),) * self.dimension
-        total = np.zeros(padded[core].shape)
+        here = padded[core]
+        total = np.zeros(here.shape)
         for axis in range(self.dimension):
             below = padded[_neighbour(self.dimension, axis, -1)]
             above = padded[_neighbour(self.dimension, axis, +1)]
-            change = below - 2.0 * padded[core] + above
+            change = below - 2.0 * here + above
             total += change / self.spacing[axis] ** 2
         return total
 
@@ -241,7 +263,8 @@ class StaggeredGrid:
             upper = _slice(dimension, axis, 1, count + 1)
             flux_below = carried_below * carrier[lower]
             flux_above = carried_above * carrier[upper]
-        return np.asarray((flux_above - flux_below) / self.spacing[axis])
+        change = flux_above - flux_below
+        return np.asarray(change / self.spacing[axis])
 
     def _at_edges(self, padded: Floats, *, axis: int, component: int) -> Floats:
         """Return u_axis half a cell before the faces of another component.
@@ -300,10 +323,12 @@ class StaggeredGrid:
         )
         for _ in range(steps):
             rate = rate_of(velocity)
-            predictor = self.project(_add(velocity, rate, dt))
+            guess = _add(velocity, rate, dt)
+            predictor = self.project(guess)
             later_rate = rate_of(predictor)
-            moved = _add(velocity, rate, 0.5 * dt)
-            velocity = self.project(_add(moved, later_rate, 0.5 * dt))
+            half_way = _add(velocity, rate, 0.5 * dt)
+            end = _add(half_way, later_rate, 0.5 * dt)
+            velocity = self.project(end)
         return velocity
 
     def step_count(
@@ -315,13 +340,19 @@ class StaggeredGrid:
         wall_velocity: Floats,
     ) -> int:
         """Return how many time steps a duration takes at the least [1]."""
-        speeds = [float(np.abs(values).max()) for values in velocity]
-        fastest = max([*speeds, float(np.abs(wall_velocity).max(initial=0.0))])
+        speeds = []
+        for values in velocity:
+            speed = np.abs(values)
+            speeds.append(float(speed.max()))
+        wall_speed = np.abs(wall_velocity)
+        speeds.append(float(wall_speed.max(initial=0.0)))
+        fastest = max(speeds)
         h = float(self.spacing.min())
         courant_steps = duration * fastest / (COURANT * h)
         viscous_share = VISCOUS_SHARE / (2 * self.dimension)
         viscous_steps = duration * viscosity / (viscous_share * h**2)
-        return max(1, int(np.ceil(max(courant_steps, viscous_steps))))
+        stable_steps = np.ceil(max(courant_steps, viscous_steps))
+        return max(1, int(stable_steps))
 
     # --- particles -------------------------------------------------------------------
 
@@ -346,30 +377,32 @@ class StaggeredGrid:
             wall_velocity: as in :meth:`acceleration`.
             corrections: how often the field is corrected.
         """
-        field = self.project(self._spread(position, velocity))
+        mean = self._spread(position, velocity)
+        field = self.project(mean)
         for _ in range(corrections):
             reached = self.at_particles(field, position, wall_velocity=wall_velocity)
             lacking = self._spread(position, velocity - reached)
-            field = self.project(_add(field, lacking, 1.0))
+            corrected = _add(field, lacking, 1.0)
+            field = self.project(corrected)
         return field
 
     def _spread(self, position: Floats, velocity: Floats) -> Velocity:
         """Return at each face the weighted mean of the particles around it."""
-        result = []
+        field = []
         for component in range(self.dimension):
+            particle_values = velocity[:, component]
             shape = self.face_shape(component)
             face_count = int(np.prod(shape))
             sums = np.zeros(face_count)
             weight = np.zeros(face_count)
-            for index, share in zip(*self._corners(position, component), strict=True):
-                weight += np.bincount(index, share, face_count)
-                sums += np.bincount(index, share * velocity[:, component], face_count)
+            faces, shares = self._corners(position, component)
+            for face, share in zip(faces, shares, strict=True):
+                weight += np.bincount(face, share, face_count)
+                sums += np.bincount(face, share * particle_values, face_count)
             values = fill_gaps(sums.reshape(shape), weight.reshape(shape))
-            if not self.box.periodic[component]:
-                values[_slice(self.dimension, component, None, 1)] = 0.0
-                values[_slice(self.dimension, component, -1, None)] = 0.0
-            result.append(values)
-        return result
+            self._stop_at_walls(values, component)
+            field.append(values)
+        return field
 
     def _corners(
         self, position: Floats, component: int
@@ -384,13 +417,18 @@ class StaggeredGrid:
         fraction = place - lower
         per_axis = []
         for axis, count in enumerate(shape):
-            rows = (lower[:, axis], lower[:, axis] + 1)
+            lower_row = lower[:, axis]
+            upper_row = lower_row + 1
             if self.box.periodic[axis]:
-                rows = tuple(np.mod(row, count) for row in rows)
+                lower_row = np.mod(lower_row, count)
+                upper_row = np.mod(upper_row, count)
             else:
-                rows = tuple(np.clip(row, 0, count - 1) for row in rows)
-            weights = (1.0 - fraction[:, axis], fraction[:, axis])
-            per_axis.append(tuple(zip(rows, weights, strict=True)))
+                lower_row = np.clip(lower_row, 0, count - 1)
+                upper_row = np.clip(upper_row, 0, count - 1)
+            upper_weight = fraction[:, axis]
+            lower_weight = 1.0 - upper_weight
+            ends = ((lower_row, lower_weight), (upper_row, upper_weight))
+            per_axis.append(ends)
         indices = []
         shares = []
         for corner in itertools.product(*per_axis):
@@ -420,8 +458,9 @@ class StaggeredGrid:
         result = np.empty(position.shape)
         for component, values in enumerate(velocity):
             padded = self._with_ghosts(values, component, wall_velocity)
+            distance = position - self.face_origin(component)
             # The lower ghost layer stands one cell before the first face.
-            place = (position - self.face_origin(component)) / self.spacing + 1.0
+            place = distance / self.spacing + 1.0
             result[:, component] = interpolate(padded, place)
         return result
 
@@ -444,9 +483,11 @@ class StaggeredGrid:
             wall_velocity: as in :meth:`acceleration`.
         """
         start = self.at_particles(before, position, wall_velocity=wall_velocity)
-        guess = self.box.inside(position + duration * start)
+        moved = position + duration * start
+        guess = self.box.inside(moved)
         end = self.at_particles(after, guess, wall_velocity=wall_velocity)
-        return self.box.inside(position + 0.5 * duration * (start + end))
+        moved = position + 0.5 * duration * (start + end)
+        return self.box.inside(moved)
 
 
 def poisson_modes(count: int, *, periodic: bool) -> tuple[Floats, Floats]:
@@ -470,12 +511,17 @@ def poisson_modes(count: int, *, periodic: bool) -> tuple[Floats, Floats]:
         theta = 2.0 * np.pi * wave / count
         phase = theta[:, None] * cell
         is_sine = (mode % 2 == 0) & (mode > 0)
-        modes = np.where(is_sine[:, None], np.sin(phase), np.cos(phase))
+        sines = np.sin(phase)
+        cosines = np.cos(phase)
+        modes = np.where(is_sine[:, None], sines, cosines)
     else:
         theta = np.pi * mode / count
-        modes = np.cos(theta[:, None] * (cell + 0.5))
-    modes /= np.sqrt(np.sum(modes**2, axis=1, keepdims=True))
-    return modes, 2.0 - 2.0 * np.cos(theta)
+        phase = theta[:, None] * (cell + 0.5)
+        modes = np.cos(phase)
+    square = np.sum(modes**2, axis=1, keepdims=True)
+    modes /= np.sqrt(square)
+    rates = 2.0 - 2.0 * np.cos(theta)
+    return modes, rates
 
 
 def interpolate(values: Floats, place: Floats) -> Floats:
@@ -490,13 +536,15 @@ def interpolate(values: Floats, place: Floats) -> Floats:
         Values, shape [point].
     """
     shape = values.shape
-    strides = np.cumprod((1, *shape[:0:-1]))[::-1]
+    last_axis_first = np.cumprod((1, *shape[:0:-1]))
+    strides = last_axis_first[::-1]
     flat = values.ravel()
     base = np.zeros(len(place), np.intp)
     fractions = []
     for axis, count in enumerate(shape):
         along = place[:, axis]
-        lower = np.clip(along.astype(np.intp), 0, count - 2)
+        row = along.astype(np.intp)
+        lower = np.clip(row, 0, count - 2)
         base += lower * strides[axis]
         fractions.append(along - lower)
     return _blend(flat, base, strides, fractions)
@@ -508,10 +556,13 @@ def _blend(
     """Return the linear blend over the axes that are left, first axis outermost."""
     if not fractions:
         return np.take(flat, base)
-    lower = _blend(flat, base, strides[1:], fractions[1:])
-    upper = _blend(flat, base + strides[0], strides[1:], fractions[1:])
+    fraction, *other_fractions = fractions
+    other_strides = strides[1:]
+    next_base = base + strides[0]
+    lower = _blend(flat, base, other_strides, other_fractions)
+    upper = _blend(flat, next_base, other_strides, other_fractions)
     upper -= lower
-    upper *= fractions[0]
+    upper *= fraction
     upper += lower
     return upper
 
@@ -522,7 +573,8 @@ def fill_gaps(sums: Floats, weight: Floats) -> Floats:
     Gaps close from their edges, layer by layer. Without any weight all values are 0.
     """
     has_value = weight > 1e-9
-    values = np.where(has_value, sums / np.where(has_value, weight, 1.0), 0.0)
+    divisor = np.where(has_value, weight, 1.0)
+    values = np.where(has_value, sums / divisor, 0.0)
     if not has_value.any():
         return values
     while not has_value.all():
@@ -543,14 +595,20 @@ def fill_gaps(sums: Floats, weight: Floats) -> Floats:
 
 def _add(velocity: Velocity, rate: Velocity, dt: float) -> Velocity:
     """Return ``velocity + dt rate``."""
-    return [values + dt * change for values, change in zip(velocity, rate, strict=True)]
+    later = []
+    for values, change in zip(velocity, rate, strict=True):
+        later.append(values + dt * change)
+    return later
 
 
 def _multiply_along(matrix: Floats, values: Floats, axis: int) -> Floats:
     """Return the product of a matrix and the columns of an array along an axis."""
     if values.ndim == 2:
-        return matrix @ values if axis == 0 else values @ matrix.T
-    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+        if axis == 0:
+            return matrix @ values
+        return values @ matrix.T
+    product = np.tensordot(matrix, values, (1, axis))
+    return np.moveaxis(product, 0, axis)
 
 
 def _slice(
@@ -565,5 +623,8 @@ def _slice(
 def _neighbour(dimension: int, axis: int, step: int) -> tuple[slice, ...]:
     """Return the index of the core of a padded array, moved by one along an axis."""
     index = [slice(1, -1)] * dimension
-    index[axis] = slice(None, -2) if step < 0 else slice(2, None)
+    if step < 0:
+        index[axis] = slice(None, -2)
+    else:
+        index[axis] = slice(2, None)
     return tuple(index)
