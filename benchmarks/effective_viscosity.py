@@ -46,7 +46,8 @@ def main() -> int:
         size = load().size("curl-noise", name)
         fits = []
         for scenario in size.subsets[options.subset]:
-            fits.append(_fit(size, options.root, scenario))
+            fit = _fit(size, options.root, scenario)
+            fits.append(fit)
         _print_fits(name, fits)
     return 0
 
@@ -65,34 +66,44 @@ def _print_fits(name: str, fits: Sequence[ViscosityFit]) -> None:
             f"{name}, frequency {frequency}: nu = {viscosity:.2e} length^2/s, "
             f"{energy_share:.0%} of E left"
         )
-    viscosity = np.median(np.concatenate(list(viscosities.values())))
-    energy_share = np.median(np.concatenate(list(energy_shares.values())))
+    viscosity = np.median([fit.viscosity for fit in fits])
+    energy_share = np.median([fit.energy_share for fit in fits])
     print(f"{name}: median nu = {viscosity:.2e} length^2/s, {energy_share:.0%} left")
 
 
 def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
     """Fit dE/dt = - nu * enstrophy to the energy E of a scenario."""
-    grid = Grid(size.task.score_grid.cells, size.task.score_grid.placement)
+    task = size.task
+    grid = Grid(task.score_grid.cells, task.score_grid.placement)
     (low, high), _ = size.bounds
-    full_weight = grid.full_weight(size.particles, (high - low) ** 2)
-    frame_count = size.task.input_frames + size.task.horizon
-    energy = []
-    enstrophy = []
-    with read_scenario(size.path(root, scenario)) as file:
+    area = (high - low) ** 2
+    full_weight = grid.full_weight(size.particles, area)
+    frame_count = task.input_frames + task.horizon
+    energies = []
+    enstrophies = []
+    path = size.path(root, scenario)
+    with read_scenario(path) as file:
         for frame in range(frame_count):
             position = file.read("position", frame).astype(np.float64)
             velocity = file.read("velocity", frame).astype(np.float64)
-            speed_squared = np.sum(velocity**2, axis=-1)
-            energy.append(0.5 * np.mean(speed_squared))
+            squared_speed = np.sum(velocity**2, axis=-1)
+            energy = 0.5 * np.mean(squared_speed)
+            energies.append(energy)
             node_fields = fields(position, velocity, grid, full=full_weight)
-            enstrophy.append(np.nanmean(node_fields.vorticity**2))
+            enstrophy = np.nanmean(node_fields.vorticity**2)
+            enstrophies.append(enstrophy)
         frequency = int(file.header.parameters["frequency"])
 
     # integral of the enstrophy up to each frame, and the energy lost up to it
-    dissipation = cumulative_trapezoid(enstrophy, dx=size.frame_interval, initial=0.0)
-    energy_loss = energy[0] - np.array(energy)
-    viscosity = dissipation @ energy_loss / (dissipation @ dissipation)
-    return ViscosityFit(frequency, float(viscosity), energy[-1] / energy[0])
+    interval = size.frame_interval
+    dissipation = cumulative_trapezoid(enstrophies, dx=interval, initial=0.0)
+    initial_energy = energies[0]
+    energy_loss = initial_energy - np.array(energies)
+    product = dissipation @ energy_loss
+    square = dissipation @ dissipation
+    viscosity = float(product / square)
+    energy_share = energies[-1] / initial_energy
+    return ViscosityFit(frequency, viscosity, energy_share)
 
 
 if __name__ == "__main__":

@@ -39,8 +39,11 @@ def plain_update(
 ) -> Tensor:
     """Return the edge update by the product of the whole concatenation."""
     sender, receiver = edge_index
-    features = torch.cat([edge, node[receiver], node[sender]], dim=1)
-    update: Tensor = self.rest(self.first(features))
+    receiver_node = node[receiver]
+    sender_node = node[sender]
+    features = torch.cat([edge, receiver_node, sender_node], dim=1)
+    hidden = self.first(features)
+    update: Tensor = self.rest(hidden)
     return update
 
 
@@ -60,11 +63,14 @@ def make_graph(count: int, windows: int) -> Tensor:
     Each window is a box with one particle in each cell of a lattice.
     """
     side = math.ceil(math.sqrt(count))
-    lattice = torch.cartesian_prod(torch.arange(side), torch.arange(side))[:count]
+    cell = torch.arange(side)
+    lattice = torch.cartesian_prod(cell, cell)
+    corner = lattice[:count]
     source = torch.Generator().manual_seed(0)
     offset = torch.rand(count * windows, 2, generator=source)
-    position = lattice.repeat(windows, 1) + offset
-    sample = torch.arange(windows).repeat_interleave(count)
+    position = corner.repeat(windows, 1) + offset
+    window = torch.arange(windows)
+    sample = window.repeat_interleave(count)
     edge_index: Tensor = radius_graph(position, RADIUS, sample)
     return edge_index
 
@@ -96,7 +102,8 @@ def make_step(options: argparse.Namespace) -> tuple[Callable[[], None], dict[str
     def step() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16):
             output, losses = model(node, edge_index, edge, source)
-        loss = nn.functional.mse_loss(output, target) + sum(losses.values())
+        error = nn.functional.mse_loss(output, target)
+        loss = error + sum(losses.values())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -132,11 +139,12 @@ def main() -> int:
     step()
     seconds = []
     for _ in range(options.steps):
-        start = time.process_time()
+        start_time = time.process_time()
         step()
-        seconds.append(time.process_time() - start)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    result = {"processor_seconds": min(seconds), "peak_bytes": peak, **counts}
+        seconds.append(time.process_time() - start_time)
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    peak_bytes = 1024 * usage.ru_maxrss
+    result = {"processor_seconds": min(seconds), "peak_bytes": peak_bytes, **counts}
     print(json.dumps(result))
     return 0
 

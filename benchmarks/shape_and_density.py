@@ -41,7 +41,8 @@ ReadFrame = Callable[[int, int], NDArray[np.float32]]
 
 def read_predicted(file: Predictions, scenario: int, frame: int) -> NDArray[np.float32]:
     """Return the predicted positions in one frame."""
-    return np.asarray(file.frames(scenario, frame, 1)[0])
+    (position,) = file.frames(scenario, frame, 1)
+    return np.asarray(position)
 
 
 def measure(
@@ -54,32 +55,43 @@ def measure(
     cluster_cells, density_cells = cells
     cluster_grid = ParticleGrid(size.bounds, cluster_cells)
     density_grid = ParticleGrid(size.bounds, density_cells)
-    rows: dict[int, list[list[float]]] = {kind: [] for kind in range(len(MATERIALS))}
+    material_count = len(MATERIALS)
+    rows: dict[int, list[list[float]]] = {}
+    for kind in range(material_count):
+        rows[kind] = []
     for scenario in size.subsets["test"]:
         truth = {}
-        with read_scenario(size.path(root, scenario)) as file:
-            material = torch.from_numpy(file.read("material").astype(np.int64))
-            first = torch.from_numpy(file.read("position", slice(0, 1))[0])
+        path = size.path(root, scenario)
+        with read_scenario(path) as file:
+            material_numbers = file.read("material").astype(np.int64)
+            material = torch.from_numpy(material_numbers)
+            first = torch.from_numpy(file.read("position", 0))
             for frame in range(size.task.input_frames, file.header.frames, FRAME_STEP):
-                truth[frame] = file.read("position", slice(frame, frame + 1))[0]
+                truth[frame] = file.read("position", frame)
 
         single_material = torch.zeros_like(material)
-        shape = ShapeMatching.build(cluster_grid, first, material, len(MATERIALS))
+        shape = ShapeMatching.build(cluster_grid, first, material, material_count)
         density = DensityProjection.build(density_grid, first, single_material, 1)
+        kinds = sorted(set(material.tolist()))
         for frame, true_position in truth.items():
-            numbers = true_position
+            measured_position = true_position
             if read_frame is not None:
-                numbers = read_frame(scenario, frame)
-            position = torch.from_numpy(numbers)
-            deviation = (shape.match(position) - position).norm(dim=1)
+                measured_position = read_frame(scenario, frame)
+            position = torch.from_numpy(measured_position)
+            correction = shape.match(position) - position
+            deviation = correction.norm(dim=1)
             stencil = density_grid.stencil(position, single_material)
             relative_density, _ = density.relative_density(stencil)
-            for kind in sorted(set(material.tolist())):
+            for kind in kinds:
                 is_kind = material == kind
                 mean_deviation = float(deviation[is_kind].mean())
                 high_density = float(relative_density[is_kind].quantile(0.95))
                 rows[kind].append([mean_deviation, high_density])
-    return {kind: torch.tensor(values) for kind, values in rows.items()}
+
+    by_material = {}
+    for kind, values in rows.items():
+        by_material[kind] = torch.tensor(values)
+    return by_material
 
 
 def main() -> int:
@@ -99,6 +111,7 @@ def main() -> int:
     )
     options = parser.parse_args()
     cluster_cells, density_cells = map(int, options.cells.split(","))
+    cells = (cluster_cells, density_cells)
     size = load().size(SPLIT, options.size)
     root = resolve_root(options.root)
     lines = []
@@ -108,22 +121,19 @@ def main() -> int:
             file = stack.enter_context(open_predictions(path))
             readers[str(path)] = partial(read_predicted, file)
         for name, read_frame in readers.items():
-            by_material = measure(
-                size, root, read_frame, (cluster_cells, density_cells)
-            )
+            by_material = measure(size, root, read_frame, cells)
             for kind, values in by_material.items():
                 mean_deviation, mean_density = values.mean(dim=0).tolist()
                 most_deviation, most_density = values.amax(dim=0).tolist()
-                lines.append(
-                    [
-                        name,
-                        MATERIALS[kind],
-                        f"{mean_deviation:.2g}",
-                        f"{most_deviation:.2g}",
-                        f"{mean_density:.2g}",
-                        f"{most_density:.2g}",
-                    ]
-                )
+                line = [
+                    name,
+                    MATERIALS[kind],
+                    f"{mean_deviation:.2g}",
+                    f"{most_deviation:.2g}",
+                    f"{mean_density:.2g}",
+                    f"{most_density:.2g}",
+                ]
+                lines.append(line)
     heads = ["of", "material", "off its shape", "at most", "density", "at most"]
     print(markdown(heads, lines))
     return 0

@@ -48,21 +48,28 @@ def sample_positions(side: int, jitter: float) -> Floats:
     if math.isnan(jitter):
         return rng.random((side * side, 2))
     axis = (np.arange(side) + 0.5) / side
-    lattice = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    coordinates = np.meshgrid(axis, axis, indexing="ij")
+    lattice = np.stack(coordinates, axis=-1)
     lattice = lattice.reshape(-1, 2)
-    offset = (rng.random(lattice.shape) - 0.5) * jitter / side
+    draws = rng.random(lattice.shape)
+    offset = (draws - 0.5) * jitter / side
     return lattice + offset
 
 
 def relative_error(position: Floats, grid: Grid) -> float:
     """Return the RMS error of the vorticity over the RMS of the exact one [1]."""
     full_weight = grid.full_weight(len(position), 1.0)
-    node_fields = fields(position, velocity(position), grid, full=full_weight)
-    phase_x, phase_y = np.meshgrid(WAVE * grid.axis, WAVE * grid.axis, indexing="ij")
+    flow = velocity(position)
+    node_fields = fields(position, flow, grid, full=full_weight)
+    phase = WAVE * grid.axis
+    phase_x, phase_y = np.meshgrid(phase, phase, indexing="ij")
     exact = 2.0 * WAVE * np.sin(phase_x) * np.sin(phase_y)
+    error = node_fields.vorticity - exact
+
     nodes = node_fields.differentiable
-    residual = (node_fields.vorticity - exact)[nodes]
-    return float(np.sqrt(np.mean(residual**2) / np.mean(exact[nodes] ** 2)))
+    squared_error = np.mean(error[nodes] ** 2)
+    exact_square = np.mean(exact[nodes] ** 2)
+    return float(np.sqrt(squared_error / exact_square))
 
 
 def main() -> int:
@@ -77,16 +84,22 @@ def main() -> int:
         f"relative RMS error of the vorticity, {grid.cells}x{grid.cells} nodes at "
         "cell centres"
     )
-    heads = "".join(f"{kind:>14s}" for kind in KINDS)
+    heads = ""
+    for kind in KINDS:
+        heads += f"{kind:>14s}"
     print(f"{'particles':>10s}{'per cell':>10s}{heads}")
+    cell_count = grid.cells**2
     for side in SIDES:
         particle_count = side * side
-        line = f"{particle_count:10d}{particle_count / grid.cells**2:10.2f}"
+        particles_per_cell = particle_count / cell_count
+        line = f"{particle_count:10d}{particles_per_cell:10.2f}"
         for jitter in KINDS.values():
-            error = relative_error(sample_positions(side, jitter), grid)
+            position = sample_positions(side, jitter)
+            error = relative_error(position, grid)
             line += f"{error:14.4f}"
         print(line)
-    error = relative_error(sample_positions(FINE_SIDE, 0.0), grid)
+    fine_lattice = sample_positions(FINE_SIDE, 0.0)
+    error = relative_error(fine_lattice, grid)
     print(f"grid alone (4 million particles on a lattice): {error:.4f}")
     return 0
 

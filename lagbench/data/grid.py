@@ -94,14 +94,13 @@ class Grid:
     @cached_property
     def shape(self) -> tuple[int, ...]:
         """Nodes along each axis."""
+        lengths = self.box.lengths.tolist()
         node_counts = []
-        for length, is_periodic in zip(
-            self.box.lengths, self.box.periodic, strict=True
-        ):
+        for length, is_periodic in zip(lengths, self.box.periodic, strict=True):
+            count = self.nodes
             if is_periodic:
-                node_counts.append(round(float(length) * self.cells))
-            else:
-                node_counts.append(self.nodes)
+                count = round(length * self.cells)
+            node_counts.append(count)
         return tuple(node_counts)
 
     @cached_property
@@ -116,7 +115,9 @@ class Grid:
     @property
     def middle_layer(self) -> int:
         """Number along z of the nodes of the middle plane, in three dimensions."""
-        return int(np.argmin(np.abs(self.places(2) - self.box.centre[2])))
+        height = self.places(2) - self.box.centre[2]
+        distance = np.abs(height)
+        return int(np.argmin(distance))
 
     @property
     def start(self) -> Floats:
@@ -125,8 +126,10 @@ class Grid:
 
     def places(self, axis: int) -> Floats:
         """Return the positions of the nodes along an axis [length], shape [node]."""
-        steps = np.arange(self.shape[axis]) + self.origin
-        return np.asarray(self.start[axis] + steps / self.cells, np.float64)
+        number = np.arange(self.shape[axis])
+        steps = number + self.origin
+        distance = steps / self.cells
+        return np.asarray(self.start[axis] + distance, np.float64)
 
     @property
     def spacing(self) -> float:
@@ -148,7 +151,8 @@ class Grid:
     @property
     def axis(self) -> Floats:
         """Positions of the nodes along an axis with walls [length], shape [nodes]."""
-        return (np.arange(self.nodes) + self.origin) / self.cells
+        steps = np.arange(self.nodes) + self.origin
+        return steps / self.cells
 
     def full_weight(self, particles: int, area: float) -> float:
         """Return the weight ``N h^d / A`` of a node deep inside the material [1].
@@ -157,7 +161,8 @@ class Grid:
             particles: particles N of the scenario.
             area: area or volume A that they cover at first [length^d].
         """
-        return particles * self.spacing**self.dimension / area
+        cell_volume = self.spacing**self.dimension
+        return particles * cell_volume / area
 
 
 @dataclass(frozen=True)
@@ -255,7 +260,8 @@ def fields(
     sums = transfer(position, velocity, grid)
     if counted is None:
         counted = counted_nodes(sums.weight, full)
-    return Fields(grid, sums.weight, node_velocity(sums, full), counted, full)
+    mean_velocity = node_velocity(sums, full)
+    return Fields(grid, sums.weight, mean_velocity, counted, full)
 
 
 def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
@@ -286,11 +292,14 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
         scatter = _scatter_between_walls
 
     # sum(w) and the components of sum(w u), shape [..., 1 + axis, *node]
-    sums = np.empty((*x.shape[:-2], 1 + dimension, *grid.shape))
-    for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
+    batch_shape = x.shape[:-2]
+    sums = np.empty((*batch_shape, 1 + dimension, *grid.shape))
+    for frame in np.ndindex(batch_shape):  # a frame fits the cache, a batch does not
         scatter(x[frame], u[frame], grid, sums[frame])
     by_component = np.moveaxis(sums, -1 - dimension, -1)  # [..., *node, 1 + axis]
-    return Transfer(weight=by_component[..., 0], momentum=by_component[..., 1:])
+    weight = by_component[..., 0]
+    momentum = by_component[..., 1:]
+    return Transfer(weight, momentum)
 
 
 def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
@@ -306,8 +315,10 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     """
     periodic = np.asarray(grid.box.periodic)
     x = grid.box.wrap(x)
-    between_walls = (x >= 0.0) & (x <= 1.0)
-    is_inside = np.where(periodic, np.isfinite(x), between_walls).all(axis=1)
+    is_finite = np.isfinite(x)
+    is_between_walls = (x >= 0.0) & (x <= 1.0)
+    is_axis_inside = np.where(periodic, is_finite, is_between_walls)
+    is_inside = is_axis_inside.all(axis=1)
     if not is_inside.all():
         x = x[is_inside]
         u = u[is_inside]
@@ -320,17 +331,20 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     carried[0].real = 1.0
     for row, component in enumerate(u.T, start=1):
         pair = carried[row // 2]
-        part = pair.imag if row % 2 else pair.real
+        part = _part_of_pair(pair, row)
         part[:] = component
 
     # Number of the lowest node around each particle, on a grid with margins. The
     # target is shifted to the other nodes instead.
     padded_shape = tuple(count + _ROWS_BELOW + _ROWS_ABOVE for count in grid.shape)
     strides = np.ones(len(padded_shape), np.intp)
-    strides[:-1] = np.cumprod(padded_shape[:0:-1])[::-1]
-    corner = ((base.T + _ROWS_BELOW) @ strides).astype(np.intp)
+    last_axis_first = np.cumprod(padded_shape[:0:-1])
+    strides[:-1] = last_axis_first[::-1]
+    padded_base = base.T + _ROWS_BELOW
+    corner = (padded_base @ strides).astype(np.intp)
     size = int(np.prod(padded_shape))
-    sums = np.zeros((pair_count, size + 2 * int(strides.sum())), np.complex128)
+    largest_shift = 2 * int(strides.sum())
+    sums = np.zeros((pair_count, size + largest_shift), np.complex128)
     weight = np.empty(len(x))
     product = np.empty(len(x), np.complex128)
     for offsets in itertools.product(range(3), repeat=grid.dimension):
@@ -343,17 +357,28 @@ def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
             np.add.at(row_sum[shift:], corner, product)
 
     for number, row in enumerate(out):
-        row_sum = sums[number // 2, :size]
-        part = row_sum.imag if number % 2 else row_sum.real
-        row[:] = _fold(part.reshape(padded_shape), grid)
+        pair_sum = sums[number // 2, :size]
+        part = _part_of_pair(pair_sum, number)
+        padded = part.reshape(padded_shape)
+        row[:] = _fold(padded, grid)
+
+
+def _part_of_pair(pair: NDArray[np.complex128], row: int) -> Floats:
+    """Return the part of a pair that belongs to a row: real if even, imaginary if odd.
+
+    It is a view: writing to it changes the pair.
+    """
+    if row % 2:
+        return pair.imag
+    return pair.real
 
 
 def _fold(padded: Floats, grid: Grid) -> Floats:
     """Return sums without margins; those of periodic axes belong to the other end."""
     for axis, is_periodic in enumerate(grid.box.periodic):
         along = np.moveaxis(padded, axis, 0)
-        count = grid.shape[axis]
-        inner = along[_ROWS_BELOW : _ROWS_BELOW + count].copy()
+        end = _ROWS_BELOW + grid.shape[axis]
+        inner = along[_ROWS_BELOW:end].copy()
         if is_periodic:
             inner[-_ROWS_BELOW:] += along[:_ROWS_BELOW]
             inner[:_ROWS_ABOVE] += along[-_ROWS_ABOVE:]
@@ -373,9 +398,10 @@ def _scatter_between_walls(x: Floats, u: Floats, grid: Grid, out: Floats) -> Non
     # NaN is not inside either.
     all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
     if not all_inside:
-        inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
-        x = x[inside]
-        u = u[inside]
+        is_axis_inside = (x >= 0.0) & (x <= 1.0)
+        is_inside = is_axis_inside.all(axis=1)
+        x = x[is_inside]
+        u = u[is_inside]
     base, weights = _spline_weights(x, grid)
     along_x, along_y = np.ascontiguousarray(u.T)
 
@@ -406,7 +432,8 @@ def _scatter_between_walls(x: Floats, u: Floats, grid: Grid, out: Floats) -> Non
     inner = slice(_ROWS_BELOW, -_ROWS_ABOVE)
     padded_sums = (weight_sum, momentum_sum.real, momentum_sum.imag)
     for field, padded_sum in zip(out, padded_sums, strict=True):
-        field[:] = padded_sum[:size].reshape(side, side)[inner, inner]
+        square = padded_sum[:size].reshape(side, side)
+        field[:] = square[inner, inner]
 
 
 def _spline_weights(x: Floats, grid: Grid) -> tuple[Floats, Floats]:
@@ -418,7 +445,8 @@ def _spline_weights(x: Floats, grid: Grid) -> tuple[Floats, Floats]:
     s -= grid.origin
     base = np.floor(s - 0.5)
     s -= base
-    weights = np.empty((len(s), 3, s.shape[1]))
+    axes, particles = s.shape
+    weights = np.empty((axes, 3, particles))
     for node, centre in enumerate((1.5, 1.0, 0.5)):
         weight = weights[:, node]
         np.subtract(s, centre, out=weight)
@@ -437,11 +465,11 @@ def counted_nodes(weight: Floats, full: float) -> Mask:
 
 def node_velocity(sums: Transfer, full: float) -> Floats:
     """Return ``sum(w u) / sum(w)``; 0 below :data:`EMPTY_SHARE` of the full weight."""
-    filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
+    least_weight = EMPTY_SHARE * full
+    is_filled = (sums.weight >= least_weight) & (sums.weight > 0.0)
+    divisor = sums.weight[..., None]
     velocity = np.zeros_like(sums.momentum)
-    np.divide(
-        sums.momentum, sums.weight[..., None], out=velocity, where=filled[..., None]
-    )
+    np.divide(sums.momentum, divisor, out=velocity, where=is_filled[..., None])
     return velocity
 
 
@@ -484,13 +512,17 @@ def slope_along(
         is_periodic: whether the last node has the first one beside it.
     """
     slope = np.zeros(field.shape)
+    double_spacing = 2.0 * spacing
     # Views with that axis last; np.moveaxis would take as long as the differences.
     value = field.swapaxes(axis, -1)
     along = slope.swapaxes(axis, -1)
-    along[..., 1:-1] = (value[..., 2:] - value[..., :-2]) / (2.0 * spacing)
+    difference = value[..., 2:] - value[..., :-2]
+    along[..., 1:-1] = difference / double_spacing
     if is_periodic:
-        along[..., 0] = (value[..., 1] - value[..., -1]) / (2.0 * spacing)
-        along[..., -1] = (value[..., 0] - value[..., -2]) / (2.0 * spacing)
+        first_difference = value[..., 1] - value[..., -1]
+        last_difference = value[..., 0] - value[..., -2]
+        along[..., 0] = first_difference / double_spacing
+        along[..., -1] = last_difference / double_spacing
     return slope
 
 
@@ -529,7 +561,8 @@ def curl(
         return slope(1, 0) - slope(0, 1)
     components = []
     for j, k in ((1, 2), (2, 0), (0, 1)):
-        components.append(slope(k, j) - slope(j, k))
+        component = slope(k, j) - slope(j, k)
+        components.append(component)
     return np.stack(components, axis=-1)
 
 
@@ -545,10 +578,13 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
     """
     u = velocity[..., 0]
     v = velocity[..., 1]
-    slope = np.zeros(u.shape)
-    slope[..., 1:-1, :] = (v[..., 2:, :] - v[..., :-2, :]) / (2.0 * spacing)
-    slope[..., 1:-1] -= (u[..., 2:] - u[..., :-2]) / (2.0 * spacing)
-    return slope
+    double_spacing = 2.0 * spacing
+    v_difference = v[..., 2:, :] - v[..., :-2, :]
+    u_difference = u[..., 2:] - u[..., :-2]
+    curl = np.zeros(u.shape)
+    curl[..., 1:-1, :] = v_difference / double_spacing
+    curl[..., 1:-1] -= u_difference / double_spacing
+    return curl
 
 
 def divergence(
