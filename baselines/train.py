@@ -303,18 +303,22 @@ class StepBatches(Sampler[list[int]]):
         self.sampler.seek(epoch, used * self.sampler.ranks)
         endless = chain.from_iterable(self.sampler for _ in count())
         for step in self.steps:
-            windows = np.array(list(islice(endless, self.batch)))
-            yield self._replace_some(windows, step).tolist()
+            drawn = list(islice(endless, self.batch))
+            windows = self._replace_some(np.array(drawn), step)
+            yield windows.tolist()
 
     def _replace_some(self, windows: NDArray[np.intp], step: int) -> NDArray[np.intp]:
         """Return the windows of a step, some of them replaced."""
         sampler = self.sampler
-        seed = np.random.SeedSequence([sampler.seed, step, sampler.rank, sampler.ranks])
+        place_in_training = [sampler.seed, step, sampler.rank, sampler.ranks]
+        seed = np.random.SeedSequence(place_in_training)
         generator = np.random.Generator(np.random.PCG64(seed))
         # NumPy promises the same bits for `random` alone.
         chance, place = generator.random((2, self.batch))
         index = (place * len(self.openings)).astype(np.intp)
-        return np.where(chance < self.opening_share, self.openings[index], windows)
+        opening = self.openings[index]
+        is_replaced = chance < self.opening_share
+        return np.where(is_replaced, opening, windows)
 
 
 def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:

@@ -380,44 +380,58 @@ def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) ->
             names.append(metric.name)
             is_falling.append(metric.direction is Direction.HIGHER)
 
-    share = np.linspace(0.01, 1.0, len(frames))  # of the error at the last frame
-    scatter = 10.0 ** rng.uniform(-0.1, 0.1, (len(names), len(frames)))
+    frame_count = len(frames)
+    share = np.linspace(0.01, 1.0, frame_count)  # of the error at the last frame
+    decades = rng.uniform(-0.1, 0.1, (len(names), frame_count))
+    scatter = 10.0**decades
     total = 1e-3 * quality * scatter * share
     total[is_falling] = 1.0 / (1.0 + quality * share)
-    ones = np.ones(total.shape, np.int64)
-    return round_statistics(Tally(tuple(names), frames, total, ones, 0 * ones))
+    weight = np.ones(total.shape, np.int64)
+    undefined = np.zeros(total.shape, np.int64)
+    tally = Tally(tuple(names), frames, total, weight, undefined)
+    return round_statistics(tally)
 
 
 def _preview(size: Size, rng: np.random.Generator) -> Preview:
+    """Return noise in place of maps, histograms and a film of two sides.
+
+    Both sides start from the truth; side 1, the prediction, then strays from it.
+    """
     frames = tuple(frames_to_predict(size))
     maps = reported_frames(size)
-    frame_count = min(FRAMES, len(frames))
-    indices = np.linspace(0, len(frames) - 1, frame_count).astype(int)
-    shown = [frames[i] for i in indices]
-
-    # both sides start from the truth, shape [side, ...]
+    map_count = len(maps)
     truth = np.random.Generator(np.random.PCG64(size.particles))
     map_shape = size.field_grid.section.shape
-    true_vorticity = 0.1 * truth.normal(size=(1, len(maps), *map_shape))
-    vorticity = true_vorticity * np.ones((2, 1, 1, 1))
-    vorticity[1] += 0.02 * rng.normal(size=vorticity[1].shape)
+    true_vorticity = 0.1 * truth.normal(size=(1, map_count, *map_shape))
+    vorticity = np.repeat(true_vorticity, 2, axis=0)
+    map_noise = rng.normal(size=vorticity[1].shape)
+    vorticity[1] += 0.02 * map_noise
 
+    frame_count = min(FRAMES, len(frames))
+    last = len(frames) - 1
+    indices = np.linspace(0, last, frame_count).astype(int)
+    film_frames = [frames[i] for i in indices]
     true_position = truth.random((1, 1, PARTICLES, size.dimension))
-    film = true_position * np.ones((2, frame_count, 1, 1))
-    film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0)
+    both_sides = np.ones((2, frame_count, 1, 1))
+    film = true_position * both_sides
+    steps = rng.normal(0.0, 1e-3, film[1].shape)
+    film[1] += np.cumsum(steps, axis=0)
+    film = np.clip(film, -0.5, 1.5)
 
-    shares = rng.random((2, len(maps), BINS))
-    histogram = shares / shares.sum(axis=-1, keepdims=True)
+    shares = rng.random((2, map_count, BINS))
+    share_sums = shares.sum(axis=-1, keepdims=True)
+    histogram = shares / share_sums
+    ranges = [[-0.3, 0.3]] * map_count
     return Preview(
         scenario=min(size.subsets["test"]),
         map_frames=maps,
         vorticity=vorticity.astype(np.float32),
         histogram=histogram.astype(np.float32),
-        histogram_range=np.array([[-0.3, 0.3]] * len(maps), np.float32),
-        film_frames=tuple(shown),
+        histogram_range=np.array(ranges, np.float32),
+        film_frames=tuple(film_frames),
         particles=tuple(range(PARTICLES)),
         material=np.zeros(PARTICLES, np.int8),
-        film=np.clip(film, -0.5, 1.5).astype(np.float32),
+        film=film.astype(np.float32),
     )
 
 

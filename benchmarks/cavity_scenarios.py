@@ -65,24 +65,21 @@ def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
         parameters = file.header.parameters
         for frame in range(frame_count):
             velocity = file.read("velocity", frame).astype(np.float64)
-            speed_squared = np.sum(velocity**2, axis=-1)
-            energy.append(0.5 * float(speed_squared.mean()))
+            squared_speed = np.sum(velocity**2, axis=-1)
+            energy.append(0.5 * float(squared_speed.mean()))
         wall_velocity = file.read("wall_velocity").astype(np.float64)
 
     # velocity components of the walls that move, shape [frame, component]
     components = wall_velocity.reshape(frame_count, -1)
-    moving = components[:, components.any(axis=0)]
+    ever_moves = components.any(axis=0)
+    moving = components[:, ever_moves]
+    mean_square = np.mean(moving**2)
+    speed = float(np.sqrt(mean_square))
     sign_changes = np.diff(np.sign(moving), axis=0)
+    reversals = int(np.count_nonzero(sign_changes))
+    mean_energy = float(np.mean(energy))
     wall, motion, reynolds, start = (parameters[name] for name in NAMES)
-    return (
-        wall,
-        motion,
-        reynolds,
-        start,
-        float(np.sqrt(np.mean(moving**2))),
-        int(np.count_nonzero(sign_changes)),
-        float(np.mean(energy)),
-    )
+    return (wall, motion, reynolds, start, speed, reversals, mean_energy)
 
 
 if __name__ == "__main__":

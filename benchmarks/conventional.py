@@ -102,6 +102,24 @@ class Conventional:
         return (base, f, [first, second, third])
 
     @ti.func
+    def ends_of_row(self, k):
+        """Return the left ghost node, the node beside it, and both on the right."""
+        left = ti.Vector([self.low, k])
+        inside_left = ti.Vector([self.first, k])
+        right = ti.Vector([self.high, k])
+        inside_right = ti.Vector([self.last, k])
+        return (left, inside_left, right, inside_right)
+
+    @ti.func
+    def ends_of_column(self, i):
+        """Return the lowest ghost node, the node beside it, and both at the top."""
+        bottom = ti.Vector([i, self.low])
+        inside_bottom = ti.Vector([i, self.first])
+        top = ti.Vector([i, self.high])
+        inside_top = ti.Vector([i, self.last])
+        return (bottom, inside_bottom, top, inside_top)
+
+    @ti.func
     def fold(self, inner, ghost, flip, moved):
         """Add the mirror image of a ghost node to its interior node."""
         ghost_mass = self.m[ghost]
@@ -133,18 +151,12 @@ class Conventional:
         # The ghost nodes give their sums to the nodes inside the walls.
         flip = ti.Vector([-1.0, -1.0])
         for k in range(self.low, self.high + 1):
-            inside_left = ti.Vector([self.first, k])
-            left = ti.Vector([self.low, k])
+            left, inside_left, right, inside_right = self.ends_of_row(k)
             self.fold(inside_left, left, flip, 0.0)
-            inside_right = ti.Vector([self.last, k])
-            right = ti.Vector([self.high, k])
             self.fold(inside_right, right, flip, 0.0)
         for i in range(self.first, self.high):
-            inside_bottom = ti.Vector([i, self.first])
-            bottom = ti.Vector([i, self.low])
+            bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.fold(inside_bottom, bottom, flip, 0.0)
-            inside_top = ti.Vector([i, self.last])
-            top = ti.Vector([i, self.high])
             self.fold(inside_top, top, flip, self.lid)
 
         # Momentum becomes velocity, mass density.
@@ -157,18 +169,12 @@ class Conventional:
             else:
                 self.q[i, k] = 1.0
         for k in range(self.first, self.high):
-            inside_left = ti.Vector([self.first, k])
-            left = ti.Vector([self.low, k])
+            left, inside_left, right, inside_right = self.ends_of_row(k)
             self.mirror(left, inside_left, 0.0)
-            inside_right = ti.Vector([self.last, k])
-            right = ti.Vector([self.high, k])
             self.mirror(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            inside_bottom = ti.Vector([i, self.first])
-            bottom = ti.Vector([i, self.low])
+            bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.mirror(bottom, inside_bottom, 0.0)
-            inside_top = ti.Vector([i, self.last])
-            top = ti.Vector([i, self.high])
             self.mirror(top, inside_top, self.lid_at(i))
 
         # Pressure and viscosity accelerate the nodes.
@@ -189,18 +195,12 @@ class Conventional:
         for i, k in ti.ndrange(self.inside, self.inside):
             self.gv[i, k] += self.ga[i, k]
         for k in range(self.first, self.high):
-            inside_left = ti.Vector([self.first, k])
-            left = ti.Vector([self.low, k])
+            left, inside_left, right, inside_right = self.ends_of_row(k)
             self.mirror_velocity(left, inside_left, 0.0)
-            inside_right = ti.Vector([self.last, k])
-            right = ti.Vector([self.high, k])
             self.mirror_velocity(right, inside_right, 0.0)
         for i in range(self.low, self.high + 1):
-            inside_bottom = ti.Vector([i, self.first])
-            bottom = ti.Vector([i, self.low])
+            bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.mirror_velocity(bottom, inside_bottom, 0.0)
-            inside_top = ti.Vector([i, self.last])
-            top = ti.Vector([i, self.high])
             self.mirror_velocity(top, inside_top, self.lid_at(i))
 
         for p in self.x:

@@ -119,22 +119,28 @@ def _score_frozen_field(
     squared_truth = 0.0
     before = given.last
     predicted = predict(given)
+    judged_frame = min(FRAME, last)
     for frame, position in zip(given.predicted_frames, predicted, strict=True):
-        true_step = box.displacement(truth[frame - 1], truth[frame])
-        true_fields = fields(truth[frame], true_step, grid, full=full)
+        true_before = truth[frame - 1]
+        true_now = truth[frame]
+        true_step = box.displacement(true_before, true_now)
+        true_fields = fields(true_now, true_step, grid, full=full)
         now = position.astype(np.float64)
         step = box.displacement(before, now)
         before = now
         counted = true_fields.counted
         predicted_fields = fields(now, step, grid, full=full, counted=counted)
+
         nodes = true_fields.differentiable
         true_vorticity = true_fields.vorticity[nodes].ravel()
         vorticity = predicted_fields.vorticity[nodes].ravel()
-        squared_error += np.mean((true_vorticity - vorticity) ** 2)
+        error = true_vorticity - vorticity
+        squared_error += np.mean(error**2)
         squared_truth += np.mean(true_vorticity**2)
-        if frame == min(FRAME, last):
+        if frame == judged_frame:
             correlation = pearson(true_vorticity, vorticity)
-    return correlation, float(np.sqrt(squared_error / squared_truth))
+    relative_error = float(np.sqrt(squared_error / squared_truth))
+    return correlation, relative_error
 
 
 def _judge_activity(size: Size, root: Path, each: bool) -> bool:

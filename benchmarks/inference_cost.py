@@ -74,22 +74,28 @@ def make_given_frames(info: DatasetInfo) -> Batch:
     count = info.particles
     side = int(np.ceil(np.sqrt(count)))
     axis = np.arange(side)
-    cells = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    coordinates = np.meshgrid(axis, axis, indexing="ij")
+    cells = np.stack(coordinates, axis=-1)
+    cells = cells.reshape(-1, 2)[:count]
     rng = np.random.default_rng(0)
+    offset = rng.random((count, 2))
     # positions in a box of side 1, shape [particle, 2]
-    unit_position = (cells[:count] + rng.random((count, 2))) / side
+    unit_position = (cells + offset) / side
     phase_x, phase_y = np.pi * unit_position.T
-    speed = info.statistics["velocity_std"][0]
     velocity_x = np.sin(phase_x) * np.cos(phase_y)
     velocity_y = -np.cos(phase_x) * np.sin(phase_y)
-    velocity = 2.0 * speed * np.stack([velocity_x, velocity_y], axis=-1)
+    unit_velocity = np.stack([velocity_x, velocity_y], axis=-1)
+    speed = info.statistics["velocity_std"][0]
+    velocity = 2.0 * speed * unit_velocity
     low, high = np.transpose(info.bounds)
     first = low + (high - low) * unit_position
     frames = []
     for step in range(info.input_frames):
-        frames.append(first + step * velocity)
+        frame = first + step * velocity
+        frames.append(frame)
+    position = np.stack(frames, axis=1)
     return Batch(
-        position=torch.tensor(np.stack(frames, axis=1), dtype=torch.float32),
+        position=torch.tensor(position, dtype=torch.float32),
         sample=torch.zeros(count, dtype=torch.int64),
         material=torch.zeros(count, dtype=torch.int64),
         wall_velocity=None,

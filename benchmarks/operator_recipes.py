@@ -55,16 +55,24 @@ def mean_terms(
     """
     generator = torch.Generator().manual_seed(0)
     totals: Counter[str] = Counter()
-    places = range(0, len(data), max(1, len(data) // WINDOWS))
+    stride = max(1, len(data) // WINDOWS)
+    places = range(0, len(data), stride)
+    is_rounded = uses_bfloat16(recipe)
     for index in places:
+        window = collate([data[index]])
         with (
             torch.no_grad(),
-            torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16(recipe)),
+            torch.autocast("cpu", torch.bfloat16, enabled=is_rounded),
         ):
-            raw_terms = model(collate([data[index]]), generator)
+            raw_terms = model(window, generator)
         for name, value in raw_terms.items():
-            totals[name] += model.weights.get(name, 1.0) * float(value)
-    return {name: value / len(places) for name, value in totals.items() if value}
+            weight = model.weights.get(name, 1.0)
+            totals[name] += weight * float(value)
+    means = {}
+    for name, total in totals.items():
+        if total:
+            means[name] = total / len(places)
+    return means
 
 
 def step_seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:

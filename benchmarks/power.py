@@ -73,7 +73,9 @@ def measure_scatter(methods: dict[str, Floats]) -> Scatter:
 
     It is NaN where no method has two seeds, or none of those has a near rival.
     """
-    relative = {name: values / values.mean() for name, values in methods.items()}
+    relative = {}
+    for name, values in methods.items():
+        relative[name] = values / values.mean()
     seed_variances = []
     rest_variances = []
     for values in relative.values():
@@ -87,15 +89,21 @@ def measure_scatter(methods: dict[str, Floats]) -> Scatter:
         rest_variance = float(np.sum(rest**2)) / freedom
         rest_variances.append(rest_variance)
         variance = float(np.var(seed_deviation, ddof=1))
-        seed_variances.append(max(0.0, variance - rest_variance / scenario_count))
+        seed_variance = variance - rest_variance / scenario_count
+        seed_variances.append(max(0.0, seed_variance))
 
-    noise = float(np.mean(rest_variances)) if rest_variances else np.nan
+    noise = np.nan
+    if rest_variances:
+        noise = float(np.mean(rest_variances))
     method_variances = []
     for first, second in _near_pairs(methods):
-        difference = relative[first].mean(axis=0) - relative[second].mean(axis=0)
+        first_mean = relative[first].mean(axis=0)
+        second_mean = relative[second].mean(axis=0)
+        difference = first_mean - second_mean
         variance = float(np.var(difference, ddof=1))
         seed_share = 1 / len(methods[first]) + 1 / len(methods[second])
-        method_variances.append(max(0.0, variance - noise * seed_share) / 2)
+        method_variance = variance - noise * seed_share
+        method_variances.append(max(0.0, method_variance) / 2)
     return Scatter(
         seed=_root_mean(seed_variances),
         rest=_root_mean(rest_variances),

@@ -37,8 +37,10 @@ Floats = NDArray[np.float64]
 
 def flow(position: Floats, seed: int) -> Floats:
     """Return the ABC flow with coefficients of a seed [length/frame]."""
-    a, b, c = np.random.default_rng(seed).uniform(0.005, 0.015, 3)
-    x, y, z = 2.0 * math.pi * position.T
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.uniform(0.005, 0.015, 3)
+    phase = 2.0 * math.pi * position
+    x, y, z = phase.T
     u = a * np.sin(z) + c * np.cos(y)
     v = b * np.sin(x) + a * np.cos(z)
     w = c * np.sin(y) + b * np.cos(x)
@@ -48,11 +50,17 @@ def flow(position: Floats, seed: int) -> Floats:
 def carried(seed: int) -> NDArray[np.float32]:
     """Return the paths of a lattice, by the midpoint rule."""
     axis = (np.arange(SIDE) + 0.5) / SIDE
-    x = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    coordinates = np.meshgrid(axis, axis, axis)
+    lattice = np.stack(coordinates, axis=-1)
+    position = lattice.reshape(-1, 3)
     frames = []
     for _ in range(FRAMES):
-        frames.append((x % 1.0).astype(np.float32) % np.float32(1.0))
-        x = x + flow(x + 0.5 * flow(x, seed), seed)
+        wrapped = position % 1.0
+        stored = wrapped.astype(np.float32)
+        # Rounding may reach the upper end, which is the lower one.
+        frames.append(stored % np.float32(1.0))
+        middle = position + 0.5 * flow(position, seed)
+        position = position + flow(middle, seed)
     return np.stack(frames)
 
 

@@ -240,10 +240,12 @@ def draw(measurements: Sequence[TimedRow], device: str, path: Path) -> None:
     left, right = figure.subplots(1, 2)
     our_points = []
     for measurement in measurements:
-        our_points.append((measurement.row.q**2, measurement.frame_ms))
+        point = (measurement.row.q**2, measurement.frame_ms)
+        our_points.append(point)
     thesis_points = []
     for row in THESIS:
-        thesis_points.append((row.q**2, row.frame_ms))
+        point = (row.q**2, row.frame_ms)
+        thesis_points.append(point)
     series = (
         (f"ours, {device}", "C0", our_points),
         ("thesis, GPU", "C3", thesis_points),
@@ -253,15 +255,13 @@ def draw(measurements: Sequence[TimedRow], device: str, path: Path) -> None:
         slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
         parabola = np.polyfit(x, y, 2)
         line = np.linspace(x.min(), x.max(), 200)
+        power_law = 10**offset * line**slope
+        label = f"{name}: slope {slope:.2f}"
         left.loglog(x, y, "o", color=colour)
-        left.loglog(
-            line,
-            10**offset * line**slope,
-            color=colour,
-            label=f"{name}: slope {slope:.2f}",
-        )
+        left.loglog(line, power_law, color=colour, label=label)
+        fitted = np.polyval(parabola, line)
         right.plot(x, y, "o", color=colour)
-        right.plot(line, np.polyval(parabola, line), color=colour, label=name)
+        right.plot(line, fitted, color=colour, label=name)
     for axes, title in ((left, "(a) log-log"), (right, "(b) second-degree fit")):
         axes.set(xlabel="q^2", ylabel="t/frame [ms]", title=title)
         axes.grid(alpha=0.3)

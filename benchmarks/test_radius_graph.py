@@ -36,7 +36,9 @@ def position() -> Tensor:
     rng = np.random.Generator(np.random.PCG64(0))
     side = int(np.ceil(np.sqrt(PARTICLES)))
     axis = np.arange(side) + 0.5
-    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    grid_lines = np.meshgrid(axis, axis)
+    lattice = np.stack(grid_lines, axis=-1)
+    lattice = lattice.reshape(-1, 2)
     jitter = rng.normal(0.0, 0.3, (PARTICLES, 2))
     # in spacings, then in the box
     coordinates = lattice[:PARTICLES] + jitter

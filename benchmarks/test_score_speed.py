@@ -97,14 +97,18 @@ def naive_scores(
         true = np.asarray(given_and_true, np.float64)
     with h5py.File(predictions) as file:
         predicted = np.asarray(file["position"][row, :frames], np.float64)
-    predicted = np.concatenate([true[:1], predicted])
+    last_given = true[:1]
+    predicted = np.concatenate([last_given, predicted])
     frame_scores = []
-    for f in range(1, frames + 1):
-        frame_scores.append(_score_frame(true[f - 1 : f + 1], predicted[f - 1 : f + 1]))
-    return {
-        name: float(np.mean([scores[name] for scores in frame_scores]))
-        for name in frame_scores[0]
-    }
+    for frame in range(1, frames + 1):
+        both_frames = slice(frame - 1, frame + 1)
+        scores = _score_frame(true[both_frames], predicted[both_frames])
+        frame_scores.append(scores)
+    means = {}
+    for name in frame_scores[0]:
+        values = [scores[name] for scores in frame_scores]
+        means[name] = float(np.mean(values))
+    return means
 
 
 def _score_frame(true: Floats, predicted: Floats) -> dict[str, float]:

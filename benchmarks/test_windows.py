@@ -84,12 +84,16 @@ def _rotation(scenario: int) -> Iterator[Frames]:
     ones do.
     """
     rng = np.random.Generator(np.random.PCG64(scenario))
-    distance = RADIUS * np.sqrt(rng.random(PARTICLES))
-    angle = 2.0 * np.pi * rng.random(PARTICLES)
+    area_share = rng.random(PARTICLES)
+    distance = RADIUS * np.sqrt(area_share)
+    start_angle = 2.0 * np.pi * rng.random(PARTICLES)
+    rotation = 0.005 * (1 + scenario % 5)  # [1/frame]
     for frame in range(FRAMES):
-        turned = angle + 0.005 * (1 + scenario % 5) * frame
-        x = 0.5 + distance * np.cos(turned)
-        yield np.stack([x, 0.5 + distance * np.sin(turned)], axis=1).astype(np.float32)
+        angle = start_angle + rotation * frame
+        x = 0.5 + distance * np.cos(angle)
+        y = 0.5 + distance * np.sin(angle)
+        position = np.stack([x, y], axis=1)
+        yield position.astype(np.float32)
 
 
 def write_ours(root: Path, scenarios: int) -> None:
