@@ -174,17 +174,21 @@ class WindowSampler(Sampler[int]):
         runs = []
         for start, stop in pairwise(starts):
             for first in range(start, stop, RUN):
-                runs.append(np.arange(first, min(first + RUN, stop)))
-        shuffled_runs = [runs[i] for i in _draw_permutation(rng, len(runs))]
+                end = min(first + RUN, stop)
+                runs.append(np.arange(first, end))
+        run_order = _draw_permutation(rng, len(runs))
+        shuffled_runs = [runs[number] for number in run_order]
 
         frames_per_run = RUN + self.data.length - 1
         run_bytes = self.data.frame_bytes * frames_per_run
         runs_per_pool = max(1, POOL_BYTES // run_bytes)
         pools = []
         for first in range(0, len(shuffled_runs), runs_per_pool):
-            pools.append(np.concatenate(shuffled_runs[first : first + runs_per_pool]))
-        shuffled_pools = [pool[_draw_permutation(rng, len(pool))] for pool in pools]
-        return np.concatenate(shuffled_pools)
+            end = first + runs_per_pool
+            pool = np.concatenate(shuffled_runs[first:end])
+            window_order = _draw_permutation(rng, len(pool))
+            pools.append(pool[window_order])
+        return np.concatenate(pools)
 
     def __iter__(self) -> Iterator[int]:
         """Yield this rank's windows to the end of the epoch; begin the next epoch."""

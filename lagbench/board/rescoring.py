@@ -346,9 +346,12 @@ def relative_difference(first: Tally, second: Tally, name: str) -> float:
     a = a.astype(np.float32).astype(np.float64)
     b = b.astype(np.float32).astype(np.float64)
     is_unequal = a != b
-    distance = np.abs(a - b)[is_unequal]
-    scale = np.maximum(np.abs(a), np.abs(b))[is_unequal]
-    return float(np.nanmax(distance / scale, initial=0.0))
+    unequal_a = a[is_unequal]
+    unequal_b = b[is_unequal]
+    distance = np.abs(unequal_a - unequal_b)
+    scale = np.maximum(np.abs(unequal_a), np.abs(unequal_b))
+    relative = distance / scale
+    return float(np.nanmax(relative, initial=0.0))
 
 
 def _format_names(names: Sequence[str]) -> str:

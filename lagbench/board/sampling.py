@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,14 @@ def spaced(length: int, count: int) -> list[int]:
     """
     if length <= count:
         return list(range(length))
+    last = length - 1
     if count == 1:
-        return [length - 1]
-    return [i * (length - 1) // (count - 1) for i in range(count)]
+        return [last]
+    indices = []
+    for number in range(count):
+        index = number * last // (count - 1)
+        indices.append(index)
+    return indices
 
 
 def coarsen(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:
@@ -26,19 +33,24 @@ def coarsen(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:
         field: values at nodes, NaN where there is none, shape [..., x node, y node].
         nodes: most nodes a side.
     """
+    values = field.astype(np.float64)
     side = field.shape[-1]
-    block = -(-side // nodes)  # nodes of a block a side, rounded up
+    block = math.ceil(side / nodes)  # nodes of a block a side
     if block == 1:
-        return field.astype(np.float64)
+        return values
 
-    count = -(-side // block)
-    margin = (0, count * block - side)
-    padding = [(0, 0)] * (field.ndim - 2) + [margin, margin]
-    padded = np.pad(field.astype(np.float64), padding, constant_values=np.nan)
+    count = math.ceil(side / block)  # blocks a side
+    missing = count * block - side
+    padding = [(0, 0)] * (field.ndim - 2)
+    padding += [(0, missing), (0, missing)]
+    padded = np.pad(values, padding, constant_values=np.nan)
 
+    leading = field.shape[:-2]
     # shape [..., x block, x node, y block, y node]
-    blocks = padded.reshape(*field.shape[:-2], count, block, count, block)
+    blocks = padded.reshape(*leading, count, block, count, block)
     is_known = np.isfinite(blocks)
+    known_values = np.where(is_known, blocks, 0.0)
     known_count = is_known.sum(axis=(-3, -1))
-    total = np.where(is_known, blocks, 0.0).sum(axis=(-3, -1))
-    return np.where(known_count > 0, total / np.maximum(known_count, 1), np.nan)
+    total = known_values.sum(axis=(-3, -1))
+    mean = total / np.maximum(known_count, 1)
+    return np.where(known_count > 0, mean, np.nan)

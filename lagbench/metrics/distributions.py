@@ -75,9 +75,11 @@ def _bin_shares(values: Floats, low: float, high: float) -> Floats:
     """Return the smoothed share of the values in each bin, shape [bin]."""
     clipped = np.minimum(np.maximum(values, low), high)
     place = (clipped - low) / (high - low)
-    number = np.minimum((place * BINS).astype(np.intp), BINS - 1)
+    number = (place * BINS).astype(np.intp)
+    number = np.minimum(number, BINS - 1)
     count = np.bincount(number, minlength=BINS)
-    shares = (count + PSEUDO_COUNT) / (len(values) + BINS * PSEUDO_COUNT)
+    total = len(values) + BINS * PSEUDO_COUNT
+    shares = (count + PSEUDO_COUNT) / total
     return np.asarray(shares, np.float64)
 
 
@@ -136,7 +138,8 @@ def _cosines(nodes: int) -> Floats:
     """Return the orthonormal DCT-II as a matrix, shape [wave number, node]."""
     k = np.arange(nodes)[:, None]
     n = np.arange(nodes)
-    cosines = np.sqrt(2.0 / nodes) * np.cos(np.pi * k * (n + 0.5) / nodes)
+    phase = np.pi * k * (n + 0.5) / nodes
+    cosines = np.sqrt(2.0 / nodes) * np.cos(phase)
     cosines[0] = math.sqrt(1.0 / nodes)
     return np.asarray(cosines, np.float64)
 
@@ -163,7 +166,9 @@ def energy_spectrum(velocity: Floats, periodic: Sequence[bool] | None = None) ->
     if periodic is None:
         periodic = [False] * dimension
     node_counts = velocity.shape[:-1]
-    half_waves = 1 if all(periodic) else 2  # of a whole wave
+    half_waves = 2  # of a whole wave
+    if all(periodic):
+        half_waves = 1
     longest = max(node_counts)
 
     modes: NDArray[Any] = velocity
@@ -172,15 +177,19 @@ def energy_spectrum(velocity: Floats, periodic: Sequence[bool] | None = None) ->
     for axis, count in enumerate(node_counts):
         if periodic[axis]:
             modes = np.fft.fft(modes, axis=axis, norm="ortho")
-            waves = np.abs(np.fft.fftfreq(count, 1.0 / count))
+            frequencies = np.fft.fftfreq(count, 1.0 / count)
+            waves = np.abs(frequencies)
             scale = half_waves * longest / count
+            greatest = (count // 2) * scale
             wave_numbers.append(waves * scale)
-            limits.append(int((count // 2) * scale) + 1)
+            limits.append(int(greatest) + 1)
         else:
             modes = _transform_by_cosines(modes, axis)
-            wave_numbers.append(np.arange(count, dtype=np.float64))
+            waves = np.arange(count, dtype=np.float64)
+            wave_numbers.append(waves)
             limits.append(count)
-    power = np.sum(np.abs(modes) ** 2, axis=-1)  # shape [*mode]
+    magnitude = np.abs(modes)
+    power = np.sum(magnitude**2, axis=-1)  # shape [*mode]
 
     squares = [numbers**2 for numbers in np.ix_(*wave_numbers)]
     shell = np.rint(np.sqrt(sum(squares))).astype(np.intp)

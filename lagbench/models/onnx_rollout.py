@@ -198,14 +198,21 @@ def find_edges(
 
     if not np.isfinite(position).all():
         return np.zeros((2, 0), np.int64)
-    lengths = bounds[:, 1] - bounds[:, 0]
-    shifted = position - bounds[:, 0]
-    box = np.where(periodic, lengths, 0.0)
+    low, high = bounds.T
+    lengths = high - low
+    from_low = position - low
+    wrapped = np.where(periodic, np.mod(from_low, lengths), from_low)
     # scipy refuses points on the upper end of a periodic axis
-    shifted = np.where(periodic, np.mod(shifted, lengths), shifted)
-    shifted = np.where(periodic & (shifted >= lengths), 0.0, shifted)
-    boxsize = box if periodic.any() else None
-    pairs = cKDTree(shifted, boxsize=boxsize).query_pairs(radius, output_type="ndarray")
-    both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
-    order = np.lexsort((both[:, 0], both[:, 1]))
-    return np.ascontiguousarray(both[order].T)
+    is_at_end = periodic & (wrapped >= lengths)
+    wrapped = np.where(is_at_end, 0.0, wrapped)
+    box_size = None
+    if periodic.any():
+        box_size = np.where(periodic, lengths, 0.0)
+    tree = cKDTree(wrapped, boxsize=box_size)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    reversed_pairs = pairs[:, ::-1]
+    edges = np.concatenate([pairs, reversed_pairs])
+    edges = edges.astype(np.int64)
+    sender, receiver = edges.T
+    order = np.lexsort((sender, receiver))
+    return np.ascontiguousarray(edges[order].T)

@@ -46,10 +46,13 @@ def assign_particles(
         pool = np.flatnonzero(other_material == kind)
         if not pool.size:
             pool = np.arange(len(other_position))
-        chosen = pool[np.arange(len(ours)) * len(pool) // len(ours)]
+        numbers = np.arange(len(ours))
+        places = numbers * len(pool) // len(ours)
+        chosen = pool[places]
         here = _centre(position[ours], box)
         there = _centre(other_position[chosen], box)
-        partner[ours] = chosen[_match(here, there, box)]
+        matched = _match(here, there, box)
+        partner[ours] = chosen[matched]
     return partner
 
 
@@ -64,24 +67,30 @@ def _match(here: Floats, there: Floats, box: Box) -> NDArray[np.intp]:
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
-    if len(here) > MOST_TOGETHER:
-        partner = np.empty(len(here), np.intp)
-        axis = int(np.argmax(np.ptp(here, axis=0)))
-        half = len(here) // 2
+    count = len(here)
+    if count > MOST_TOGETHER:
+        # Halves along the longest side are matched apart.
+        partner = np.empty(count, np.intp)
+        sides = np.ptp(here, axis=0)
+        axis = int(np.argmax(sides))
+        half = count // 2
         order = np.argsort(here[:, axis], kind="stable")
         other_order = np.argsort(there[:, axis], kind="stable")
         for part in (slice(None, half), slice(half, None)):
             ours = order[part]
             others = other_order[part]
-            partner[ours] = others[_match(here[ours], there[others], box)]
+            matched = _match(here[ours], there[others], box)
+            partner[ours] = others[matched]
         return partner
     if box.is_periodic:
-        cost = np.zeros((len(here), len(there)))
+        cost = np.zeros((count, len(there)))
         for axis, is_periodic in enumerate(box.periodic):
             way = here[:, axis, None] - there[:, axis]
             if is_periodic:
-                way -= box.lengths[axis] * np.rint(way / box.lengths[axis])
+                period = box.lengths[axis]
+                way -= period * np.rint(way / period)
             cost += way**2
     else:
         cost = cdist(here, there, "sqeuclidean")
-    return np.asarray(linear_sum_assignment(cost)[1], np.intp)
+    _, matched = linear_sum_assignment(cost)
+    return np.asarray(matched, np.intp)

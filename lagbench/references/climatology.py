@@ -31,18 +31,20 @@ def predict(given: Given) -> Prediction:
     rng = np.random.Generator(np.random.PCG64(SEED))
     draws = rng.random(len(given.last))
     position = np.repeat(given.last[None], horizon, axis=0)
+    frames = np.arange(first, first + horizon)
     scenarios = long_enough(size)
     for kind in np.unique(given.material):
         sources = _images_with(given, int(kind), scenarios)
         members = np.flatnonzero(given.material == kind)
         for number, (scenario, mirror) in enumerate(sources):
-            motion = read_train_scenario(size.path(given.root, scenario))
+            path = size.path(given.root, scenario)
+            motion = read_train_scenario(path)
             followers = members[number :: len(sources)]
             pool = np.flatnonzero(motion.material == kind)
-            partner = pool[(draws[followers] * len(pool)).astype(np.intp)]
-            frames = np.arange(first, first + horizon)
-            paths = motion.positions_at(frames)[:, partner]
-            position[:, followers] = mirror.positions(paths)
+            place = draws[followers] * len(pool)
+            partner = pool[place.astype(np.intp)]
+            all_paths = motion.positions_at(frames)
+            position[:, followers] = mirror.positions(all_paths[:, partner])
     yield from position.astype("float32")
 
 

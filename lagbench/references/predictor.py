@@ -226,9 +226,11 @@ def linear_field(points: Floats, values: Floats) -> Field:
 
     def field(at: Floats) -> Floats:
         velocity = np.asarray(linear(at), np.float64)
-        beyond = np.isnan(velocity[:, 0])
-        if beyond.any():
-            velocity[beyond] = values[KDTree(points).query(at[beyond])[1]]
+        is_beyond = np.isnan(velocity[:, 0])
+        if is_beyond.any():
+            tree = KDTree(points)
+            _, nearest = tree.query(at[is_beyond])
+            velocity[is_beyond] = values[nearest]
         return velocity
 
     return field
@@ -244,21 +246,31 @@ def fitted_field(points: Floats, values: Floats) -> Field:
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
+    neighbour_count = min(NEAREST, len(points))
+    tiny = np.finfo(np.float64).tiny
 
     def field(at: Floats) -> Floats:
-        neighbours = tree.query(at, k=min(NEAREST, len(points)))
-        distance = np.asarray(neighbours[0])
+        neighbours = tree.query(at, k=neighbour_count)
+        distance = np.asarray(neighbours[0])  # shape [place, neighbour]
         nearest = np.asarray(neighbours[1])
+        farthest = distance.max(axis=1)[:, None]
+        weight = 1.0 / (distance**2 + 1e-6 * farthest**2 + tiny)
+
+        # The linear function has the value 1 and the way as its basis.
         way = points[nearest] - at[:, None]  # shape [place, neighbour, axis]
-        basis = np.concatenate([np.ones((*way.shape[:2], 1)), way], axis=2)
-        floor = np.finfo(np.float64).tiny
-        weight = 1.0 / (distance**2 + 1e-6 * distance.max(axis=1)[:, None] ** 2 + floor)
+        place_count = len(at)
+        one = np.ones((place_count, neighbour_count, 1))
+        basis = np.concatenate([one, way], axis=2)
         weighted = weight[..., None] * basis
         matrix = np.einsum("nki,nkj->nij", weighted, basis)
-        size = np.trace(matrix, axis1=1, axis2=2)
-        matrix += 1e-12 * size[:, None, None] * np.eye(basis.shape[2])
         right = np.einsum("nki,nkj->nij", weighted, values[nearest])
-        return np.asarray(np.linalg.solve(matrix, right)[:, 0])
+
+        # A little on the diagonal, for points that lie in one plane.
+        size = np.trace(matrix, axis1=1, axis2=2)
+        identity = np.eye(basis.shape[2])
+        matrix += 1e-12 * size[:, None, None] * identity
+        solution = np.linalg.solve(matrix, right)
+        return np.asarray(solution[:, 0])
 
     return field
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -164,15 +165,23 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
 
 def _unpack(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
     """Return packed values, NaN where missing, and the step of the packing."""
-    scale = float(np.ravel(variable.attrs["scale_factor"])[0])
-    offset = float(np.ravel(variable.attrs["add_offset"])[0])
-    fill = int(np.ravel(variable.attrs["_FillValue"])[0])
+    scale = float(_first_number(variable.attrs["scale_factor"]))
+    offset = float(_first_number(variable.attrs["add_offset"]))
+    fill = int(_first_number(variable.attrs["_FillValue"]))
     steps = variable[...]
-    has_valid_scale = np.isfinite([scale, offset]).all() and scale > 0.0
+    is_finite = np.isfinite([scale, offset]).all()
+    has_valid_scale = is_finite and scale > 0.0
     if steps.dtype != np.uint16 or not has_valid_scale:
         raise ValueError(f"{variable.name} is not packed as it should be")
-    values = np.where(steps == fill, np.nan, steps * scale + offset)
+    unpacked = steps * scale + offset
+    is_missing = steps == fill
+    values = np.where(is_missing, np.nan, unpacked)
     return values.astype(np.float32), scale
+
+
+def _first_number(attribute: Any) -> Any:  # noqa: ANN401 (types of netCDF)
+    """Return the number of an attribute, which may be an array."""
+    return np.ravel(attribute)[0]
 
 
 def _read_integers(variable: h5py.Dataset) -> tuple[int, ...]:

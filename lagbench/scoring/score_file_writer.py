@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,8 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
 
 
 def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
-    tallies = []
-    for i in card.scenarios:
-        tallies.append(card.tallies[SUBMISSION][i])
+    submission = card.tallies[SUBMISSION]
+    tallies = [submission[scenario] for scenario in card.scenarios]
     names = tallies[0].names
     frames = tallies[0].frames
 
@@ -64,24 +63,27 @@ def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     attributes["statistics"] = " ".join(names)
     file.setncatts(attributes)
 
-    _write_variable(file, "scenario", ("scenario",), np.array(card.scenarios, np.int32))
-    _write_variable(file, "frame", ("frame",), np.array(frames, np.int32))
+    scenario_numbers = np.array(card.scenarios, np.int32)
+    frame_numbers = np.array(frames, np.int32)
+    _write_variable(file, "scenario", ("scenario",), scenario_numbers)
+    _write_variable(file, "frame", ("frame",), frame_numbers)
     if card.skill is not None:
-        file.best_floor = card.skill.reference
-        values = card.scores[card.skill.reference][card.ranking].values
-        _write_variable(file, "best_floor_value", ("scenario",), values)
+        reference = card.skill.reference
+        file.best_floor = reference
+        reference_values = card.scores[reference][card.ranking].values
+        _write_variable(file, "best_floor_value", ("scenario",), reference_values)
 
-    values = _stack(tally.series(name) for name in names for tally in tallies)
-    measured = _stack(tally.measured(name) for name in names for tally in tallies)
-    shape = (len(names), len(tallies), len(frames))
     dims = ("statistic", "scenario", "frame")
-    _write_variable(file, "value", dims, values.reshape(shape).astype(np.float32))
-    _write_variable(file, "measured", dims, measured.reshape(shape).astype(np.int8))
+    shape = (len(names), len(tallies), len(frames))
+    values = np.empty(shape, np.float32)
+    is_measured = np.empty(shape, np.int8)
+    for row, name in enumerate(names):
+        for column, tally in enumerate(tallies):
+            values[row, column] = tally.series(name)
+            is_measured[row, column] = tally.measured(name)
+    _write_variable(file, "value", dims, values)
+    _write_variable(file, "measured", dims, is_measured)
     _write_preview(file.createGroup("preview"), card.preview)
-
-
-def _stack(rows: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    return np.stack(list(rows))
 
 
 def _write_preview(group: Any, preview: Preview) -> None:  # noqa: ANN401

@@ -314,8 +314,11 @@ def skill_gap(
     sides = ((first, first_reference), (second, second_reference))
     for stream, (seeds, reference) in enumerate(sides):
         base = _values_in(reference, seeds[0].scenarios)  # shape [scenario]
-        method = mean_over_seeds(np.stack([score.values for score in seeds]))
-        has_both = ~np.isnan(base) & ~np.isnan(method)
+        seed_values = [score.values for score in seeds]
+        method = mean_over_seeds(np.stack(seed_values))
+        has_base = ~np.isnan(base)
+        has_method = ~np.isnan(method)
+        has_both = has_base & has_method
         base = base[has_both]
         method = method[has_both]
         if not base.any() or not method.any():
@@ -324,8 +327,9 @@ def skill_gap(
                 where=seeds[0].metric.name,
                 expected="values of the method and of the naive predictor",
             )
-        ratio = float(np.mean(method)) / float(np.mean(base))
-        relative = (method / ratio - base) / float(np.mean(base))
+        base_mean = float(np.mean(base))
+        ratio = float(np.mean(method)) / base_mean
+        relative = (method / ratio - base) / base_mean
         resampling = resample(relative)
         if len(base) < FEWEST_FOR_INTERVAL or resampling is None:
             degrees.append(math.nan)
@@ -339,7 +343,9 @@ def skill_gap(
 
     interval = (math.nan, math.nan)
     if not any(math.isnan(freedom) for freedom in degrees):
-        stretch = student_quantile(min(degrees), 0.975) / student_quantile(1e6, 0.975)
+        student = student_quantile(min(degrees), 0.975)
+        normal = student_quantile(1e6, 0.975)
+        stretch = student / normal
         first_ratio = ratios[0] * np.exp(stretch * deviations[0])
         second_ratio = ratios[1] * np.exp(stretch * deviations[1])
         ordered = np.sort(second_ratio - first_ratio)

@@ -111,7 +111,9 @@ class ScenarioScan:
             return  # nearly always, and 20 times as fast
 
         # distance outside the box along an axis, shape [frame, particle]
-        beyond = np.fmax(box.lower_walls - block, block - box.upper_walls).max(axis=-1)
+        below = box.lower_walls - block
+        above = block - box.upper_walls
+        beyond = np.fmax(below, above).max(axis=-1)
         is_outside = beyond > cell
         if not is_outside.any():
             return
@@ -121,7 +123,8 @@ class ScenarioScan:
         self.outside_box += int(np.count_nonzero(is_outside))
         self.farthest = max(self.farthest, float(beyond[is_outside].max()))
         places = box.wrap(block)
-        is_outside_grid = ((places < 0) | (places > 1)).any(axis=-1)
+        is_axis_outside = (places < 0) | (places > 1)
+        is_outside_grid = is_axis_outside.any(axis=-1)
         self.outside_grid += int(np.count_nonzero(is_outside_grid))
         if self.first_lost is None and self.farthest > MAX_DISTANCE:
             frame, particle = first_index(beyond > MAX_DISTANCE)

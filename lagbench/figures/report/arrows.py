@@ -107,13 +107,15 @@ def _draw_arrows(fields: Fields, velocity: Floats, *, limit: float) -> Markup:
     grid = fields.grid
     every = math.ceil(max(grid.shape) / MOST_ARROWS)
     counted = np.argwhere(fields.counted)  # shape [node, 2]
-    is_shown = (counted - every // 2) % every == 0
-    column, row = counted[is_shown.all(axis=1)].T
+    is_axis_shown = (counted - every // 2) % every == 0
+    is_shown = is_axis_shown.all(axis=1)
+    column, row = counted[is_shown].T
 
     (left, right), (_, top) = grid.box.bounds
     scale = SIDE / (right - left)
-    node_x = grid.start[0] + (column + grid.origin) * grid.spacing
-    node_y = grid.start[1] + (row + grid.origin) * grid.spacing
+    start_x, start_y = grid.start
+    node_x = start_x + (column + grid.origin) * grid.spacing
+    node_y = start_y + (row + grid.origin) * grid.spacing
     x = (node_x - left) * scale
     y = (top - node_y) * scale
 
@@ -126,7 +128,8 @@ def _draw_arrows(fields: Fields, velocity: Floats, *, limit: float) -> Markup:
     along_x = length * u / divisor
     along_y = -length * v / divisor
 
-    levels = np.clip(share * LEVELS, 0, LEVELS - 1).astype(int)
+    levels = np.clip(share * LEVELS, 0, LEVELS - 1)
+    levels = levels.astype(int)
     data = [""] * LEVELS
     arrows = zip(x, y, along_x, along_y, levels, strict=True)
     for middle_x, middle_y, a, b, level in arrows:
@@ -134,7 +137,8 @@ def _draw_arrows(fields: Fields, velocity: Floats, *, limit: float) -> Markup:
     paths = []
     for level, level_data in enumerate(data):
         if level_data:
-            paths.append(tag("path", d=level_data, class_=f"q{level}"))
+            path = tag("path", d=level_data, class_=f"q{level}")
+            paths.append(path)
     return join(paths)
 
 
