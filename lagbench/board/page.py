@@ -412,24 +412,31 @@ def _overview_lines(method: MethodOverview, overview: SizeOverview) -> list[Mark
 def _overview_line(
     method: MethodOverview, overview: SizeOverview, *, variant_of: str | None = None
 ) -> Markup:
+    """Return the line of one method, with a cell for each data set."""
     rank = ""
     if method.rank is not None:
         rank = format_ranks(method.rank, method.rank_range)
-    name = [tag("span", clipped(method.name, 60), class_="name")]
+    short_name = clipped(method.name, 60)
+    name = [tag("span", short_name, class_="name")]
     if method.variants:
-        name.append(fold_button(method.method, len(method.variants)))
-    skill = [tag("span", text(method.mean_skill), class_="n")]
+        button = fold_button(method.method, len(method.variants))
+        name.append(button)
     if method.missing:
-        skill = [tag("span", f"not on {', '.join(method.missing)}", class_="ci gaps")]
+        missing = ", ".join(method.missing)
+        skill = tag("span", f"not on {missing}", class_="ci gaps")
+    else:
+        skill = tag("span", text(method.mean_skill), class_="n")
     cells = [
         tag("td", rank, class_="rank"),
         tag("th", *name, scope="row", class_="method"),
         tag("td", str(method.kind), class_="words"),
-        tag("td", *skill),
+        tag("td", skill),
     ]
     for tab in overview.tabs:
-        cells.append(_overview_cell(method.rows.get(tab.id), tab))
-    cells.append(tag("td", _lowest_level(method), class_="words"))
+        row = method.rows.get(tab.id)
+        cells.append(_overview_cell(row, tab))
+    level = _lowest_level(method)
+    cells.append(tag("td", level, class_="words"))
     if variant_of is None:
         return tag("tr", *cells)
     return tag("tr", *cells, class_="variant folded", data_variant_of=variant_of)

@@ -162,16 +162,15 @@ def make_table(tab: Tab, metrics: Mapping[str, Metric]) -> TableView:
         return loss
 
     lines = []
-    for place, row in enumerate(sorted(tab.lines, key=order)):
+    rows = sorted(tab.lines, key=order)
+    for place, row in enumerate(rows):
         cells = {}
         for key, column in columns.items():
-            cells[key] = _make_cell(
-                row,
-                column,
-                classes=tuple(painters[key].classes_of(row)),
-                ranks=key in (tab.ranking, SKILL.key),
-            )
-        lines.append(_make_line(row, place, cells))
+            classes = tuple(painters[key].classes_of(row))
+            ranks = key in (tab.ranking, SKILL.key)
+            cells[key] = _make_cell(row, column, classes=classes, ranks=ranks)
+        line = _make_line(row, place, cells)
+        lines.append(line)
     return TableView(
         tab=tab, columns=columns, presets=presets_of(tab, columns), lines=lines
     )

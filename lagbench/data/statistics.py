@@ -55,10 +55,15 @@ def scenario_moments(
     """
     recent: list[NDArray[np.float64]] = []
     counts = dict.fromkeys(QUANTITIES, 0)
-    totals: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
-    squares: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
+    totals: dict[str, list[NDArray[np.float64]]] = {}
+    squares: dict[str, list[NDArray[np.float64]]] = {}
+    for name in QUANTITIES:
+        totals[name] = []
+        squares[name] = []
+    highest_order = len(QUANTITIES) - 1
     for position in frames:
-        differences = [np.ascontiguousarray(position.T, dtype=np.float64)]
+        by_axis = np.ascontiguousarray(position.T, dtype=np.float64)
+        differences = [by_axis]
         for order, earlier in enumerate(recent):
             later = differences[-1]
             if order == 0:
@@ -66,11 +71,12 @@ def scenario_moments(
             else:
                 change = later - earlier
             differences.append(change)
-        recent = differences[: len(QUANTITIES) - 1]
+        recent = differences[:highest_order]
         for name, values in zip(QUANTITIES, differences, strict=False):
+            square = values * values
             counts[name] += values.shape[1]
             totals[name].append(values.sum(axis=1))
-            squares[name].append((values * values).sum(axis=1))
+            squares[name].append(square.sum(axis=1))
     moments = {}
     for name in QUANTITIES:
         moments[name] = Moments(

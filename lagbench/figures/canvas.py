@@ -131,20 +131,26 @@ def build_solid_palette() -> NDArray[np.uint8]:
     speeds = _exact_colours(build_speed_map())
     tables = [paper[None], speeds]
     for share in FADES:
-        tables.append(_blend(speeds[::2], paper, share=share))
+        faded = _blend(speeds[::2], paper, share=share)
+        tables.append(faded)
     for colour, blend_count in BLENDS[:2]:
         pure = parse_rgb(colour).astype(float)
         for number in range(1, blend_count + 1):
-            tables.append(_blend(pure[None], paper, share=number / blend_count))
+            share = number / blend_count
+            blended = _blend(pure[None], paper, share=share)
+            tables.append(blended)
 
-    palette = np.concatenate(tables).round().astype(np.uint8)
-    filling = np.repeat(palette[:1], PALETTE_SIZE - len(palette), axis=0)
+    exact = np.concatenate(tables)
+    palette = exact.round().astype(np.uint8)
+    missing = PALETTE_SIZE - len(palette)
+    filling = np.repeat(palette[:1], missing, axis=0)
     return np.concatenate([palette, filling])
 
 
 def colour_bytes(colour_map: ListedColormap) -> NDArray[np.uint8]:
     """Return the colours of a map as RGB bytes, shape [level, 3]."""
-    return _exact_colours(colour_map).round().astype(np.uint8)
+    exact = _exact_colours(colour_map)
+    return exact.round().astype(np.uint8)
 
 
 def _exact_colours(colour_map: ListedColormap) -> NDArray[np.float64]:
@@ -165,9 +171,13 @@ def choose_palette(image: Image) -> NDArray[np.uint8]:
     palettes = (build_palette(), build_solid_palette())
     errors = []
     for palette in palettes:
-        reduced = np.asarray(reduce_colours(image, palette).convert("RGB"), np.float64)
-        errors.append(float(np.sum((reduced - exact) ** 2)))
-    return palettes[int(np.argmin(errors))]
+        reduced_image = reduce_colours(image, palette)
+        reduced = np.asarray(reduced_image.convert("RGB"), np.float64)
+        difference = reduced - exact
+        squared_error = np.sum(difference**2)
+        errors.append(float(squared_error))
+    best = int(np.argmin(errors))
+    return palettes[best]
 
 
 def reduce_colours(image: Image, palette: NDArray[np.uint8]) -> Image:

@@ -48,10 +48,13 @@ class View:
 
     def __init__(self, box: Box) -> None:
         self._centre = box.centre
-        self._corners = np.array(list(itertools.product(*box.bounds)))
-        seen = (self._corners - self._centre) @ _VIEW.T
+        corners = itertools.product(*box.bounds)
+        self._corners = np.array(list(corners))
+        from_centre = self._corners - self._centre
+        seen = from_centre @ _VIEW.T
         reach = np.abs(seen).max(axis=0)  # right, up, away [length]
-        self.scale = (0.5 - RIM) / float(reach[:2].max())
+        largest = float(reach[:2].max())
+        self.scale = (0.5 - RIM) / largest
         """Side lengths of the picture per length of the box."""
         self._reach = float(reach[2])
 
@@ -64,7 +67,8 @@ class View:
         Returns:
             Shape [..., 2], in sides of the picture.
         """
-        seen = (np.asarray(position, np.float64) - self._centre) @ _VIEW[:2].T
+        from_centre = np.asarray(position, np.float64) - self._centre
+        seen = from_centre @ _VIEW[:2].T
         return np.asarray(0.5 + self.scale * seen)
 
     def depth(self, position: NDArray[np.floating]) -> Floats:
@@ -72,21 +76,25 @@ class View:
 
         The points [length] have the shape [..., axis].
         """
-        away = (np.asarray(position, np.float64) - self._centre) @ _VIEW[2]
-        return np.asarray(np.clip(0.5 + 0.5 * away / self._reach, 0.0, 1.0))
+        from_centre = np.asarray(position, np.float64) - self._centre
+        away = from_centre @ _VIEW[2]
+        depth = 0.5 + 0.5 * away / self._reach
+        return np.asarray(np.clip(depth, 0.0, 1.0))
 
     def edges(self) -> Iterator[tuple[Floats, bool]]:
         """Yield the edges of the box, shape [end, 2], and whether each lies in front.
 
         Edges at the nearest corner are in front of all particles.
         """
-        depths = self.depth(self._corners)
+        corners = self._corners
+        depths = self.depth(corners)
         nearest = int(np.argmin(depths))
-        for first, second in itertools.combinations(range(len(self._corners)), 2):
-            difference = self._corners[first] != self._corners[second]
-            if np.count_nonzero(difference) == 1:
-                ends = self.place(self._corners[[first, second]])
-                yield ends, nearest in (first, second)
+        for pair in itertools.combinations(range(len(corners)), 2):
+            ends = corners[list(pair)]
+            is_different = ends[0] != ends[1]
+            if np.count_nonzero(is_different) == 1:
+                is_in_front = nearest in pair
+                yield self.place(ends), is_in_front
 
     def wall(self, number: int) -> Floats:
         """Return the corners of a wall in the picture, around it, shape [4, 2].
@@ -94,9 +102,12 @@ class View:
         Walls are numbered left, right, bottom, top, front, back.
         """
         axis, side = divmod(number, 2)
-        place = np.sort(np.unique(self._corners[:, axis]))[side]
-        corners = self._corners[self._corners[:, axis] == place]
-        return self.place(corners[[0, 1, 3, 2]])
+        coordinate = self._corners[:, axis]
+        ends = np.unique(coordinate)  # ascending
+        is_on_wall = coordinate == ends[side]
+        corners = self._corners[is_on_wall]
+        around = [0, 1, 3, 2]
+        return self.place(corners[around])
 
 
 def shade(colours: NDArray[np.floating], depth: Floats, paper: Floats) -> Floats:
