@@ -292,17 +292,20 @@ class WallParticles:
         low, high = self._bounds.T
         # wall, place along it [length], place across it [length]
         rows: list[tuple[int, float, float]] = []
+        depths = spacing * (np.arange(WALL_LAYERS) + 0.5)
         for wall, axis in enumerate(WALL_AXES):
+            other_axis = 1 - axis
             length = high[axis] - low[axis]
             count = max(1, round(length / spacing))
             pitch = length / count
-            for depth in spacing * (np.arange(WALL_LAYERS) + 0.5):
+            for depth in depths:
                 if wall in LOW_WALLS:
-                    across = low[1 - axis] - depth
+                    across = low[other_axis] - depth
                 else:
-                    across = high[1 - axis] + depth
+                    across = high[other_axis] + depth
                 for number in range(count):
-                    rows.append((wall, low[axis] + pitch * (number + 0.5), across))
+                    along = low[axis] + pitch * (number + 0.5)
+                    rows.append((wall, along, across))
         walls, along, across = np.array(rows).T
         self.wall = walls.astype(int)  # which each particle lies beside
         self._along = along
@@ -315,13 +318,17 @@ class WallParticles:
 
         ``travel`` is how far walls have gone [length], shape [frame, wall].
         """
-        axis = np.array(WALL_AXES)[self.wall]
+        wall_axes = np.array(WALL_AXES)
+        axis = wall_axes[self.wall]
         low, high = self._bounds[axis].T
         start = self._along - low
-        along = low + (start + travel[frame, self.wall]) % (high - low)
+        moved = start + travel[frame, self.wall]
+        along = low + moved % (high - low)
         is_along = axis[:, None] == [0, 1]  # [particle, space]
-        places = np.where(is_along, along[:, None], self._across[:, None])
-        return np.concatenate([file.read("position", frame), places.astype(np.float32)])
+        exact_places = np.where(is_along, along[:, None], self._across[:, None])
+        wall_position = exact_places.astype(np.float32)
+        position = file.read("position", frame)
+        return np.concatenate([position, wall_position])
 
 
 def _read_runs(

@@ -70,15 +70,17 @@ def describe_start(given: Given, mirror: Mirror | None = None) -> InitialCloud:
     if mirror is not None:
         position = mirror.positions(position)
         velocity = mirror.velocities(velocity)
+    directions = DIRECTIONS[position.shape[1]]
     clouds = {}
     shares = {}
     for kind in np.unique(given.material).tolist():
         members = given.material == kind
-        projections = position[members] @ DIRECTIONS[position.shape[1]]
+        projections = position[members] @ directions
         clouds[kind] = np.quantile(projections, LEVELS, axis=0)
         shares[kind] = float(np.mean(members))
     sums = transfer(position, velocity, grid)
-    field = node_velocity(sums, float(sums.weight.max()))
+    largest_weight = float(sums.weight.max())
+    field = node_velocity(sums, largest_weight)
     return InitialCloud(clouds, shares, field)
 
 
@@ -93,11 +95,17 @@ def distance(start: InitialCloud, other: InitialCloud) -> float:
     variance = 0.0
     for kind, cloud in start.clouds.items():
         share = start.shares[kind]
-        squared_distance += share * float(np.mean((cloud - other.clouds[kind]) ** 2))
-        variance += share * float(np.mean(np.var(cloud, axis=0)))
-    difference = float(np.mean((start.field - other.field) ** 2))
+        difference = cloud - other.clouds[kind]
+        mean_square = float(np.mean(difference**2))
+        spread = np.var(cloud, axis=0)
+        squared_distance += share * mean_square
+        variance += share * float(np.mean(spread))
+    field_difference = start.field - other.field
+    squared_difference = float(np.mean(field_difference**2))
     squared_speed = float(np.mean(start.field**2)) or 1.0
-    return float(np.sqrt(squared_distance / variance + difference / squared_speed))
+    of_clouds = squared_distance / variance
+    of_fields = squared_difference / squared_speed
+    return float(np.sqrt(of_clouds + of_fields))
 
 
 def find_analog(given: Given) -> tuple[int, Mirror]:

@@ -147,9 +147,11 @@ def spread_subset(
     order = _order_of_columns(position, material, count)
     draws = np.random.Generator(np.random.PCG64(0)).random(count)
     groups = np.array_split(order, count)
-    return np.sort(
-        [group[int(u * len(group))] for u, group in zip(draws, groups, strict=True)]
-    )
+    carriers = []
+    for draw, group in zip(draws, groups, strict=True):
+        place = int(draw * len(group))
+        carriers.append(group[place])
+    return np.sort(carriers)
 
 
 def _order_of_columns(
@@ -159,48 +161,65 @@ def _order_of_columns(
 
     In three dimensions a slab across x holds columns across y.
     """
-    dimension = position.shape[1]
-    column = np.zeros(len(position), np.intp)
+    particles, dimension = position.shape
+    x = position[:, 0]
+    y = position[:, 1]
+    column = np.zeros(particles, np.intp)
     for kind in np.unique(material):
         members = np.flatnonzero(material == kind)
-        chosen_count = math.ceil(count * len(members) / len(position))
+        chosen_count = math.ceil(count * len(members) / particles)
         if dimension == 2:
-            column[members] = _rank(position[members, 0], math.isqrt(chosen_count))
+            columns = math.isqrt(chosen_count)
+            column[members] = _rank(x[members], columns)
             continue
-        side = max(1, round(float(np.cbrt(chosen_count))))
-        slab = _rank(position[members, 0], side)
+        root = float(np.cbrt(chosen_count))
+        side = max(1, round(root))
+        slab = _rank(x[members], side)
         for number in range(side):
             inside = members[slab == number]
-            column[inside] = number * side + _rank(position[inside, 1], side)
-    return np.lexsort((position[:, -1], column, material))
+            column_of_slab = _rank(y[inside], side)
+            column[inside] = number * side + column_of_slab
+    last_axis = position[:, -1]
+    return np.lexsort((last_axis, column, material))
 
 
 def _rank(coordinate: Floats, groups: int) -> NDArray[np.intp]:
     """Return in which of so many groups of nearly equal counts each one lies."""
-    place = np.argsort(np.argsort(coordinate, kind="stable"), kind="stable")
-    return np.asarray(place * groups // max(1, len(coordinate)), np.intp)
+    order = np.argsort(coordinate, kind="stable")
+    place = np.argsort(order, kind="stable")
+    count = max(1, len(coordinate))
+    return np.asarray(place * groups // count, np.intp)
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
-    interval = given.size.frame_interval
-    count = len(carriers)
-    if fills_box(given.size):
+    """Return the start of the solver: the particles that carry mass."""
+    size = given.size
+    interval = size.frame_interval
+    if fills_box(size):
         step_before = given.box.displacement(given.position[-3], given.position[-2])
         velocity = (1.5 * given.step - 0.5 * step_before) / interval
     else:
+        gravity = float(size.value("gravity"))
         velocity = given.step / interval
-        velocity[:, UP] -= 0.5 * float(given.size.value("gravity")) * interval
+        velocity[:, UP] -= 0.5 * gravity * interval
     # row 0 of a program never acts: row 1 is on the way to the first predicted frame
-    walls = given.walls[given.predicted_frames[0] - 1 :] / interval
+    last_given = given.predicted_frames[0] - 1
+    wall_velocity = given.walls[last_given:] / interval
+    if not given.driven:
+        wall_velocity = wall_velocity[0]
+    count = len(carriers)
+    dimension = given.box.dimension
+    viscosity = given.parameters.get("viscosity", 0.0)
+    friction = given.parameters.get("friction", 0.0)
     return InitialState(
         position=given.last[carriers],
         velocity=velocity[carriers],
-        affine=np.zeros((count, given.box.dimension, given.box.dimension)),
+        affine=np.zeros((count, dimension, dimension)),
         material=given.material[carriers],
         area=given.area,
-        viscosity=float(str(given.parameters.get("viscosity", 0.0))),
-        friction=float(str(given.parameters.get("friction", 0.0))),
-        wall_velocity=walls if given.driven else walls[0],
+        viscosity=float(str(viscosity)),
+        friction=float(str(friction)),
+        wall_velocity=wall_velocity,
     )
 
 
