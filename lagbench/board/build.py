@@ -818,9 +818,11 @@ def residual_histograms(preview: Preview) -> tuple[Histogram, ...]:
             no_shares = np.full(RESIDUAL_BINS, np.nan)
             histograms.append(Histogram(low=0.0, high=0.0, shares=no_shares))
             continue
-        greatest = float(np.max(np.abs(values)))
-        # a field without any error is one bin, not a division by 0
-        relative = values / greatest if greatest else values
+        magnitude = np.abs(values)
+        greatest = float(np.max(magnitude))
+        relative = values
+        if greatest:  # a field without any error is one bin, not a division by 0
+            relative = values / greatest
         bins = np.rint(relative * half).astype(int) + half
         counts = np.bincount(bins, minlength=RESIDUAL_BINS)
         shares = counts / values.size

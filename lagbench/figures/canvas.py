@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -112,8 +112,13 @@ def build_palette() -> NDArray[np.uint8]:
         pure = parse_rgb(colour).astype(float)
         for number in range(1, blend_count + 1):
             share = number / blend_count
-            tables.append(_blend(pure[None], paper, share=share))
+            blended = _blend(pure[None], paper, share=share)
+            tables.append(blended)
+    return _fill_up(tables)
 
+
+def _fill_up(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.uint8]:
+    """Return 256 colours: those of the tables, then paper, the first of them."""
     exact = np.concatenate(tables)
     palette = exact.round().astype(np.uint8)
     missing = PALETTE_SIZE - len(palette)
@@ -139,12 +144,7 @@ def build_solid_palette() -> NDArray[np.uint8]:
             share = number / blend_count
             blended = _blend(pure[None], paper, share=share)
             tables.append(blended)
-
-    exact = np.concatenate(tables)
-    palette = exact.round().astype(np.uint8)
-    missing = PALETTE_SIZE - len(palette)
-    filling = np.repeat(palette[:1], missing, axis=0)
-    return np.concatenate([palette, filling])
+    return _fill_up(tables)
 
 
 def colour_bytes(colour_map: ListedColormap) -> NDArray[np.uint8]:

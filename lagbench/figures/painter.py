@@ -128,12 +128,14 @@ class Painter:
         grid = scene.fields.grid
         nearest = []
         for axis, count in enumerate(grid.shape):
-            start = grid.start[axis]
-            node = (self._middle - start) * grid.cells - grid.origin
-            number = np.floor(node + 0.5).astype(np.intp)
+            distance = self._middle - grid.start[axis]
+            node = distance * grid.cells - grid.origin
+            number = np.floor(node + 0.5)
+            number = number.astype(np.intp)
             nearest.append(np.clip(number, 0, count - 1))
-        column = nearest[0]
-        row = grid.shape[1] - 1 - nearest[1][::-1]
+        column, upward_row = nearest
+        last_row = grid.shape[1] - 1
+        row = last_row - upward_row[::-1]
 
         # first row at the top, as pixels have it
         rows = scene.vorticity.T[::-1]

@@ -260,7 +260,8 @@ def _draw_moving_wall(
     _fill_rectangle(axes, band, MOVING, order=0.6)
 
     along = velocity / np.abs(velocity).max()
-    across = np.array([-along[1], along[0]])
+    along_x, along_y = along
+    across = np.array([-along_y, along_x])
     centre = np.array([x + width / 2, y + height / 2])
     length = np.abs(along) * max(width, height)
     size = 0.3 * min(width, height)
@@ -269,8 +270,10 @@ def _draw_moving_wall(
         middle = centre + share * length
         tip = middle + size * along
         tail = middle - 0.7 * size * along
-        corners = [tip, tail + half_base, tail - half_base]
-        axes.fill(*np.transpose(corners), color=PAPER, lw=0, zorder=0.7)
+        left = tail + half_base
+        right = tail - half_base
+        corners_x, corners_y = np.transpose([tip, left, right])
+        axes.fill(corners_x, corners_y, color=PAPER, lw=0, zorder=0.7)
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) -> None:
@@ -323,8 +326,12 @@ def _project(
     low, high = np.transpose(recording.size.box.bounds)
     share = np.clip((position - low) / (high - low), 0.0, 1.0)
     if panel is Panel.FRONT:
-        return position[:, :2], VIEW_FADE * share[:, 2], 1.0
-    return position[:, [0, 2]], VIEW_FADE * (1.0 - share[:, 1]), 1.0
+        place = position[:, :2]
+        depth = VIEW_FADE * share[:, 2]
+    else:
+        place = position[:, [0, 2]]
+        depth = VIEW_FADE * (1.0 - share[:, 1])
+    return place, depth, 1.0
 
 
 def _box_patch(axes: Axes, recording: Recording) -> Rectangle:

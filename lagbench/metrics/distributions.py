@@ -232,22 +232,28 @@ def spectrum_error(pair: FramePair) -> float:
     ranges = []
     for axis, is_periodic in enumerate(periodic):
         across = tuple(other for other in range(counted.ndim) if other != axis)
-        places = np.flatnonzero(counted.any(axis=across))
+        has_counted = counted.any(axis=across)
+        places = np.flatnonzero(has_counted)
         if is_periodic:
             ranges.append(slice(None))
         else:
-            ranges.append(slice(places[0], places[-1] + 1))
+            end = places[-1] + 1
+            ranges.append(slice(places[0], end))
     cuboid = tuple(ranges)
 
-    true = energy_spectrum(pair.truth.fields.velocity[cuboid], periodic)
-    predicted = energy_spectrum(pair.prediction.fields.velocity[cuboid], periodic)
+    true_velocity = pair.truth.fields.velocity[cuboid]
+    predicted_velocity = pair.prediction.fields.velocity[cuboid]
+    true = energy_spectrum(true_velocity, periodic)
+    predicted = energy_spectrum(predicted_velocity, periodic)
     has_energy = true > 0.0
     if not has_energy.any():
         return math.nan
 
     ratio = predicted[has_energy] / true[has_energy]
-    decades = np.log10(np.clip(ratio, 10.0**-DECADES, 10.0**DECADES))
-    return math.sqrt(float(np.mean(decades**2)))
+    clipped = np.clip(ratio, 10.0**-DECADES, 10.0**DECADES)
+    decades = np.log10(clipped)
+    mean_square = float(np.mean(decades**2))
+    return math.sqrt(mean_square)
 
 
 METRICS = metrics_of(globals())

@@ -138,11 +138,14 @@ class OnnxModel:
             "wall_velocity": given.walls / self.size.frame_interval,
             "viscosity": np.asarray(given.viscosity, np.float64),
         }
+        packed_arrays = {}
+        for name, array in arrays.items():
+            packed_arrays[name] = pack(array)
         return {
             "path": str(self.path.absolute()),
             "frames": frames,
             "radius": self.size.task.radius,
-            "arrays": {name: pack(array) for name, array in arrays.items()},
+            "arrays": packed_arrays,
         }
 
 

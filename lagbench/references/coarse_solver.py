@@ -229,13 +229,18 @@ def _leaders(
     """Return for each other particle the index of the nearest of its material that
     carries mass.
     """
+    carrier_position = given.last[carriers]
+    carrier_material = given.material[carriers]
+    other_position = given.last[others]
+    other_material = given.material[others]
     leader = np.zeros(len(others), np.intp)
-    for kind in np.unique(given.material[others]):
-        pool = np.flatnonzero(given.material[carriers] == kind)
-        led = np.flatnonzero(given.material[others] == kind)
-        tree = given.box.tree(given.last[carriers[pool]])
-        points = given.box.tree_points(given.last[others[led]])
-        leader[led] = pool[tree.query(points)[1]]
+    for kind in np.unique(other_material):
+        pool = np.flatnonzero(carrier_material == kind)
+        led = np.flatnonzero(other_material == kind)
+        tree = given.box.tree(carrier_position[pool])
+        points = given.box.tree_points(other_position[led])
+        _, nearest = tree.query(points)
+        leader[led] = pool[nearest]
     return leader
 
 

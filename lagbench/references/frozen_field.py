@@ -34,12 +34,17 @@ def decay(position: Floats, box: Box) -> float:
         position: the given frames [length], shape [frame, particle, axis].
         box: box that holds the particles.
     """
-    steps = box.displacement(position[:-1], position[1:])
-    speed = np.sqrt(np.mean(steps**2, axis=(1, 2)))
-    if len(speed) < 2 or not speed.all():
+    before = position[:-1]
+    after = position[1:]
+    steps = box.displacement(before, after)
+    mean_square = np.mean(steps**2, axis=(1, 2))
+    speed = np.sqrt(mean_square)  # of each step
+    count = len(speed)
+    if count < 2 or not speed.all():
         return 1.0
-    slope = np.polyfit(np.arange(len(speed)), np.log(speed), 1)[0]
-    return min(1.0, float(np.exp(slope)))
+    slope, _ = np.polyfit(np.arange(count), np.log(speed), 1)
+    factor = float(np.exp(slope))
+    return min(1.0, factor)
 
 
 def predict(given: Given) -> Prediction:

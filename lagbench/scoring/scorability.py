@@ -84,8 +84,8 @@ def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
     frames = task.config.predicted_frames
     with task.opened(scenario) as opened:
         area = opened.scenario.area
-        first = opened.file.read("position", slice(frames[0], frames[0] + 1))[0]
-        last = opened.file.read("position", slice(frames[-1], frames[-1] + 1))[0]
+        first = opened.file.read("position", frames[0])
+        last = opened.file.read("position", frames[-1])
     return Cloud(first, area), Cloud(last, area)
 
 

@@ -445,19 +445,21 @@ class WindowReader:
     def read(self, index: int) -> Window:
         """Return a window as NumPy arrays of its own."""
         scenario, frame = self.place(index)
-        frames = self.store.frames(scenario, frame, frame + self.length)
+        end = frame + self.length
+        frames = self.store.frames(scenario, frame, end)
         material, walls = self.store.constants(scenario)
         if walls is not None:
-            walls = walls[frame : frame + self.length]
+            walls = walls[frame:end]
         window = copy_window(frames, material, walls, scenario, frame)
-        window = window._replace(viscosity=self.store.viscosity(scenario))
+        viscosity = self.store.viscosity(scenario)
+        window = window._replace(viscosity=viscosity)
         force = self.store.body_force(scenario)
         if force is not None:
-            shown_frames = slice(frame, frame + self.length)
-            window = window._replace(body_force=force[shown_frames].copy())
+            shown_force = force[frame:end].copy()
+            window = window._replace(body_force=shown_force)
         if not self.origin:
             return window
-        first_frame = self.store.frames(scenario, 0, 1)[0]
+        (first_frame,) = self.store.frames(scenario, 0, 1)
         return window._replace(origin=first_frame.copy())
 
 

@@ -61,9 +61,12 @@ def draw_sequential_map(field: NDArray[np.floating], limit: float) -> bytes:
 
 def _draw_map(field: NDArray[np.floating], limit: float, palette: Bytes) -> bytes:
     """Return a picture of values at nodes, shape [x node, y node]; NaN is grey."""
-    share = np.clip(np.nan_to_num(field / limit, nan=0.0), -1.0, 1.0)
+    relative = np.nan_to_num(field / limit, nan=0.0)
+    share = np.clip(relative, -1.0, 1.0)
     level = np.round(LEVELS + LEVELS * share)
-    index = np.where(np.isnan(field), NO_VALUE, level).astype(np.uint8)
+    is_missing = np.isnan(field)
+    index = np.where(is_missing, NO_VALUE, level)
+    index = index.astype(np.uint8)
     rows = index.T[::-1]  # first row at the top
     return encode_indexed_png(np.ascontiguousarray(rows), palette)
 
