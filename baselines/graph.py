@@ -259,8 +259,8 @@ def nearest_edges(
     ranks = np.arange(1, most_ranks + 1)
     reach = radius * (1.0 + MARGIN)
     tree = KDTree(points)
-    _, neighbours = tree.query(points, k=ranks, distance_upper_bound=reach)
-
+    answer = tree.query(points, k=ranks, distance_upper_bound=reach)
+    neighbours = np.asarray(answer[1])
     receiver = np.arange(count)[:, None]
     sender = np.minimum(neighbours, count - 1)  # ``count`` stands for no neighbour
     way = x[receiver] - x[sender]
@@ -287,7 +287,7 @@ def _is_neighbour(neighbours: NDArray[np.intp], count: int) -> NDArray[np.bool_]
     receiver = np.arange(count)[:, None]
     is_particle = neighbours < count
     is_other = neighbours != receiver
-    return is_particle & is_other
+    return np.asarray(is_particle & is_other)
 
 
 def _nearest_pairs(
