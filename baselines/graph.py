@@ -261,6 +261,7 @@ def nearest_edges(
     tree = KDTree(points)
     answer = tree.query(points, k=ranks, distance_upper_bound=reach)
     neighbours = np.asarray(answer[1])
+
     receiver = np.arange(count)[:, None]
     sender = np.minimum(neighbours, count - 1)  # ``count`` stands for no neighbour
     way = x[receiver] - x[sender]
