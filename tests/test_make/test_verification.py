@@ -74,7 +74,7 @@ def measured(
 def test_what_was_generated_passes(
     generated: GenerationResult, measured: Registry, unmeasured: Registry
 ) -> None:
-    """Every subset is there and equal to the registry, as is the whole; without a hash
+    """Every subset is there and equal to datasets.yaml, as is the whole; without a hash
     none claims that.
     """
     result = verify_tiny(generated.root, measured, complete=True)
@@ -84,8 +84,8 @@ def test_what_was_generated_passes(
         assert report.missing == ()
         assert report.wrong == ()
         assert report.extra == ()
-        assert report.verdict == "equal to measured.yaml"
-    assert result.verdict == "equal to measured.yaml"
+        assert report.verdict == "equal to datasets.yaml"
+    assert result.verdict == "equal to datasets.yaml"
     assert result.dataset_sha256 == generated.dataset_sha256
     assert result.problems == ()
     assert result.warnings == ()
@@ -108,8 +108,8 @@ def test_a_missing_file_is_a_warning_unless_all_are_wanted(
     assert result.warnings == ("test lacks 3",)
     verdicts = [report.verdict for report in result.subsets]
     assert verdicts == [
-        "equal to measured.yaml",
-        "equal to measured.yaml",
+        "equal to datasets.yaml",
+        "equal to datasets.yaml",
         "incomplete",
     ]
     result.check()
