@@ -17,7 +17,8 @@ from typer.testing import Result
 
 PARTS = ("where:", "expected:", "got:", "fix:")
 
-ADOPT = ("adopt", "-o", "mine", "--radius", "0.1", "--frame-interval", "0.25")
+ADOPT = "adopt -o mine --radius 0.1 --frame-interval 0.25"
+TRAIN = "train curl-noise --size tiny --baseline"
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +57,16 @@ def write_transposed(source: Path, target: Path) -> None:
     """Write the predictions of a file with frames behind particles."""
     dimensions = ("scenario", "particle", "frame", "space")
     with netCDF4.Dataset(source) as good, netCDF4.Dataset(target, "w") as file:
-        file.setncatts({name: good.getncattr(name) for name in good.ncattrs()})
+        for name in good.ncattrs():
+            file.setncattr(name, good.getncattr(name))
         for name, dimension in good.dimensions.items():
             file.createDimension(name, len(dimension))
         for name in ("scenario", "frame"):
-            file.createVariable(name, good[name].dtype, (name,))[:] = good[name][:]
-        values = np.moveaxis(good["position"][:].filled(), 1, 2)
-        file.createVariable("position", "f4", dimensions)[:] = values
+            numbers = file.createVariable(name, good[name].dtype, (name,))
+            numbers[:] = good[name][:]
+        values = good["position"][:].filled()
+        position = file.createVariable("position", "f4", dimensions)
+        position[:] = np.moveaxis(values, 1, 2)
 
 
 FAULTS: dict[str, Callable[[netCDF4.Dataset], None]] = {
@@ -72,57 +76,53 @@ FAULTS: dict[str, Callable[[netCDF4.Dataset], None]] = {
     "another": lambda file: file.setncattr("split", "cavitty"),
 }
 
-MISTAKES: dict[str, tuple[str, ...]] = {
-    "a misspelt split": ("generate", "cavitty", "--size", "tiny"),
-    "a misspelt size": ("generate", "cavity", "--size", "tny"),
-    "a misspelt split in a file": ("score", "another.nc"),
-    "no data": ("plot", "cavity", "--size", "tiny", "--root", "nothing"),
-    "no data to score by": ("score", "good.nc", "--root", "nothing"),
-    "a picture with another suffix": ("plot", "SCENARIO", "-o", "x.jpg"),
-    "a film with another suffix": ("animate", "SCENARIO", "-o", "x.avi"),
-    "a file that is no predictions": ("score", "notes.txt"),
-    "a file that is not there": ("score", "goood.nc"),
-    "an empty file": ("score", "empty.nc"),
-    "no folder to write to": ("score", "good.nc", "-o", "notes.txt/scores"),
-    "values that are no numbers": ("score", "nan.nc"),
-    "other units": ("score", "units.nc"),
-    "exchanged axes": ("score", "axes.nc"),
-    "an old version": ("score", "old.nc"),
-    "an unknown option": ("score", "good.nc", "--spilt", "cavity"),
-    "an unknown command": ("scroe", "good.nc"),
-    "a word for a number": ("generate", "cavity", "--workers", "two"),
-    "nothing to score": ("score",),
-    "no such scenario": ("plot", "curl-noise", "--size", "tiny", "--scenario", "99"),
-    "no such frame": ("plot", "SCENARIO", "--frame", "999"),
-    "no such picture": ("plot", "SCENARIO", "--kind", "vortcity"),
-    "no such film": ("animate", "SCENARIO", "--kind", "streamlines", "-o", "x.gif"),
-    "no such metric": ("compare", "good.nc", "persistence", "--metric", "mse"),
-    "no such reference": ("compare", "good.nc", "persistance"),
-    "another split to compare": ("compare", "good.nc", "still", "--split", "cavity"),
-    "a text as trajectories": (*ADOPT, "notes.txt"),
-    "a folder without trajectories": (*ADOPT, "."),
-    "exchanged axes of trajectories": (*ADOPT, "axes.npy"),
-    "trajectories with NaN": (*ADOPT, "nan.npy"),
-    "trajectories in millimetres": (*ADOPT, "metres.npy"),
-    "a period without bounds": (*ADOPT, "runs.npy", "--periodic", "x"),
-    "an axis that is none": (
-        *ADOPT,
-        *("runs.npy", "--periodic", "q", "--bounds", "0,1,0,1"),
-    ),
-    "bounds in another form": (*ADOPT, "runs.npy", "--bounds", "0..1"),
-    "bounds from high to low": (*ADOPT, "runs.npy", "--bounds", "1,0,0,1"),
-    "YAML that is none": (
-        *("train", "curl-noise", "--size", "tiny", "--baseline", "gns"),
-        *("--recipe", "bad.yaml"),
-    ),
-    "a misspelt model": ("train", "curl-noise", "--size", "tiny", "--baseline", "gnss"),
-    "a misspelt setting": (
-        *("train", "curl-noise", "--size", "tiny", "--baseline", "gns"),
-        *("--set", "training.step=3"),
-    ),
-    "weights that are none": ("predict", "notes.txt", "-o", "x.nc"),
-    "a description that is not there": ("submit", "good.nc", "--from", "meta.yaml"),
+MISTAKES = {
+    "a misspelt split": "generate cavitty --size tiny",
+    "a misspelt size": "generate cavity --size tny",
+    "a misspelt split in a file": "score another.nc",
+    "no data": "plot cavity --size tiny --root nothing",
+    "no data to score by": "score good.nc --root nothing",
+    "a picture with another suffix": "plot SCENARIO -o x.jpg",
+    "a film with another suffix": "animate SCENARIO -o x.avi",
+    "a file that is no predictions": "score notes.txt",
+    "a file that is not there": "score goood.nc",
+    "an empty file": "score empty.nc",
+    "no folder to write to": "score good.nc -o notes.txt/scores",
+    "values that are no numbers": "score nan.nc",
+    "other units": "score units.nc",
+    "exchanged axes": "score axes.nc",
+    "an old version": "score old.nc",
+    "an unknown option": "score good.nc --spilt cavity",
+    "an unknown command": "scroe good.nc",
+    "a word for a number": "generate cavity --workers two",
+    "nothing to score": "score",
+    "no such scenario": "plot curl-noise --size tiny --scenario 99",
+    "no such frame": "plot SCENARIO --frame 999",
+    "no such picture": "plot SCENARIO --kind vortcity",
+    "no such film": "animate SCENARIO --kind streamlines -o x.gif",
+    "no such metric": "compare good.nc persistence --metric mse",
+    "no such reference": "compare good.nc persistance",
+    "another split to compare": "compare good.nc still --split cavity",
+    "a text as trajectories": f"{ADOPT} notes.txt",
+    "a folder without trajectories": f"{ADOPT} .",
+    "exchanged axes of trajectories": f"{ADOPT} axes.npy",
+    "trajectories with NaN": f"{ADOPT} nan.npy",
+    "trajectories in millimetres": f"{ADOPT} metres.npy",
+    "a period without bounds": f"{ADOPT} runs.npy --periodic x",
+    "an axis that is none": f"{ADOPT} runs.npy --periodic q --bounds 0,1,0,1",
+    "bounds in another form": f"{ADOPT} runs.npy --bounds 0..1",
+    "bounds from high to low": f"{ADOPT} runs.npy --bounds 1,0,0,1",
+    "YAML that is none": f"{TRAIN} gns --recipe bad.yaml",
+    "a misspelt model": f"{TRAIN} gnss",
+    "a misspelt setting": f"{TRAIN} gns --set training.step=3",
+    "weights that are none": "predict notes.txt -o x.nc",
+    "a description that is not there": "submit good.nc --from meta.yaml",
 }
+
+
+def has_all_parts(message: str) -> bool:
+    """Say whether a message has where, expected, got and fix."""
+    return all(part in message for part in PARTS)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -136,23 +136,20 @@ def test_a_mistake_is_told_with_all_that_is_needed(
     monkeypatch.chdir(files)
     monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
     scenario = bench.size.path(bench.root, 3)
-    words = []
-    for word in MISTAKES[mistake]:
-        words.append(str(scenario) if word == "SCENARIO" else word)
-    result = run(*words)
+    words = MISTAKES[mistake].split()
+    result = run(*(scenario if word == "SCENARIO" else word for word in words))
     assert result.exit_code in {1, 2, 3, 4, 5}
-    missing = [part for part in PARTS if part not in result.stderr]
-    assert not missing, result.stderr
+    assert has_all_parts(result.stderr), result.stderr
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")
 def test_a_folder_that_refuses_is_told(
     run: Callable[..., Result], files: Path, bench: ScoreBench
 ) -> None:
-    command = ("score", files / "good.nc", "--root", bench.root, "-o", "/proc/x")
-    result = run(*command)
+    predictions = files / "good.nc"
+    result = run("score", predictions, "--root", bench.root, "-o", "/proc/x")
     assert result.exit_code == 5
-    assert all(part in result.stderr for part in PARTS), result.stderr
+    assert has_all_parts(result.stderr), result.stderr
 
 
 def test_a_library_that_is_missing_is_told(
@@ -161,8 +158,8 @@ def test_a_library_that_is_missing_is_told(
     """The fix is the command that installs it."""
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda *_: None)
-    command = ("train", "curl-noise", "--size", "tiny", "--baseline", "gns")
-    result = run(*command, "--root", bench.root)
+    command = f"{TRAIN} gns"
+    result = run(*command.split(), "--root", bench.root)
     assert result.exit_code == 2
-    assert all(part in result.stderr for part in PARTS), result.stderr
+    assert has_all_parts(result.stderr), result.stderr
     assert "pip install" in result.stderr

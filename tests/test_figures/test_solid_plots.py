@@ -16,7 +16,7 @@ from lagbench.errors import UsageError
 from lagbench.figures.animate import Film
 from lagbench.figures.panels import Panel, limit_of
 from lagbench.figures.plot import KINDS, choose_moments, plot_frame
-from lagbench.figures.recording import open_recording
+from lagbench.figures.recording import Recording, open_recording
 
 FRAMES = 3
 BOTTOM = 0.125  # of the box of fluid-3d tiny
@@ -26,34 +26,45 @@ def fill(low: tuple[float, ...], high: tuple[float, ...]) -> NDArray[np.float32]
     """Return particles that fill a block, four along a cell of the score grid."""
     axes = []
     for start, end in zip(low, high, strict=True):
-        axes.append(np.arange(start + 1 / 128, end, 1 / 64))
-    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        axis = np.arange(start + 1 / 128, end, 1 / 64)
+        axes.append(axis)
+    grid = np.meshgrid(*axes, indexing="ij")
+    return np.stack(grid, axis=-1).reshape(-1, 3)
 
 
 def liquid(start: NDArray[np.floating]) -> xr.Dataset:
     """Return a scenario of fluid-3d tiny whose particles rotate about the y axis."""
     middle = start.mean(axis=0)
+    x, y, z = (start - middle).T
     frames = []
     for frame in range(FRAMES):
-        cosine, sine = np.cos(0.02 * frame), np.sin(0.02 * frame)
-        turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-        frames.append((start - middle) @ turn.T + middle)
+        angle = 0.02 * frame
+        turned_x = np.cos(angle) * x + np.sin(angle) * z
+        turned_z = np.cos(angle) * z - np.sin(angle) * x
+        turned = np.stack([turned_x, y, turned_z], axis=-1)
+        frames.append(middle + turned)
+    position = np.stack(frames).astype(np.float32)
+    material = np.zeros(len(start), np.int8)
     return xr.Dataset(
         {
-            "position": (
-                ("frame", "particle", "axis"),
-                np.stack(frames).astype(np.float32),
-            ),
-            "material": ("particle", np.zeros(len(start), np.int8)),
+            "position": (("frame", "particle", "axis"), position),
+            "material": ("particle", material),
             "particle_mass": ((), 1.0 / 64**3),
         },
         coords={"frame": np.arange(FRAMES)},
-        attrs={"split": "fluid-3d", "size": "tiny", "scenario": 3, "family": "made-up"},
+        attrs={
+            "split": "fluid-3d",
+            "size": "tiny",
+            "scenario": 3,
+            "family": "made-up",
+        },
     )
 
 
-BLOCK = liquid(fill((0.2, 0.2, 0.6), (0.5, 0.5, 0.85)))  # behind the middle
-FILM = liquid(fill((0.2, BOTTOM, 0.2), (0.8, BOTTOM + 0.03, 0.8)))
+BEHIND = fill((0.2, 0.2, 0.6), (0.5, 0.5, 0.85))  # the middle of the box
+BLOCK = liquid(BEHIND)
+ON_THE_FLOOR = fill((0.2, BOTTOM, 0.2), (0.8, BOTTOM + 0.03, 0.8))
+FILM = liquid(ON_THE_FLOOR)
 
 
 @pytest.fixture
@@ -71,15 +82,21 @@ def texts(monkeypatch: pytest.MonkeyPatch) -> list[Text]:
 
 
 def words_of(texts: list[Text]) -> list[str]:
-    return [text.get_text() for text in texts if text.get_text()]
+    words = [text.get_text() for text in texts]
+    return [word for word in words if word]
+
+
+def is_told(part: str, texts: list[Text]) -> bool:
+    """Say whether a text holds a part."""
+    return any(part in words for words in words_of(texts))
 
 
 def test_a_liquid_is_shown_from_three_sides(texts: list[Text]) -> None:
     """Vorticity and streamlines of a splash say little: they come on request."""
     plot_frame(BLOCK, 2, "all.png")
-    titles = ("Particles by speed", "From the front", "From above")
-    for title in titles:
-        assert title in words_of(texts)
+    words = words_of(texts)
+    for title in ("Particles by speed", "From the front", "From above"):
+        assert title in words
 
 
 @pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
@@ -92,15 +109,16 @@ def test_a_slice_lies_where_the_liquid_is(texts: list[Text], kind: Panel) -> Non
         assert np.isfinite(scene.vorticity).sum() > 3
         assert np.isfinite(limit_of(kind, scene))
     plot_frame(BLOCK, 2, "slice.png", kind=kind)
-    assert any(f"across z at {place:.2f}" in words for words in words_of(texts))
+    assert is_told(f"across z at {place:.2f}", texts)
 
 
 def test_where_material_is_too_thin_the_panel_says_so(texts: list[Text]) -> None:
     """A film of liquid on the floor has no vorticity on the grid."""
     with open_recording(FILM) as recording:
-        assert limit_of(Panel.VORTICITY, recording.scene(2)) == 1.0
+        scene = recording.scene(2)
+        assert limit_of(Panel.VORTICITY, scene) == 1.0
     plot_frame(FILM, 2, "thin.png", kind=Panel.VORTICITY)
-    assert any("too thin" in words for words in words_of(texts))
+    assert is_told("too thin", texts)
 
 
 def test_a_film_without_any_vorticity_is_refused() -> None:
@@ -109,15 +127,18 @@ def test_a_film_without_any_vorticity_is_refused() -> None:
     assert caught.value.where == "--kind"
 
 
+def layers_of(recording: Recording) -> set[int | None]:
+    """Return the layers of the slices of all frames."""
+    return {recording.scene(frame).layer for frame in range(FRAMES)}
+
+
 def test_a_film_shows_one_slice() -> None:
     """The slice of the best frame is that of all frames."""
     with open_recording(BLOCK) as recording:
-        layers = {recording.scene(frame).layer for frame in range(FRAMES)}
+        layers = layers_of(recording)
         recording.fix_layer(range(FRAMES))
         assert recording.layer in layers
-        assert {recording.scene(frame).layer for frame in range(FRAMES)} == {
-            recording.layer
-        }
+        assert layers_of(recording) == {recording.layer}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -136,8 +157,9 @@ def test_no_text_is_cut_off(texts: list[Text], kind: str) -> None:
 
 @pytest.mark.parametrize("kind", [Panel.FRONT, Panel.ABOVE])
 def test_views_are_of_three_dimensions(tmp_path: Path, kind: Panel) -> None:
+    scenario = write_swirl(tmp_path)
     with pytest.raises(UsageError) as caught:
-        plot_frame(write_swirl(tmp_path), 1, tmp_path / "x.png", kind=kind)
+        plot_frame(scenario, 1, tmp_path / "x.png", kind=kind)
     assert caught.value.where == "--kind"
 
 
@@ -146,5 +168,6 @@ def test_moments_of_a_row_lie_apart(frames: int, steps: int) -> None:
     """Neighbours of a short recording are a sixth of it apart, not a frame or two."""
     moments = choose_moments(frames)
     assert len(moments) == 6
-    assert (moments[0], moments[-1]) == (0, frames - 1)
+    assert moments[0] == 0
+    assert moments[-1] == frames - 1
     assert min(np.diff(moments)) == steps
