@@ -298,7 +298,10 @@ class NeuralMPM(Baseline):
     def _encode_context(
         self, state: GridState, network: ContextNetwork, *, average: bool
     ) -> Tensor:
-        """Return the context of each window, mirror-averaged if asked for."""
+        """Return the context of each window: the network's numbers about its scenario.
+
+        They are mirror-averaged if the options and the caller want it.
+        """
         stencil = self.grid.stencil(state.position, state.layer)
         fields, _ = self.encoder.encode(state, stencil)
         images = [fields]

@@ -251,16 +251,20 @@ class ParticleGrid(nn.Module):
             m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
 
         This is the weak form of the material-point method (Sulsky, Chen and Schreyer
-        1994), with grad per cell; a is 0 where there is no matter. As the b_i sum to 1
-        and the s_p are symmetric, momentum and angular momentum of the nodes are
-        conserved. The result has shape [layer, 2 frame, x node, y node].
+        1994). Every particle has mass 1, and grad counts in cells; a is 0 where there
+        is no matter. As sum b_i = 1 and sum b_i x_i = x at every particle, and the s_p
+        are symmetric, momentum and angular momentum of the nodes are conserved. The
+        result has shape [layer, 2 frame, x node, y node]; x and y of a frame are
+        neighbours.
 
         The box has two dimensions and walls.
 
         Args:
             stencil: nodes around ``position``.
             position: positions [length], shape [particle, 2].
-            stress: components (xx, xy, yy), shape [particle, frame, 3].
+            stress: s_p, the stress times the volume of a particle of mass 1, as
+                components (xx, xy, yy) [length cell/frame^2], shape [particle, frame,
+                3].
             mass: result of :meth:`spread` for values of 1.
         """
         columns, rows = self.shape

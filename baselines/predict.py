@@ -505,7 +505,8 @@ def _training_attributes(
 ) -> dict[str, Any]:
     """Return the file's attributes of the training: provenance, seed and budget.
 
-    The validations of another size are left out: they compare with nothing here.
+    The validations of a training at another size are left out: no validation of this
+    size could be compared with them.
     """
     provenance = training_provenance(checkpoint).model_copy(
         update={"prediction_overrides": tuple(settings)}

@@ -246,7 +246,10 @@ class Library:
 def nearest(
     states: States, feature: Floats, *, count: int, without: int | None
 ) -> tuple[list[State], list[float]]:
-    """Return the nearest states of different mirrored scenarios, and distances."""
+    """Return the nearest states and their distances.
+
+    Of each scenario and mirror image only the nearest state counts.
+    """
     difference = states.features - feature
     square = np.sum(difference**2, axis=1)
     distance = np.sqrt(square)

@@ -270,10 +270,11 @@ class NodalStressND:
 
     @ti.func
     def load_along(self, fields: Template, s: ti.i32, p: ti.i32) -> Value:
-        """Return what a particle holds along x, y and z; zeros where no z is.
+        """Return a particle's vectors in three fields: one field for each of x, y, z.
 
-        Read once, before anything is written: LLVM cannot know that the fields do not
-        overlap, and would read again after each write.
+        In two dimensions the third is zero. Callers load before they write anything:
+        LLVM cannot know that the fields do not overlap, and would read again after each
+        write.
         """
         third = ti.Vector([0.0, 0.0, 0.0, 0.0])
         if ti.static(self.dimension == 3):
@@ -621,8 +622,8 @@ class NodalStressND:
     ) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            # Read first, so that the address of the fields stays out of the loops: else
-            # no vectors.
+            # Read before the loops: with the address of the fields inside them LLVM
+            # would not vectorise.
             fill = self.fill[0]
             for n in range(nodes):
                 self.clear(0, n)

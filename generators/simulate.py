@@ -303,7 +303,7 @@ def perturbed_substep_count(size: Size, scenario: int) -> int:
 def measure_predictability(
     job: SimulationJob, report: Report
 ) -> dict[int, tuple[float, ...]]:
-    """Simulate perturbed runs of scenarios beside their files.
+    """Simulate scenarios again, perturbed, and compare them with their files.
 
     Returns:
         The predictability limit of each scenario: the RMSE of each predicted frame

@@ -155,8 +155,10 @@ class InitialState:
     parameters: Mapping[str, int | float | str] = field(default_factory=dict)
 
     def force_towards(self, frame: int) -> NDArray[np.float64]:
-        """Return the acceleration of each layer from the frame before up to this one
-        [length/s^2], shape [layer, axis]; without a force there are no layers.
+        """Return the acceleration that acts on the way to a frame [length/s^2].
+
+        The shape is [layer, axis]; without a force there are no layers. After the end
+        of the program its last row acts.
         """
         program = self.body_force
         if program is None:

@@ -78,7 +78,10 @@ class SuperGAT(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the aggregate of each node, and the link loss in training."""
+        """Return the aggregate of each node, and the link loss in training.
+
+        SuperGAT has no use for the updates of the edges, ``edge``.
+        """
         scaled_node = node / self.scale
         if not self.training:
             return self.scale * self.conv(scaled_node, edge_index), {}
@@ -88,7 +91,7 @@ class SuperGAT(Operator):
         pairs = draw_unlinked_pairs(edge_index, len(node), pair_count, generator)
         aggregate = self.scale * self.conv(scaled_node, edge_index, pairs)
         link_loss = self.conv.get_attention_loss()
-        # They would hold the whole graph of gradients.
+        # PyG keeps both for that loss: they would hold the whole graph of gradients.
         self.conv.att_x = None
         self.conv.att_y = None
         return aggregate, {"link": link_loss}
