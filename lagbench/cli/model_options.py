@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from lagbench.data.layout import quote_root
 from lagbench.data.local import locate_split
 from lagbench.data.registry import NO_GENERATOR
 from lagbench.errors import WorkFailedError, check_installed
@@ -58,7 +59,7 @@ def root_option(split: str, root: Path | None) -> str:
     location = locate_split(split, root=root)
     entry = location.registry.split(location.name)
     if root is not None:
-        return f" --root {root}"
+        return f" --root {quote_root(root)}"
     if entry.generator == NO_GENERATOR:
-        return f" --root {location.root}"
+        return f" --root {quote_root(location.root)}"
     return ""

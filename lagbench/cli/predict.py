@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, UsageError, format_count
 
@@ -224,8 +226,8 @@ def _describe(
         yield f"  frozen  {', '.join(marks)}: not finite from there on"
     root_option = ""
     if root:
-        root_option = f" --root {root}"
-    yield f"next: lagbench score {result.path}{root_option}"
+        root_option = f" --root {quote_root(root)}"
+    yield f"next: lagbench score {shlex.quote(str(result.path))}{root_option}"
 
 
 def _compare_speed(result: PredictionResult, solver: SolverBench) -> str:

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import pickle
+import shlex
 import socket
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from typer.testing import CliRunner
 from lagbench.__main__ import app
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
+from lagbench.cli.model_options import root_option
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
@@ -426,3 +428,10 @@ def test_two_processes_make_the_weights_of_one(
         # Adam's step where a gradient is nearly nothing follows its rounding: compare
         # norms, not numbers.
         assert (value - other[name]).norm() <= 1e-4 * value.norm(), name
+
+
+def test_a_root_with_a_space_is_quoted_in_the_next_command(tmp_path: Path) -> None:
+    """A reader copies the command as it stands."""
+    root = tmp_path / "my data"
+    root.mkdir()
+    assert shlex.split(root_option("cavity", root)) == ["--root", str(root)]
