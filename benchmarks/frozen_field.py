@@ -35,7 +35,12 @@ FALLEN = 0.8
 SHARE = 0.75
 ERROR = 0.8
 ACTIVE = 80
-KINDS = {"fluid": "family", "multimaterial": "pair"}
+KINDS = {
+    "fluid": "family",
+    "multimaterial": "pair",
+    "fluid-3d": "family",
+    "multimaterial-3d": "pair",
+}
 HEAD = (
     "| data set | frozen field below 0.8 | median correlation | largest | median error "
     "| accepted |\n|---|---:|---:|---:|---:|---|"

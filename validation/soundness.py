@@ -26,7 +26,7 @@ from lagbench.data.manifest import FileEntry, read_manifest
 from lagbench.data.registry import Size, load
 from lagbench.errors import DataError, LagbenchError
 
-FREE_SURFACES = ("fluid", "multimaterial", "fluid-3d")
+FREE_SURFACES = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
 FULL_BOXES = (
     "cavity",
     "curl-noise",

@@ -64,6 +64,7 @@ NOT_IN_DEMO = (
     "curl-noise-3d",
     "cavity-3d",
     "fluid-3d",
+    "multimaterial-3d",
 )
 """Splits whose kernels the demo would have to compile besides."""
 

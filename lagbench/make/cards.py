@@ -20,6 +20,13 @@ from lagbench.figures.tables import escape, markdown
 from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
 from .croissant import KEYWORDS, croissant_json
 
+_PAIRS_WITH_SNOW = (
+    "Pairs with snow come to rest first. `active_frames` of a file says for how "
+    "many predicted frames "
+    "its scenario moves: up to the last with at least 1 % of the greatest "
+    "kinetic energy."
+)
+
 # what a reader of one split's card must know beside its description
 NOTES: Mapping[str, str] = {
     "cavity": (
@@ -31,12 +38,8 @@ NOTES: Mapping[str, str] = {
         "The wall velocities of all frames, those to be predicted included, are part "
         "of what is given. `wall_velocity` at frame f is what acts from frame f-1 to f."
     ),
-    "multimaterial": (
-        "Pairs with snow come to rest first. `active_frames` of a file says for how "
-        "many predicted frames "
-        "its scenario moves: up to the last with at least 1 % of the greatest "
-        "kinetic energy."
-    ),
+    "multimaterial": _PAIRS_WITH_SNOW,
+    "multimaterial-3d": _PAIRS_WITH_SNOW,
     "fluid": (
         "Scenarios of train differ in length: the longer ones are those that still "
         "move. `active_frames` of "

@@ -50,7 +50,7 @@ MIN_CELLS = 16
 MIN_PARTICLES = 100
 """Least particles that carry the mass on a coarser grid."""
 
-SOLVED = ("fluid", "multimaterial", "fluid-3d")
+SOLVED = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
 """Splits that are solved; in full boxes the projection solver is cheaper and better."""
 
 

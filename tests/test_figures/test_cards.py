@@ -271,7 +271,7 @@ def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
         manifest = Manifest(split=name, size="tiny", version=size.version)
         text = card(size, manifest)
         has_note = "Pairs with snow come to rest first" in text
-        assert has_note == (name == "multimaterial")
+        assert has_note == name.startswith("multimaterial")
 
 
 @pytest.mark.parametrize(

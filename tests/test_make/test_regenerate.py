@@ -22,6 +22,7 @@ OWN_KERNELS = (
     "curl-noise-3d",
     "cavity-3d",
     "fluid-3d",
+    "multimaterial-3d",
 )
 OF_THIS_TURN = (
     *(name for name in SPLITS if name not in OWN_KERNELS),
