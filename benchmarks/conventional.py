@@ -38,7 +38,7 @@ from validation.experiment import (
 
 
 @ti.data_oriented
-class Conventional:
+class ConventionalSquare:
     """Fields and kernels of one cavity whose top wall moves along x.
 
     Args:
@@ -297,7 +297,7 @@ def main() -> int:
     )
     parameters = solver_parameters(experiment)
     state = initial_state(experiment)
-    box = Conventional(parameters, state)
+    box = ConventionalSquare(parameters, state)
     box.substep()
     ti.sync()
     wall_times = []  # [s]

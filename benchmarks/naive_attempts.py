@@ -85,7 +85,7 @@ class States:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Case:
+class AnalogCase:
     """A scenario to predict, and what may be looked at."""
 
     given: Given
@@ -128,7 +128,7 @@ class Attempt:
 
     name: str
     what: str
-    predict: Callable[[Case, Choice], Clouds]
+    predict: Callable[[AnalogCase, Choice], Clouds]
     choices: tuple[Choice, ...]
 
 
@@ -282,12 +282,12 @@ class Predictors:
     def __init__(self, library: Library) -> None:
         self.library = library
 
-    def _kinds(self, case: Case) -> tuple[int, ...]:
+    def _kinds(self, case: AnalogCase) -> tuple[int, ...]:
         kinds = np.unique(case.given.material)
         return tuple(kinds.tolist())
 
     def _compare(
-        self, case: Case, steps: int, choice: Choice, kinds: tuple[int, ...]
+        self, case: AnalogCase, steps: int, choice: Choice, kinds: tuple[int, ...]
     ) -> tuple[list[State], list[float]]:
         """Return the analogs of the state after some frames of flight."""
         weight = float(choice.get("velocity_weight", 20.0))
@@ -301,7 +301,11 @@ class Predictors:
         return nearest(states, feature, count=count, without=case.without)
 
     def _paths(
-        self, case: Case, state: State, position: Floats, members: NDArray[np.intp]
+        self,
+        case: AnalogCase,
+        state: State,
+        position: Floats,
+        members: NDArray[np.intp],
     ) -> Callable[[int], Floats]:
         """Return the way of the members' partners: frames on to [member, axis]."""
         image, material = self.library.motion(state)
@@ -324,7 +328,7 @@ class Predictors:
 
     def _after_flight(
         self,
-        case: Case,
+        case: AnalogCase,
         flown: int,
         follow: Callable[[int], Floats],
     ) -> Clouds:
@@ -341,12 +345,12 @@ class Predictors:
             clouds[frame] = box.inside(position)
         return clouds
 
-    def _flown(self, case: Case, choice: Choice) -> int:
+    def _flown(self, case: AnalogCase, choice: Choice) -> int:
         horizon = len(case.given.predicted_frames)
         lag = int(choice.get("lag", 0))
         return min(horizon, case.flight + lag)
 
-    def shared(self, case: Case, choice: Choice) -> Clouds:
+    def shared(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Our own: the particles share the nearest states."""
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
@@ -369,7 +373,7 @@ class Predictors:
             return self._fly(case)
         return self._after_flight(case, flown, follow)
 
-    def weighted(self, case: Case, choice: Choice) -> Clouds:
+    def weighted(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Nearer states get more particles: shares fall with the distance."""
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
@@ -400,7 +404,7 @@ class Predictors:
 
         return self._after_flight(case, flown, follow)
 
-    def barycentre(self, case: Case, choice: Choice) -> Clouds:
+    def barycentre(self, case: AnalogCase, choice: Choice) -> Clouds:
         """The mean cloud of the nearest states: matched anew at every frame, then
         averaged with weights that fall with the distance.
         """
@@ -432,7 +436,7 @@ class Predictors:
 
         return self._after_flight(case, flown, follow)
 
-    def per_material(self, case: Case, choice: Choice) -> Clouds:
+    def per_material(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Every material has analogs of its own, with any company."""
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
@@ -455,7 +459,7 @@ class Predictors:
 
         return self._after_flight(case, flown, follow)
 
-    def windows(self, case: Case, choice: Choice) -> Clouds:
+    def windows(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Analogs are sought anew after every window, from the predicted state."""
         flown = self._flown(case, choice)
         weight = 20.0
@@ -489,7 +493,7 @@ class Predictors:
             clouds[frame] = box.inside(cloud)
         return clouds
 
-    def from_the_start(self, case: Case, choice: Choice) -> Clouds:
+    def from_the_start(self, case: AnalogCase, choice: Choice) -> Clouds:
         """A mixture of whole scenarios that start alike: climatology by neighbours."""
         kinds = self._kinds(case)
         weight = float(choice["velocity_weight"])
@@ -522,7 +526,7 @@ class Predictors:
 
         return self._after_flight(case, 0, follow)
 
-    def damped(self, case: Case, choice: Choice) -> Clouds:
+    def damped(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Free flight with bounces: walls return a share of the speed, and friction
         takes a share per frame.
         """
@@ -551,7 +555,7 @@ class Predictors:
                 clouds[frame] = position.copy()
         return clouds
 
-    def to_the_pool(self, case: Case, choice: Choice) -> Clouds:
+    def to_the_pool(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Our own prediction, drawn towards a flat pool on the floor."""
         clouds = self.shared(case, choice)
         pool = _pool(case)
@@ -562,7 +566,7 @@ class Predictors:
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
-    def with_climatology(self, case: Case, choice: Choice) -> Clouds:
+    def with_climatology(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Our own prediction, drawn towards the mean cloud of train at that frame."""
         clouds = self.shared(case, choice)
         images = []
@@ -580,7 +584,9 @@ class Predictors:
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
-    def _mean_cloud(self, case: Case, frame: int, images: Sequence[State]) -> Floats:
+    def _mean_cloud(
+        self, case: AnalogCase, frame: int, images: Sequence[State]
+    ) -> Floats:
         """Return particles spread over the clouds of train at a frame.
 
         The shape is [particle, axis]; materials are those of the case.
@@ -603,7 +609,7 @@ class Predictors:
             climate[members] = train_particles[drawn]
         return climate
 
-    def _fly(self, case: Case) -> Clouds:
+    def _fly(self, case: AnalogCase) -> Clouds:
         """Return free flight in every frame."""
         clouds = {}
         for frame in case.frames:
@@ -612,7 +618,7 @@ class Predictors:
         return clouds
 
 
-def _share_since_flight(case: Case, frame: int, choice: Choice) -> float:
+def _share_since_flight(case: AnalogCase, frame: int, choice: Choice) -> float:
     """Return how far a prediction is drawn to a target: more with time since flight."""
     most = float(choice["most"])
     time_scale = float(choice["time"])  # [frame]
@@ -635,7 +641,7 @@ def _matched(here: Floats, there: Floats, material: NDArray[np.int8]) -> Floats:
     return np.asarray(there[partner])
 
 
-def _pool(case: Case) -> Floats:
+def _pool(case: AnalogCase) -> Floats:
     """Return particles spread evenly over a flat pool that has the given area."""
     box = case.given.box
     low = box.lower_walls
@@ -758,7 +764,7 @@ def measured_frames(size: Size, every: int, active: int | None) -> tuple[int, ..
     return tuple(frames) or (end - 1,)
 
 
-def cases_of_train(size: Size, root: Path) -> dict[int, Case]:
+def cases_of_train(size: Size, root: Path) -> dict[int, AnalogCase]:
     """Return the scenarios of train, each to be predicted from the other ones."""
     cases = {}
     for scenario in long_enough(size):
@@ -767,14 +773,14 @@ def cases_of_train(size: Size, root: Path) -> dict[int, Case]:
             given = given_in(file, size, root)
         active = active_frames(path)
         frames = measured_frames(size, CHOSEN_EVERY, active)
-        cases[scenario] = Case(
+        cases[scenario] = AnalogCase(
             given=given, frames=frames, without=scenario, thinning=THINNING
         )
     return cases
 
 
 def error_on_train(
-    cases: Mapping[int, Case], library: Library, attempt: Attempt, choice: Choice
+    cases: Mapping[int, AnalogCase], library: Library, attempt: Attempt, choice: Choice
 ) -> float:
     """Return the mean distance of clouds when scenarios of train predict each other."""
     errors = []
@@ -812,7 +818,7 @@ def score_on_test(size: Size, root: Path, attempt: Attempt, choice: Choice) -> f
     for scenario in task.scenarios:
         with task.opened(scenario) as truth:
             given = given_in(truth.file, size, root)
-        case = Case(given=given, frames=frames, without=None, thinning=1)
+        case = AnalogCase(given=given, frames=frames, without=None, thinning=1)
         clouds = attempt.predict(case, choice)
         shape = (len(horizon), *given.last.shape)
         position = np.empty(shape, np.float32)
@@ -848,7 +854,7 @@ def run(
     root: Path,
     attempt: Attempt,
     *,
-    cases: Mapping[int, Case],
+    cases: Mapping[int, AnalogCase],
     library: Library,
 ) -> dict[str, object]:
     """Return the chosen parameters of an attempt and its errors."""

@@ -38,7 +38,7 @@ TARGET = 3.0
 
 
 @ti.data_oriented
-class Conventional:
+class ConventionalCube:
     """Fields and kernels of a periodic cube."""
 
     def __init__(self, parameters, state: InitialState) -> None:
@@ -223,7 +223,7 @@ def run_side(side: str, grid: int, substeps: int) -> dict[str, float]:
             offline_cache=True,
             log_level=ti.ERROR,
         )
-        cube = Conventional(parameters, state)
+        cube = ConventionalCube(parameters, state)
         cube.substep()
         ti.sync()
         start_time = time.process_time()

@@ -50,6 +50,7 @@ PRODUCT_FOLDERS = (
     "lagbench",
     "generators",
     "baselines",
+    "benchmarks",
     "studies",
     "validation",
 )
