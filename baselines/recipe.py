@@ -364,9 +364,12 @@ def recipe_for(
 
 
 def _has_recipes_of(split: str, file: _RecipeFile) -> bool:
-    """Return whether a file has any recipe of a split, or of any split."""
+    """Return whether a file has any recipe of a split.
+
+    One for all splits does not count: there is none for the size that was asked for.
+    """
     splits = {recipe.partition("/")[0] for recipe in file.recipes}
-    return not splits.isdisjoint((split, ANY))
+    return split in splits
 
 
 def _no_recipe_of_split(

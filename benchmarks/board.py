@@ -215,7 +215,7 @@ def make_entry(size: Size, target: Path, number: int, *, first: int) -> None:
         authors=("A. Author", "B. <script>alert(1)</script>", f"C. {number}"),
         affiliation="An institute",
         code=f"https://example.org/{method}",
-        date=datetime.date(2026, 1, 1) + datetime.timedelta(days=number),
+        date=datetime.date(2026, 1, 1) + datetime.timedelta(days=number % 300),
         notes="Made up. " * (number % 9),
         training="a little noise",
         budget=EntryBudget(windows=1000 * number, cpu_hours=0.25),

@@ -178,7 +178,17 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
 def draw_bodies(
     size: Size, scenario: int, rng: RandomSource, draw_shape: ShapeDraw
 ) -> InitialState:
-    """Draw the bodies of a scenario in the plane or in space, by their shapes."""
+    """Draw the bodies of a scenario in the plane or in space, by their shapes.
+
+    Args:
+        size: the split and size.
+        scenario: number of the scenario; it chooses the materials.
+        rng: source of the draws.
+        draw_shape: draws a shape for a material, in the plane or in space.
+
+    Raises:
+        WorkFailedError: the bodies find no places apart from one another.
+    """
     materials = _materials(size, scenario)
     shapes = [draw_shape(rng, material, size) for material in materials]
     bodies = _place_apart(rng, size, shapes)

@@ -78,7 +78,7 @@ at Re 1000: S. Albensoeder, H. C. Kuhlmann, J. Comput. Phys. 206 (2005) 536-558,
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validity:
+class CaseResult:
     """What a case measured."""
 
     measured: float
@@ -181,7 +181,7 @@ def vortex(position: Array, speed: float) -> tuple[Array, Array]:
     return velocity, affine
 
 
-def taylor_green(grid: int = 32) -> Validity:
+def taylor_green(grid: int = 32) -> CaseResult:
     """Energy of the decaying vortex in a square after ten turnovers."""
     speed = 0.2
     k = 2.0 * np.pi
@@ -199,12 +199,12 @@ def taylor_green(grid: int = 32) -> Validity:
     solver.advance(steps)
     ratio = energy(solver) / before
     truth = float(np.exp(-4.0 * viscosity * k**2 * steps * parameters.dt))
-    return Validity(
+    return CaseResult(
         measured=ratio, truth=truth, deviation=abs(ratio / truth - 1.0), tolerance=0.01
     )
 
 
-def poiseuille(grid: int = 32) -> Validity:
+def poiseuille(grid: int = 32) -> CaseResult:
     """Profile of steady reverse Poiseuille flow, in units of its largest speed."""
     speed = 0.2
     viscosity = speed * 0.5 / 10.0
@@ -234,7 +234,7 @@ def poiseuille(grid: int = 32) -> Validity:
         mean += nodal_velocity(solver)[..., 0].mean(axis=0) / 20.0
     height = (np.arange(grid) + 0.5) / grid
     error = float(np.sqrt(np.mean((mean / speed - profile(height)) ** 2)))
-    return Validity(
+    return CaseResult(
         measured=float(np.abs(mean).max() / speed),
         truth=1.0,
         deviation=error,
@@ -288,7 +288,7 @@ def spectral_dissipation(
     return np.array(dissipation)
 
 
-def taylor_green_3d(grid: int = 24) -> Validity:
+def taylor_green_3d(grid: int = 24) -> CaseResult:
     """Peak of the dissipation of the vortex in a cube, in units of k U^3."""
     speed = 0.2
     k = 2.0 * np.pi
@@ -313,7 +313,7 @@ def taylor_green_3d(grid: int = 24) -> Validity:
     dissipation = -np.gradient(np.array(energies), times)
     truth = float(spectral_dissipation(32, 100.0, duration=8.0, dt=0.05).max())
     peak = float(dissipation[2:-1].max())
-    return Validity(
+    return CaseResult(
         measured=peak, truth=truth, deviation=abs(peak / truth - 1.0), tolerance=0.08
     )
 
@@ -354,7 +354,7 @@ def _centre_line(
     return mean
 
 
-def thin_cavity(grid: int = 24) -> Validity:
+def thin_cavity(grid: int = 24) -> CaseResult:
     """The cavity in a thin box, periodic along z, against Ghia's u at Re 100."""
     u = _centre_line(grid, 4, is_thin=True, turns=25.0)
     height = np.r_[0.0, (np.arange(grid) + 0.5) / grid, 1.0]
@@ -362,7 +362,7 @@ def thin_cavity(grid: int = 24) -> Validity:
     assert ghia is not None  # Reynolds number 100 is tabulated
     measured = CubicSpline(height, np.r_[0.0, u, 1.0])(Y)
     error = float(np.sqrt(np.nanmean((measured - np.array(ghia.u)) ** 2)))
-    return Validity(
+    return CaseResult(
         measured=float(u.min()),
         truth=float(np.nanmin(ghia.u)),
         deviation=error,
@@ -370,7 +370,7 @@ def thin_cavity(grid: int = 24) -> Validity:
     )
 
 
-def cube(grid: int = 24, reference_cells: int = 32) -> Validity:
+def cube(grid: int = 24, reference_cells: int = 32) -> CaseResult:
     """The driven cube at Re 100 against the staggered grid, along its centre line."""
     u = _centre_line(grid, grid, is_thin=False, turns=20.0)
     box = Box.from_bounds([(0.0, 1.0)] * 3)
@@ -386,7 +386,7 @@ def cube(grid: int = 24, reference_cells: int = 32) -> Validity:
     height = (np.arange(grid) + 0.5) / grid
     truth = np.interp(height, np.r_[0.0, cell, 1.0], np.r_[0.0, faces, 1.0])
     error = float(np.sqrt(np.mean((u - truth) ** 2)))
-    return Validity(
+    return CaseResult(
         measured=float(u.min()),
         truth=float(faces.min()),
         deviation=error,
@@ -394,14 +394,14 @@ def cube(grid: int = 24, reference_cells: int = 32) -> Validity:
     )
 
 
-def cube_at_1000(grid: int = 32) -> Validity:
+def cube_at_1000(grid: int = 32) -> CaseResult:
     """The driven cube at Re 1000 beside Albensoeder and Kuhlmann (2005)."""
     u = _centre_line(grid, grid, is_thin=False, turns=40.0, reynolds=1000.0)
     height = np.r_[0.0, (np.arange(grid) + 0.5) / grid, 1.0]
     profile = CubicSpline(height, np.r_[0.0, u, 1.0])
     published = ALBENSOEDER[:, 1]
     error = float(np.sqrt(np.mean((profile(ALBENSOEDER[:, 0]) - published) ** 2)))
-    return Validity(
+    return CaseResult(
         measured=float(u.min()),
         truth=float(published.min()),
         deviation=error,
@@ -409,7 +409,7 @@ def cube_at_1000(grid: int = 32) -> Validity:
     )
 
 
-CASES: dict[str, Callable[[], Validity]] = {
+CASES: dict[str, Callable[[], CaseResult]] = {
     "taylor-green": taylor_green,
     "poiseuille": poiseuille,
     "taylor-green-3d": taylor_green_3d,

@@ -64,7 +64,7 @@ SAVED = "scores.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repetition:
+class SeasonComparison:
     """How the scores of a repeated run compare with those on the board."""
 
     has_same_bytes: bool
@@ -82,7 +82,7 @@ class SeasonResult:
     predicted: list[str] = field(
         default_factory=list
     )  # as in "cavity/mini/gns, seed 0"
-    comparison: Repetition | None = None  # where the scores were compared only
+    comparison: SeasonComparison | None = None  # where the scores were compared only
 
     @property
     def exit_code(self) -> int:
@@ -169,13 +169,13 @@ def run_season(
 
 def compare_scores(
     stored: SeasonScores, scores: SeasonScores, *, has_same_bytes: bool
-) -> Repetition:
+) -> SeasonComparison:
     """Return the greatest relative difference of two runs of the same season."""
     before = list(_values_of(stored))
     after = list(_values_of(scores))
     scale = np.maximum(np.abs(before), np.finfo(np.float32).tiny)
     relative = np.abs(np.subtract(after, before)) / scale
-    return Repetition(
+    return SeasonComparison(
         has_same_bytes=has_same_bytes,
         greatest=float(np.max(relative)),
         values=len(before),

@@ -170,7 +170,7 @@ def _predict_onnx(
         f"{result.path}: {result.method}, {result.scenarios} scenarios, "
         f"{result.frames} frames",
         f"  model   {result.seconds_per_frame:.3g} s per frame, one thread",
-        f"next: lagbench score {result.path}",
+        _next_command(result.path, root),
     ]
     print_result(result, lines, as_json=as_json, quiet=quiet)
 
@@ -224,10 +224,15 @@ def _describe(
         for scenario, frame in result.diverged.items():
             marks.append(f"scenario {scenario} at frame {frame}")
         yield f"  frozen  {', '.join(marks)}: not finite from there on"
+    yield _next_command(result.path, root)
+
+
+def _next_command(path: Path, root: Path | None) -> str:
+    """Return the line that says how to score the predictions."""
     root_option = ""
     if root:
         root_option = f" --root {quote_root(root)}"
-    yield f"next: lagbench score {shlex.quote(str(result.path))}{root_option}"
+    return f"next: lagbench score {shlex.quote(str(path))}{root_option}"
 
 
 def _compare_speed(result: PredictionResult, solver: SolverBench) -> str:

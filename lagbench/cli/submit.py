@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -136,7 +137,7 @@ def _describe(result: SubmitResult) -> Iterator[str]:
         )
     board_option = ""
     if not is_default_board:
-        board_option = f" --board {result.board}"
+        board_option = f" --board {shlex.quote(str(result.board))}"
     yield (
         f"next: lagbench leaderboard check{board_option}; "
         f"to see the page: lagbench leaderboard build{board_option}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -221,7 +222,8 @@ def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
     yield f"  weights    {result.weights}"
     if result.size == "tiny":
         yield "hint: tiny is for tests: it is too small to learn from; try --size mini"
-    yield f"next: lagbench predict {result.weights}{root_option} -o predictions.nc"
+    weights = shlex.quote(str(result.weights))
+    yield f"next: lagbench predict {weights}{root_option} -o predictions.nc"
 
 
 def _describe_time(result: TrainingResult) -> str:

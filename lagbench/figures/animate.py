@@ -21,7 +21,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, suggest_name
 from lagbench.work.progress import watched
 
-from .canvas import DPI, figure, pixels_of, shrink
+from .canvas import DPI, figure, pixels_of, renamed, shrink
 from .colours import INK, MUTED
 from .encoders import encode_gif, encode_mp4
 from .painter import Painter, unpack
@@ -134,7 +134,7 @@ def check_ending(path: Path) -> None:
             where="--output",
             expected=f"a name ending in {' or '.join(SUFFIXES)}",
             got=path,
-            fix=f"name it {path.with_suffix(SUFFIXES[0]).name}",
+            fix=f"name it {renamed(path, SUFFIXES[0])}",
         )
 
 

@@ -256,6 +256,16 @@ def png_bytes(drawn: Figure) -> bytes:
         return buffer.getvalue()
 
 
+def renamed(path: Path, ending: str) -> str:
+    """Return a name like that of a file, with another ending.
+
+    >>> renamed(Path("out/a.txt"), ".png"), renamed(Path(".."), ".png")
+    ('a.png', 'picture.png')
+    """
+    stem = path.stem.rstrip(".") or "picture"
+    return f"{stem}{ending}"
+
+
 def save(drawn: Figure, output: str | Path) -> Path:
     """Write the figure to a file, with equal bytes every time; return its path.
 
@@ -273,7 +283,7 @@ def save(drawn: Figure, output: str | Path) -> Path:
             where="--output",
             expected=f"a name ending in {', '.join(ENDINGS)}",
             got=path,
-            fix=f"name it {path.with_suffix(ENDINGS[0]).name}",
+            fix=f"name it {renamed(path, ENDINGS[0])}",
         )
     if ending == ".png":
         data = png_bytes(drawn)

@@ -84,6 +84,8 @@ MISTAKES = {
     "no data to score by": "score good.nc --root nothing",
     "a picture with another suffix": "plot SCENARIO -o x.jpg",
     "a film with another suffix": "animate SCENARIO -o x.avi",
+    "a folder for a picture": "plot SCENARIO -o .",
+    "a folder for a film": "animate SCENARIO -o ..",
     "a file that is no predictions": "score notes.txt",
     "a file that is not there": "score goood.nc",
     "an empty file": "score empty.nc",
