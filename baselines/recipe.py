@@ -332,7 +332,7 @@ def recipe_for(
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
     if part is None:
         if file.recipes or variant:
-            if path == entry.recipes and not _has_recipes_of(split, file):
+            if path == entry.recipes and not _has_recipes_of(split, size, file):
                 raise _no_recipe_of_split(entry, f"{split}/{size}", file)
             raise _missing_recipe(entry, name, variant, file)
         part = _SharedRecipe()
@@ -363,13 +363,10 @@ def recipe_for(
     )
 
 
-def _has_recipes_of(split: str, file: _RecipeFile) -> bool:
-    """Return whether a file has any recipe of a split.
-
-    One for all splits does not count: there is none for the size that was asked for.
-    """
+def _has_recipes_of(split: str, size: str, file: _RecipeFile) -> bool:
+    """Return whether a file has a recipe of a split, or one of this size for all."""
     splits = {recipe.partition("/")[0] for recipe in file.recipes}
-    return split in splits
+    return split in splits or f"{ANY}/{size}" in file.recipes
 
 
 def _no_recipe_of_split(

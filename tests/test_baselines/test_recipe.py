@@ -371,7 +371,7 @@ def test_no_such_recipe(entry: CatalogueEntry) -> None:
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
     for asked, split, size, variant, words in (
         (entry, "cavity", "tiny", "lon", "did you mean 'long'"),
-        (entry, "curl-noise", "full", None, "cavity/tiny"),
+        (entry, "curl-noise", "full", None, "with a recipe of curl-noise/full"),
         (
             entry,
             "curl-noise",

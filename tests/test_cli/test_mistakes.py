@@ -138,8 +138,10 @@ def test_a_mistake_is_told_with_all_that_is_needed(
     monkeypatch.chdir(files)
     monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
     scenario = bench.size.path(bench.root, 3)
-    words = MISTAKES[mistake].split()
-    result = run(*(scenario if word == "SCENARIO" else word for word in words))
+    command = MISTAKES[mistake].replace("SCENARIO", str(scenario))
+    words = command.split()
+    monkeypatch.setattr("sys.argv", ["lagbench", *words])
+    result = run(*words)
     assert result.exit_code in {1, 2, 3, 4, 5}
     assert has_all_parts(result.stderr), result.stderr
 
