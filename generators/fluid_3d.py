@@ -135,14 +135,14 @@ def _state(
 
     Particles are shared out by volume; the last body has what rounding leaves.
     """
-    total_volume = sum(solid.volume for solid, _, _ in bodies)
+    total_volume = sum(solid.measure for solid, _, _ in bodies)
     positions = []
     velocities = []
     left_count = size.particles
     for index, (solid, centre, velocity) in enumerate(bodies):
         count = left_count
         if index < len(bodies) - 1:
-            count = int(size.particles * (solid.volume / total_volume))
+            count = int(size.particles * (solid.measure / total_volume))
         left_count -= count
         body = Body(solid, np.array(centre))
         positions.append(sample_points(rng, body, count))

@@ -55,9 +55,6 @@ ShapeDraw: TypeAlias = "Callable[[RandomSource, Material, Size], Shape]"
 
 _NAMES = ("first", "second", "third")
 
-# what a shape states of its extent, by number of axes
-_MEASURES = {2: "area", 3: "volume"}
-
 # when to give up; no scenario of datasets.yaml comes near it
 _ATTEMPTS = 1000
 
@@ -124,14 +121,17 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
 
 
 def _body_parameters(
-    name: str, body: Body, velocity: NDArray[np.float64]
+    name: str, body: Body, measure: float, velocity: NDArray[np.float64]
 ) -> dict[str, int | float | str]:
     """Return what a file states of one body: shape, area or volume, centre and
     velocity.
     """
+    measure_name = "volume"
+    if len(velocity) == 2:
+        measure_name = "area"
     parameters: dict[str, int | float | str] = {
         f"{name}_shape": type(body.shape).__name__.lower(),
-        f"{name}_{_MEASURES[len(velocity)]}": _measure(body.shape),
+        f"{name}_{measure_name}": measure,
     }
     for quantity, vector in (("centre", body.centre), ("velocity", velocity)):
         for axis, component in zip("xyz", vector.tolist(), strict=False):
@@ -139,16 +139,11 @@ def _body_parameters(
     return parameters
 
 
-def _measure(shape: Shape) -> float:
-    """Return the area of a shape [length^2], in space its volume [length^3]."""
-    return float(getattr(shape, _MEASURES[len(shape.reach)]))
-
-
-def _share_particles(particle_count: int, areas: Sequence[float]) -> list[int]:
-    """Return the particles of each body, in proportion to the areas or volumes."""
-    area = sum(areas)
+def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int]:
+    """Return the particles of each body, in proportion to areas or volumes."""
+    area = sum(measures)
     counts = []
-    for body_area in areas[:-1]:
+    for body_area in measures[:-1]:
         counts.append(math.floor(particle_count * body_area / area + 0.5))
     counts.append(particle_count - sum(counts))
     return counts
@@ -192,8 +187,8 @@ def draw_bodies(
     materials = _materials(size, scenario)
     shapes = [draw_shape(rng, material, size) for material in materials]
     bodies = _place_apart(rng, size, shapes)
-    areas = [_measure(shape) for shape in shapes]
-    counts = _share_particles(size.particles, areas)
+    measures = [shape.measure for shape in shapes]
+    counts = _share_particles(size.particles, measures)
 
     # the attractor: velocity of each body = rate (point - centre) [length/s]
     point = _draw_attractor(rng, size)
@@ -212,15 +207,15 @@ def draw_bodies(
         "attraction": rate,
         "friction": friction,
     }
-    for name, body, velocity in zip(_NAMES, bodies, velocities, strict=False):
-        parameters |= _body_parameters(name, body, velocity)
+    for body_values in zip(_NAMES, bodies, measures, velocities, strict=False):
+        parameters |= _body_parameters(*body_values)
     dimension = size.dimension
     return InitialState(
         position=np.concatenate(points),
         velocity=np.repeat(np.stack(velocities), counts, axis=0),
         affine=np.zeros((size.particles, dimension, dimension)),
         material=np.repeat(np.array(materials, dtype=np.int8), counts),
-        area=sum(areas),
+        area=sum(measures),
         wall_velocity=np.zeros((2 * dimension, dimension)),
         friction=friction,
         parameters=parameters,

@@ -49,6 +49,10 @@ class Shape(Protocol):
     """A body's outline about the origin."""
 
     @property
+    def measure(self) -> float:
+        """Area [length^2], in space volume [length^3]."""
+
+    @property
     def reach(self) -> tuple[float, ...]:
         """Half the sides of the bounding box [length]."""
 
@@ -71,7 +75,7 @@ class Rectangle:
         return cls(length, area / length)
 
     @property
-    def area(self) -> float:
+    def measure(self) -> float:
         """Length times width."""
         return self.length * self.width
 
@@ -110,7 +114,7 @@ class Disc:
         return cls(math.sqrt(area / math.pi))
 
     @property
-    def area(self) -> float:
+    def measure(self) -> float:
         """Pi times the radius squared."""
         return math.pi * self.radius * self.radius
 
@@ -131,7 +135,7 @@ class Blobs:
 
     centres: tuple[tuple[float, float], ...]  # centres of the discs [length]
     radius: float  # their radius [length]
-    area: float  # area of the union [length^2]
+    measure: float  # area of the union [length^2]
 
     @classmethod
     def of_area(cls, area: float, offsets: Array, *, cells: int) -> Blobs:

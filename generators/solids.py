@@ -18,7 +18,7 @@ class Solid(Protocol):
     """A :class:`.Shape` in three dimensions."""
 
     @property
-    def volume(self) -> float:
+    def measure(self) -> float:
         """Volume [length^3]."""
 
     @property
@@ -41,7 +41,7 @@ class Ball:
         return cls(cube_root(volume / (4.0 / 3.0 * math.pi)))
 
     @property
-    def volume(self) -> float:
+    def measure(self) -> float:
         """Four thirds of pi times the radius cubed."""
         return 4.0 / 3.0 * math.pi * self.radius * self.radius * self.radius
 
@@ -72,7 +72,7 @@ class Block:
         return cls((along_x * height, height, along_z * height))
 
     @property
-    def volume(self) -> float:
+    def measure(self) -> float:
         """Product of the sides."""
         return self.sides[0] * self.sides[1] * self.sides[2]
 
@@ -99,7 +99,7 @@ class Rod:
     axis: tuple[float, float, float] = (1.0, 0.0, 0.0)  # unit vector
 
     @property
-    def volume(self) -> float:
+    def measure(self) -> float:
         """Pi times the radius squared times the length."""
         return math.pi * self.radius * self.radius * self.length
 

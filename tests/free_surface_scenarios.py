@@ -60,7 +60,7 @@ def scenario(
     size [1/s].
     """
     rng = np.random.default_rng(seed)
-    areas = np.array([part.shape.area for part in parts])
+    areas = np.array([part.shape.measure for part in parts])
     ends = np.rint(
         np.concatenate([[0.0], areas.cumsum()]) / areas.sum() * constants.particles
     ).astype(int)

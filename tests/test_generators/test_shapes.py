@@ -56,7 +56,7 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
     grid = np.stack([columns, rows], -1).reshape(-1, 2)
     inside = grid[shape.distance(grid) <= 0.0]
     area = len(inside) * cell**2
-    assert area == pytest.approx(shape.area, rel=5e-3)
+    assert area == pytest.approx(shape.measure, rel=5e-3)
     low = np.negative(shape.reach)
     greatest = inside.max(axis=0)
     least = inside.min(axis=0)
@@ -106,7 +106,7 @@ def test_sample_points_lie_evenly_inside(name: str, count: int) -> None:
     assert position.shape == (count, 2)
     distance = body.distance(position)
     assert distance.max() <= 2.0**-20
-    spacing = math.sqrt(body.shape.area / count)
+    spacing = math.sqrt(body.shape.measure / count)
     gaps, _ = neighbours(position, 2)
     gap = gaps[:, 1]
     assert gap.min() > 0.5 * spacing
