@@ -431,11 +431,11 @@ def _record_targets(folder: Path) -> list[Target]:
         )
         targets.append(target)
     score_files = sorted((folder / f"records/b/{SCORES}" / PLACE).glob("*.nc"))
-    victim = score_files[0].relative_to(folder / "records")
+    score_file = score_files[0].relative_to(folder / "records")
     target = Target(
         name="score file",
         source="records",
-        victim=victim.as_posix(),
+        victim=score_file.as_posix(),
         mutations=HASHED_FILE,
         commands=[CHECK],
         weight=2,
