@@ -122,6 +122,8 @@ def _require_free(folder: Folder, place: Place) -> None:
         raise UsageError(
             "there is such an entry already",
             where=str(path),
+            expected="a method without an entry on this data set",
+            got=place[2],
             fix="a further seed: --add; instead of it: --replace; else another "
             "--method, and name: in meta.yaml",
         )

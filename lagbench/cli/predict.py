@@ -11,7 +11,7 @@ import typer
 
 from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, UsageError, format_count
+from lagbench.errors import LagbenchError, UsageError, check_regular, format_count
 
 from .model_options import (
     PREDICTION_LIBRARIES,
@@ -150,10 +150,13 @@ def _predict_onnx(
     """Predict with an ONNX file, which does not state its split."""
     from lagbench.models.predict_onnx import predict_onnx
 
+    check_regular(model)
     if split is None:
         raise UsageError(
             "an ONNX file does not state its split",
             where="--split",
+            expected="the split that the model predicts",
+            got="nothing",
             fix="name it: --split cavity --size mini",
         )
     with progress_bar(quiet=quiet) as progress:
@@ -238,5 +241,16 @@ def _next_command(path: Path, root: Path | None) -> str:
 def _compare_speed(result: PredictionResult, solver: SolverBench) -> str:
     ratio = result.seconds_per_frame / solver.seconds_per_frame
     if ratio > 1:
-        return f"{ratio:.2g} times as fast as the model"
-    return f"the model is {1 / ratio:.2g} times as fast"
+        return f"{_format_ratio(ratio)} times as fast as the model"
+    return f"the model is {_format_ratio(1 / ratio)} times as fast"
+
+
+def _format_ratio(ratio: float) -> str:
+    """Return a ratio with two digits, or as a whole number.
+
+    >>> _format_ratio(1.234), _format_ratio(463.2)
+    ('1.2', '463')
+    """
+    if ratio < 10:
+        return f"{ratio:.2g}"
+    return f"{ratio:.0f}"

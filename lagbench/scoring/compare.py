@@ -417,12 +417,18 @@ def _require_entry(
     if (split, size, name) in entries:
         return
     methods = [place[2] for place in entries if place[:2] == (split, size)]
+    others = [" ".join(place[:2]) for place in entries if place[2] == name]
+    fix = suggest_name(name, {*methods, *REFERENCES})
+    if others:
+        fix = f"{name} is an entry of {', '.join(others)}; {fix}"
+    elif not entries:
+        fix = f"no leaderboard is found: --board FOLDER names one; {fix}"
     raise UsageError(
         "no reference predictor and no entry of that name",
         where=f"{split} {size}",
         expected="a reference predictor, an entry of the leaderboard, or a file",
         got=ascii(name),
-        fix=suggest_name(name, {*methods, *REFERENCES}),
+        fix=fix,
     )
 
 
@@ -557,7 +563,8 @@ def _check_split(
         where=str(path),
         expected=expected_split,
         got=ascii(identity["split"]),
-        fix="name that split, or leave --split out",
+        fix="name that split with --split, as `lagbench list` shows it, or the folder"
+        " of a split of your own",
     )
 
 

@@ -51,7 +51,8 @@ def check_split(
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
         got=f"{quote(split_name)}, {quote(size_name)}",
-        fix=f"{hint}; or name the folder of a split of your own: --split own/",
+        fix=f"{hint}; predictions for a split of your own are scored with"
+        " lagbench score FILE --split own/, and cannot be submitted",
     )
     return None
 

@@ -413,5 +413,6 @@ def require_split(result: ValidationResult, expected_split: str | None) -> None:
         where=str(result.path),
         expected=expected_split,
         got=ascii(result.split),
-        fix="name that split, or leave --split out",
+        fix="name that split with --split, as `lagbench list` shows it, or the folder"
+        " of a split of your own",
     )

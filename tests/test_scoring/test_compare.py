@@ -366,6 +366,25 @@ def test_an_unknown_entry_is_refused_before_predictions_are_scored(
     assert "'moving'" in str(caught.value.fix)
 
 
+def test_an_entry_of_another_data_set_is_named(
+    scored: Folders, entries: Path, bench: ScoreBench
+) -> None:
+    """The README's line, typed for another size, says where the entry stands."""
+    folder = entries / "scores" / "fluid" / "mini"
+    folder.mkdir(parents=True)
+    here = entries / "scores" / bench.size.split / bench.size.name / "moving.nc"
+    here.rename(folder / "elsewhere.nc")
+    with pytest.raises(UsageError) as caught:
+        compare(
+            scored["still"] / "predictions.nc",
+            "elsewhere",
+            board=entries,
+            root=bench.root,
+            registry=bench.registry,
+        )
+    assert "elsewhere is an entry of fluid mini" in str(caught.value.fix)
+
+
 def test_a_named_board_must_be_one(scored: Folders, tmp_path: Path) -> None:
     with pytest.raises(UsageError) as caught:
         compare(scored["still"], "moving", board=tmp_path)
