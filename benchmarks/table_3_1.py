@@ -23,7 +23,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lagbench.generators import solver
-from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
+from lagbench.generators.split import (
+    Device,
+    FreeSurfaceParameters,
+    InitialState,
+    Material,
+)
 
 _LIQUID_MODULUS = 30.0
 _COURANT = 0.4
@@ -107,11 +112,11 @@ def block(row: ThesisRow) -> tuple[FreeSurfaceParameters, InitialState]:
     return parameters, state
 
 
-def start(row: ThesisRow, device: solver.Device) -> solver.Solver:
+def start(row: ThesisRow, device: Device) -> solver.Solver:
     """Build the solver of a row, load the block and compile."""
     parameters, state = block(row)
     running = solver.build(
-        parameters, device=device, threads=1 if device is solver.Device.CPU else None
+        parameters, device=device, threads=1 if device is Device.CPU else None
     )
     running.load([state])
     running.advance(2)
@@ -136,12 +141,12 @@ def best_ms(
     return 1e3 * min(times)
 
 
-def measure(row: ThesisRow, *, device: solver.Device, repeats: int) -> TimedRow:
+def measure(row: ThesisRow, *, device: Device, repeats: int) -> TimedRow:
     """Time one row: substeps in runs of a fixed number, and frames of its own
     substeps.
     """
     running = start(row, device)
-    if device is solver.Device.CPU:
+    if device is Device.CPU:
         clock = time.process_time
     else:
         clock = time.perf_counter
@@ -277,9 +282,9 @@ def main() -> int:
     parser.add_argument("--rows", default="1-4", help="first and last q, such as 1-4")
     parser.add_argument(
         "--device",
-        type=solver.Device,
-        default=solver.Device.CPU,
-        choices=list(solver.Device),
+        type=Device,
+        default=Device.CPU,
+        choices=list(Device),
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))

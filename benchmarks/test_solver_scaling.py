@@ -14,7 +14,7 @@ import table_3_1
 from pytest_benchmark.fixture import BenchmarkFixture
 from timing import best_seconds
 
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 
 DEVICE = Device(os.environ.get("LAGBENCH_BENCH_DEVICE", "cpu"))
 LAST = 9 if DEVICE is Device.CUDA else 4

@@ -17,6 +17,7 @@ import time
 import numpy as np
 
 from lagbench.generators import solver
+from lagbench.generators.split import Device
 from validation.experiment import (
     Case,
     initial_state,
@@ -37,9 +38,7 @@ def main() -> int:
     experiment = plan(
         Case.CAVITY, reynolds=100.0, grid=options.grid, substeps=options.substeps
     )
-    running = solver.build(
-        solver_parameters(experiment), device=solver.Device.CPU, threads=1
-    )
+    running = solver.build(solver_parameters(experiment), device=Device.CPU, threads=1)
     running.load([initial_state(experiment)])
     running.advance(1)
     wall = []

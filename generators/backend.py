@@ -16,7 +16,7 @@ from typing import Any
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 from lagbench.work.machine import available_cores
 
-from .solver import Device
+from .split import Device
 
 # As it is imported, Taichi greets on stdout, which would spoil `--json`, and asks the
 # network for a newer version.

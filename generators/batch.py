@@ -24,8 +24,8 @@ from lagbench.errors import UsageError, WorkFailedError
 
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
-from .solver import Device, Health, Solver, build
-from .split import FreeSurfaceParameters, InitialState, SolverParameters
+from .solver import Health, Solver, build
+from .split import Device, FreeSurfaceParameters, InitialState, SolverParameters
 
 if TYPE_CHECKING:
     from .free_surface import FreeSurface

@@ -16,8 +16,14 @@ from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
 from .full_box_parameters import FullBoxParameters
-from .solver import Device, Health
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Material
+from .solver import Health
+from .split import (
+    ClosedBoxParameters,
+    Device,
+    FreeSurfaceParameters,
+    InitialState,
+    Material,
+)
 from .transfer import Nothing, Template
 
 Parameters = TypeVar(

@@ -5,7 +5,6 @@ Importing this module does not import Taichi; :func:`build` does.
 
 from __future__ import annotations
 
-import enum
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,21 +16,12 @@ from numpy.typing import NDArray
 from .full_box_parameters import FullBoxParameters
 from .split import (
     ClosedBoxParameters,
+    Device,
     FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
 )
-
-
-class Device(enum.StrEnum):
-    """Where and how the substeps run; the bits do not depend on it."""
-
-    # one scenario, a whole frame of substeps in one serial kernel without atomics
-    CPU = "cpu"
-    # the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads
-    PARALLEL = "parallel"
-    CUDA = "cuda"  # the same kernels on an NVIDIA GPU
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ClosedBoxParameters",
+    "Device",
     "FreeSurface3DParameters",
     "FreeSurfaceParameters",
     "InitialState",
@@ -27,6 +28,16 @@ __all__ = [
     "SolverParameters",
     "SplitGenerator",
 ]
+
+
+class Device(enum.StrEnum):
+    """Where and how the substeps run; the bits do not depend on it."""
+
+    # one scenario, a whole frame of substeps in one serial kernel without atomics
+    CPU = "cpu"
+    # the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads
+    PARALLEL = "parallel"
+    CUDA = "cuda"  # the same kernels on an NVIDIA GPU
 
 
 class Material(enum.IntEnum):

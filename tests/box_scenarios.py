@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.draws import fill, quantise
-from lagbench.generators.solver import Device, build
-from lagbench.generators.split import ClosedBoxParameters, InitialState
+from lagbench.generators.solver import build
+from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
 from lagbench.work.machine import available_cores
 
 ALL_LIDS = (0.3, -0.2, 0.25, -0.35)

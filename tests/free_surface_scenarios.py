@@ -14,8 +14,12 @@ from numpy.typing import NDArray
 from lagbench.generators.draws import quantise
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Shape, body_at, sample_points
-from lagbench.generators.solver import Device
-from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
+from lagbench.generators.split import (
+    Device,
+    FreeSurfaceParameters,
+    InitialState,
+    Material,
+)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from rich.progress import Progress
 
 from lagbench.data.checksums import round_digits
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 
 from .diagnostics import CentreLines, X, Y, box_of, centre_lines, draw_profiles
 from .experiment import (

@@ -23,8 +23,13 @@ from lagbench.errors import UsageError
 from lagbench.generators import cavity, curl_noise
 from lagbench.generators.draws import fill, quantise
 from lagbench.generators.noise import gradients
-from lagbench.generators.solver import Device, build
-from lagbench.generators.split import ClosedBoxParameters, InitialState, Material
+from lagbench.generators.solver import build
+from lagbench.generators.split import (
+    ClosedBoxParameters,
+    Device,
+    InitialState,
+    Material,
+)
 
 from . import diagnostics
 

@@ -42,7 +42,7 @@ from lagbench.generators.simulate import (
     perturbed_substep_count,
     simulate,
 )
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 from lagbench.store.copy import gather as gather_files
 from lagbench.store.copy import list_gatherable
 from lagbench.store.publication import (

@@ -26,7 +26,7 @@ from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 from lagbench.store.copy import list_unstored, update_working_copy
 from lagbench.work.pool import Pool, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress

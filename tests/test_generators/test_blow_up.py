@@ -22,8 +22,7 @@ from lagbench.generators.batch import ScenarioBatch, SimulationJob
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.constants import split_module
 from lagbench.generators.simulate import simulate
-from lagbench.generators.solver import Device
-from lagbench.generators.split import InitialState
+from lagbench.generators.split import Device, InitialState
 from lagbench.make.generate import generate
 
 

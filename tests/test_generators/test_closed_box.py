@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.draws import quantise
-from lagbench.generators.solver import Device
-from lagbench.generators.split import ClosedBoxParameters, InitialState
+from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
 
 
 def with_velocity(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import polar
 
 from lagbench.generators import backend, constitutive
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 from lagbench.generators.transfer import Nothing
 
 Single: TypeAlias = NDArray[np.float32]

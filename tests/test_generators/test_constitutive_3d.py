@@ -14,7 +14,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from lagbench.generators import backend, constitutive, constitutive_3d
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 from lagbench.generators.transfer import Nothing
 
 Single: TypeAlias = NDArray[np.float32]

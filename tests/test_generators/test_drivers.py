@@ -29,7 +29,8 @@ from conftest import SIZE, SPLIT
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.generators.closed_box import ClosedBox
-from lagbench.generators.solver import Device, build
+from lagbench.generators.solver import build
+from lagbench.generators.split import Device
 from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 
@@ -202,7 +203,7 @@ def test_extremes_of_an_advance_span_its_frames() -> None:
 
 START = """
 from lagbench.generators import backend
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 backend.start(Device.CPU)
 config = backend.ti.lang.impl.current_cfg()
 print(config.arch, config.opt_level, config.advanced_optimization, config.debug)

@@ -9,7 +9,7 @@ from scenario_draws import turn
 
 from lagbench.data.registry import Size, load
 from lagbench.generators.batch import ScenarioBatch, SimulationJob
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 
 FIXED = (0, 26)
 

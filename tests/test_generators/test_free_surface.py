@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.free_surface import FreeSurface, courant
 from lagbench.generators.shapes import Disc, Rectangle
-from lagbench.generators.solver import Device
-from lagbench.generators.split import InitialState, Material
+from lagbench.generators.split import Device, InitialState, Material
 
 CONSTANTS = parameters()
 WEIGHTLESS = parameters(gravity=0.0)

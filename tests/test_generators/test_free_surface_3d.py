@@ -26,8 +26,9 @@ from lagbench.generators.free_surface_3d import FreeSurface3D
 from lagbench.generators.multimaterial import PAIRS
 from lagbench.generators.shapes import Body, body_at, sample_points
 from lagbench.generators.solids import Ball, Block, Rod, Solid, cube_root
-from lagbench.generators.solver import Device, build
+from lagbench.generators.solver import build
 from lagbench.generators.split import (
+    Device,
     FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,

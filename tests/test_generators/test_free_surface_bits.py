@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from reference_free_surface import FreeSurfaceReference
 
 from lagbench.generators.shapes import Disc, Rectangle
-from lagbench.generators.solver import Device
-from lagbench.generators.split import InitialState, Material
+from lagbench.generators.split import Device, InitialState, Material
 from lagbench.work.machine import available_cores
 
 CONSTANTS = parameters()

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
 from lagbench.generators import backend, transfer
-from lagbench.generators.solver import Device
+from lagbench.generators.split import Device
 
 DX = 1.0 / 32.0
 
