@@ -33,6 +33,14 @@ PIPE_CLOSED = 141
 RESUMABLE_COMMANDS = {"demo", "generate", "download", "train", "season"}
 """Commands that go on where they stopped."""
 
+COMMANDS_WITHOUT_SIZE = {
+    "lagbench score",
+    "lagbench validate",
+    "lagbench compare",
+    "lagbench submit",
+}
+"""Commands that read the size of the data set from predictions or scores."""
+
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 VANISHED_ERRORS = {
@@ -131,6 +139,15 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
     help_hint = f"`{command} --help` lists what there is"
     kind = type(error).__name__
     if kind == "NoSuchOption":
+        if error.option_name == "--size" and command in COMMANDS_WITHOUT_SIZE:
+            return UsageError(
+                "no such option",
+                where=command,
+                expected="files, which state their size",
+                got=error.option_name,
+                fix="leave --size out; `lagbench template` and `lagbench predict` take "
+                "the size and write it into predictions",
+            )
         possible = ", ".join(error.possibilities or ())
         suggestion = f"did you mean {possible}? " if possible else ""
         return UsageError(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lagbench.data.layout import url_of
+from lagbench.data.local import locate_new
 from lagbench.data.registry import Registry, format_ids, load
 from lagbench.errors import UsageError, format_count
 from lagbench.make.generate import GenerationResult, generate
@@ -74,6 +75,8 @@ def generate_command(
     """
     if season is None:
         split = choose_split(split_argument, split_option)
+        if size is None and not quiet:
+            print_note(_describe_default_size(split, root))
         places = [Place(split=split, size=size, root=root, registry=None)]
     else:
         split_name = None
@@ -156,6 +159,22 @@ def _season_places(
             got=f"{split or 'any split'} {size or 'any size'}",
         )
     return places
+
+
+def _describe_default_size(split: str, root: Path | None) -> str:
+    """Return which size is taken where none is named, why, and which others there are.
+
+    Raises:
+        UsageError: there is no such split.
+    """
+    size, _, registry = locate_new(split, root=root)
+    others = [name for name in registry.split(size.split).sizes if name != size.name]
+    if not others:
+        return f"{size.split} {size.name}: the only size of the split"
+    return (
+        f"{size.split} {size.name}: the default, since no --size is named; the others "
+        f"are {' and '.join(others)}"
+    )
 
 
 def _describe_plan(result: GenerationResult) -> list[str]:

@@ -24,6 +24,8 @@ from .output import format_seconds
 
 SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
 
+LONG = 100.0  # time of one scenario from which it is shown in minutes [s]
+
 Listener = Callable[[Progress], None]
 
 
@@ -108,7 +110,17 @@ def _seconds_left(progress: Progress) -> float:
 
 
 def _format_rate(progress: Progress, unit: str) -> str:
+    """Return the count, and the rate: below one a second the time of one."""
     count = f"{progress.scenarios_done}"
     if progress.scenarios:
         count = f"{count}/{progress.scenarios}"
-    return f"{count} {unit}, {progress.rate:.2f}/s"
+    rate = progress.rate
+    if rate <= 0.0:
+        return f"{count} {unit}"
+    if rate >= 1.0:
+        return f"{count} {unit}, {rate:.2f}/s"
+    seconds = 1.0 / rate
+    duration = f"{seconds:.1f} s"
+    if seconds >= LONG:
+        duration = format_seconds(seconds)
+    return f"{count} {unit}, {duration} a {unit.removesuffix('s')}"

@@ -608,8 +608,8 @@ def template(
             recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
-    _check_output(Path(output), overwrite=overwrite)
     entry, folder, splits = locate(split, size, root=root, registry=registry)
+    _check_output(Path(output), overwrite=overwrite)
     fetch_truth(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()

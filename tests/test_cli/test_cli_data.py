@@ -170,6 +170,23 @@ def test_generate_and_verify_one_scenario(run: Run, tmp_path: Path) -> None:
     assert complete.exit_code == 4
 
 
+@pytest.mark.parametrize(
+    ("options", "is_told"), [((), True), (("--size", "mini"), False), (("-q",), False)]
+)
+def test_generate_says_which_size_it_takes(
+    options: tuple[str, ...], is_told: bool, run: Run, tmp_path: Path
+) -> None:
+    """It says so before it begins, with the reason and the other sizes."""
+    words = ("generate", "cavity", "--dry-run", "--root", tmp_path)
+    result = run(*words, *options)
+    assert result.exit_code == 0
+    note = result.stderr
+    assert bool(note) == is_told
+    if is_told:
+        for word in ("mini", "default", "--size", "tiny", "full"):
+            assert word in note
+
+
 def test_damage_of_a_data_set_exits_4(run: Run, copied: Copied) -> None:
     """It is described on stdout and named on stderr."""
     root = copied()

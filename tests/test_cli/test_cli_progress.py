@@ -53,6 +53,38 @@ def test_an_unknown_total_is_left_out(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().err == "writing train: 2 scenarios, 2.00/s\n"
 
 
+def slow_scoring(done: int, seconds: float) -> Progress:
+    """Return the progress of a scoring of 20 scenarios."""
+    return Progress(
+        stage="scoring",
+        done=done,
+        total=20,
+        scenarios_done=done,
+        scenarios=20,
+        seconds=seconds,
+    )
+
+
+@pytest.mark.parametrize(
+    ("done", "seconds", "rate"),
+    [
+        (0, 12.0, "0/20 scenarios"),
+        (2, 250.0, "2/20 scenarios, 2 min a scenario"),
+        (2, 25.0, "2/20 scenarios, 12.5 s a scenario"),
+        (5, 4.0, "5/20 scenarios, 1.25/s"),
+    ],
+)
+def test_slow_work_is_told_by_seconds(
+    done: int, seconds: float, rate: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Below one a second the time of one is shown; before the first there is none."""
+    with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
+        assert listener is not None
+        listener(slow_scoring(done, seconds))
+    line = capsys.readouterr().err
+    assert f"{rate}, " in line or line.endswith(f"{rate}\n")
+
+
 def test_quick_work_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar(quiet=False, unit="steps", seconds_per_line=3600.0) as listener:
         assert listener is not None

@@ -146,6 +146,18 @@ def test_a_mistake_is_told_with_all_that_is_needed(
     assert has_all_parts(result.stderr), result.stderr
 
 
+@pytest.mark.parametrize("command", ["score", "validate", "compare", "submit"])
+def test_a_size_that_the_file_states_is_not_asked_for(
+    command: str, run: Callable[..., Result]
+) -> None:
+    """These commands have no --size: no other option is suggested for it."""
+    result = run(command, "good.nc", "persistence", "--size", "mini")
+    assert result.exit_code == 2
+    assert has_all_parts(result.stderr), result.stderr
+    assert "leave --size out" in result.stderr
+    assert "did you mean" not in result.stderr
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")
 def test_a_folder_that_refuses_is_told(
     run: Callable[..., Result], files: Path, bench: ScoreBench

@@ -413,6 +413,26 @@ def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
     assert side_of(a, a) == "same"
 
 
+def test_rounding_makes_no_method_better(tmp_path: Path) -> None:
+    """Sums in another order differ in the last digits, in all scenarios alike."""
+    a = publish(tmp_path, ONES, method="a")
+    b = publish(tmp_path, [1.0 - 1e-13] * 6, method="b")
+    assert side_of(a, b) == "same"
+    result = compare(a, b)
+    assert result.metrics["mse_avg"].test.difference == 0.0
+    assert "no difference" in result.verdict
+    c = publish(tmp_path, [1.0 - 1e-9] * 6, method="c")
+    assert side_of(a, c) == "worse"
+
+
+def test_the_verdict_stands_last(
+    scored: Folders, run: Callable[..., Result]
+) -> None:
+    words = ("compare", scored["still"], scored["straight"])
+    verdict = compare(scored["still"], scored["straight"]).verdict
+    assert run(*words).stdout.splitlines()[-1] == verdict
+
+
 def test_few_scenarios_decide_nothing(tmp_path: Path) -> None:
     """Five scenarios cannot reach 5 %: neither column nor verdict claims anything."""
     a = publish(tmp_path, ONES[:5], method="a")

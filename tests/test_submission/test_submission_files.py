@@ -138,6 +138,21 @@ def test_the_template_is_the_last_given_frame_repeated(
     assert not output.exists()
 
 
+def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """The file would be told again after the split is spelt right."""
+    output = tmp_path / "predictions.nc"
+    output.write_bytes(b"mine")
+    location: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
+    with pytest.raises(UsageError, match="cavitty"):
+        template("cavitty", output=output, **location)
+    with pytest.raises(UsageError) as caught:
+        template("cavity", "tiny", output=output, **location)
+    assert caught.value.where == str(output)
+    assert output.read_bytes() == b"mine"
+
+
 def test_without_a_recorded_hash_one_must_be_given(
     unmeasured: Registry, tmp_path: Path
 ) -> None:
