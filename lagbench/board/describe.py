@@ -88,8 +88,9 @@ def _urls_of(meta: Meta, count: int) -> Sequence[str | None]:
         raise UsageError(
             "addresses do not match the files",
             where="--url",
+            expected=f"{count}, one for each file, or none",
             got=len(meta.urls),
-            fix=f"give {count}, one per file in their order, or none",
+            fix="give the addresses in the order of the files, or leave --url out",
         )
     return meta.urls
 
@@ -102,6 +103,7 @@ def _place_of(header: Header, meta: Meta) -> Place:
         suggestion = re.sub("[^a-z0-9]+", "-", method.lower()).strip("-")
         raise UsageError(
             "the label of the predictions cannot name an entry",
+            where="attribute method of the predictions, or --method",
             expected="small letters, digits and single hyphens",
             got=ascii(method),
             fix=f"name it: --method {suggestion or 'my-model'}",
@@ -110,6 +112,8 @@ def _place_of(header: Header, meta: Meta) -> Place:
         raise UsageError(
             f"{method!r} is the name of a reference predictor",
             where="--method",
+            expected="a name of your own",
+            got=ascii(method),
             fix="name your method otherwise; reference predictors are added by "
             "themselves",
         )
@@ -149,7 +153,9 @@ def _require_distinct_name(name: str, rivals: Mapping[Path, Entry]) -> None:
         if confusable_key(other_name) == key:
             raise UsageError(
                 "the name looks like another's",
-                where=owner,
+                where="name in --from meta.yaml",
+                expected=f"a name that cannot be taken for {ascii(other_name)} of "
+                f"{owner}",
                 got=ascii(name),
                 fix="choose another, or say what differs, in meta.yaml: "
                 "`name: GNS, six terms`",
@@ -197,7 +203,11 @@ def _date_of(meta: Meta) -> datetime.date:
     latest = latest_date()
     if date > latest:
         raise UsageError(
-            "a day to come", where="date", expected=f"at most {latest}", got=date
+            "a day to come",
+            where="date",
+            expected=f"at most {latest}",
+            got=date,
+            fix="give the day of the submission, or leave date out: it is today then",
         )
     return date
 
@@ -220,8 +230,10 @@ def _budget_of(
         raise UsageError(
             "a track is not stated",
             where="budget.track",
-            fix="leave it out: it follows from the budget that `lagbench predict` "
-            "writes into predictions.nc",
+            expected="no track: it follows from the budget of the predictions",
+            got=ascii(meta.budget.track),
+            fix="leave it out; `lagbench predict` writes the budget into "
+            "predictions.nc",
         )
     budgets = []
     if extended is not None:

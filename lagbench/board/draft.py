@@ -70,7 +70,8 @@ def fit(
     if model is None:
         raise ChecksFailedError(
             "the entry does not fit the schema",
-            where=None if where is None else str(where),
+            where="the description" if where is None else str(where),
+            expected="known keys, with values of their kinds",
             got=format_issues(issues),
             fix=fix,
         )

@@ -137,6 +137,7 @@ def read_entry(path: Path) -> Entry:
         raise ChecksFailedError(
             f"{len(issues)} mistake(s) in an entry",
             where=str(path),
+            expected="known keys, with values of their kinds",
             got=format_issues(issues),
             fix="mend the keys named above; docs/submitting.md describes them",
         )
@@ -160,6 +161,8 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
             "the file does not describe a method",
             where=str(path),
             expected="lines of key: value",
+            got=f"{type(keys).__name__}: {repr(keys)[:60]}",
+            fix="write lines as `name: My model`; docs/submitting.md has a whole file",
         )
     for key, value in options.items():
         if value not in (None, "", (), []):
@@ -173,8 +176,9 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
         raise UsageError(
             "the description of the method does not fit",
             where=where,
+            expected="known keys, with values of their kinds",
             got=format_issues(issues),
-            fix="docs/submitting.md describes the keys",
+            fix="mend the keys named above; docs/submitting.md describes them",
         )
     return meta
 

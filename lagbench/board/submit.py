@@ -187,7 +187,9 @@ def _require_keys(meta: Meta) -> None:
     if missing_options:
         raise UsageError(
             "the entry lacks what readers need",
+            where="the options",
             expected=" and ".join(missing_options),
+            got="nothing",
             fix="give them as options, or authors and command in a file: "
             "--from meta.yaml",
         )
@@ -202,7 +204,13 @@ def _require_files(paths: Sequence[Path]) -> None:
         what = "too many files"
     else:
         return
-    raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
+    raise UsageError(
+        what,
+        where="FILE ...",
+        expected=f"1 to {MOST_SEEDS}, one per seed",
+        got=len(paths),
+        fix="name the predictions: lagbench submit predictions.nc",
+    )
 
 
 def _read_predictions(
@@ -217,6 +225,8 @@ def _read_predictions(
                 where=str(path),
                 expected=[*registry.splits],
                 got=header.split,
+                fix="a leaderboard takes the splits of lagbench; `lagbench score` and "
+                "`lagbench compare` take a split of your own too",
             )
         if header.subset != "test":
             raise UsageError(

@@ -21,7 +21,7 @@ from lagbench.board import publish
 from lagbench.board import submit as submitting
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
-from lagbench.board.entry_file import read_entry
+from lagbench.board.entry_file import read_entry, read_meta
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
     ChecksFailedError,
@@ -186,6 +186,12 @@ def test_predictions_are_submitted_once(
     assert result.method == "first"
 
 
+def has_all_parts(error: LagbenchError) -> bool:
+    """Say whether a message has where, expected, got and fix."""
+    parts = (error.where, error.expected, error.got, error.fix)
+    return None not in parts
+
+
 TWO_ADDRESSES = ("https://a.org/1", "https://a.org/2")
 Keys = dict[str, Any]
 
@@ -220,6 +226,20 @@ def test_refused_before_the_work(
         assert caught.value.where == "date"
     if key == "budget":
         assert caught.value.where == "budget.track"
+    assert has_all_parts(caught.value)
+
+
+@pytest.mark.usefixtures("unscored")
+@pytest.mark.parametrize("line", ["parameters: many", "nmae: Mine", "- a list"])
+def test_a_description_that_does_not_fit_is_told(
+    line: str, own: BoardBench, predictions: Path, tmp_path: Path
+) -> None:
+    meta = tmp_path / "meta.yaml"
+    meta.write_text(f"{line}\n")
+    with pytest.raises(UsageError) as caught:
+        read_meta(meta, {})
+    assert has_all_parts(caught.value)
+    assert str(meta) in str(caught.value.where)
 
 
 @pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
