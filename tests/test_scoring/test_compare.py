@@ -425,9 +425,7 @@ def test_rounding_makes_no_method_better(tmp_path: Path) -> None:
     assert side_of(a, c) == "worse"
 
 
-def test_the_verdict_stands_last(
-    scored: Folders, run: Callable[..., Result]
-) -> None:
+def test_the_verdict_stands_last(scored: Folders, run: Callable[..., Result]) -> None:
     words = ("compare", scored["still"], scored["straight"])
     verdict = compare(scored["still"], scored["straight"]).verdict
     assert run(*words).stdout.splitlines()[-1] == verdict
