@@ -154,8 +154,7 @@ def _require_distinct_name(name: str, rivals: Mapping[Path, Entry]) -> None:
             raise UsageError(
                 "the name looks like another's",
                 where="name in --from meta.yaml",
-                expected=f"a name that cannot be taken for {ascii(other_name)} of "
-                f"{owner}",
+                expected=f"a name that cannot be taken for {other_name!a} of {owner}",
                 got=ascii(name),
                 fix="choose another, or say what differs, in meta.yaml: "
                 "`name: GNS, six terms`",
