@@ -97,6 +97,17 @@ def explain_memory_errors(hint: str) -> Iterator[None]:
         ) from error
 
 
+def read_load() -> float | None:
+    """Return how many processes wanted to run, the mean over the last minute.
+
+    None where the system does not tell.
+    """
+    try:
+        return round(os.getloadavg()[0], 2)
+    except (OSError, AttributeError):  # AttributeError: Windows
+        return None
+
+
 def hardware(device: str = "cpu") -> dict[str, Any]:
     """Return processor, cores, threads and device, without the machine's name."""
     device_name = "cpu"

@@ -2,7 +2,8 @@
 
 Only the given frames of the test subset are read. Times are those of rollouts alone,
 after one step to warm up; the time of the neighbour search is measured on frames of the
-same rollouts.
+same rollouts. On a CPU the cost is the processor time of all threads: other work on the
+machine does not count, and it compares with that of a solver on one core.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from .machine import (
     choose_device,
     explain_memory_errors,
     hardware,
+    read_load,
     use_threads,
 )
 from .provenance import training_provenance
@@ -64,11 +66,17 @@ class PredictionResult:
     scenarios: int  # scenarios predicted
     frames: int  # frames of each
     batch: int  # scenarios that were rolled out side by side
-    seconds_per_frame: float  # time of one frame of one scenario [s]
+    # time of one frame of one scenario by the clock below [s]
+    seconds_per_frame: float
     seconds_without_search: float  # the same without the neighbour search [s]
-    # 'processor' on one CPU thread, where other work on the machine then does not
-    # count; 'wall' on a GPU and on several threads
+    # 'processor' on a CPU: of all threads together, without other work on the machine;
+    # 'wall' on a GPU
     clock: str
+    wall_seconds_per_frame: float  # time on the wall, other work included [s]
+    threads: int  # CPU threads
+    # processes that wanted to run, mean over the last minute; None where the system
+    # does not tell
+    load: float | None
     # of our solver on one core of this machine [s]
     solver_seconds_per_frame: float | None
     device: str  # processor and threads, or GPU
@@ -222,6 +230,9 @@ def _summarise(
         seconds_per_frame=seconds,
         seconds_without_search=seconds_without_search,
         clock=rollouts.clock,
+        wall_seconds_per_frame=rollouts.wall_seconds_per_frame,
+        threads=rollouts.threads,
+        load=read_load(),
         solver_seconds_per_frame=solver_seconds_per_frame,
         device=device,
         parameters=count_parameters(rollouts.model),
@@ -384,10 +395,12 @@ class _TimedRollouts:
         *,
         viscosity: float | None,
     ) -> None:
-        self.seconds = 0.0  # time of the rollouts [s]
+        self.seconds = 0.0  # time of the rollouts by the clock below [s]
+        self.wall_seconds = 0.0  # time of the rollouts on the wall [s]
         self.clock = "wall"  # clock of the times, 'processor' or 'wall'
-        if machine == "cpu" and torch.get_num_threads() == 1:
+        if machine == "cpu":
             self.clock = "processor"
+        self.threads = torch.get_num_threads()
         # frames that the model predicted, of all scenarios; frozen ones cost nothing
         self.frames = 0
         # scenario id to the absolute frame from which its rollout is frozen
@@ -416,8 +429,10 @@ class _TimedRollouts:
             if number == 0:
                 roll_out(self.model, given_frames, 1)  # to warm up
             start_time = self._read_clock()
+            wall_start = time.perf_counter()
             rollouts = roll_out(self.model, given_frames, self.info.horizon)
             self.seconds += self._read_clock() - start_time
+            self.wall_seconds += time.perf_counter() - wall_start
             for rollout in rollouts:
                 self._count_frames(rollout)
             self._time_searches(given_frames, rollouts)
@@ -456,6 +471,11 @@ class _TimedRollouts:
     def seconds_per_frame(self) -> float:
         """Time of one frame of one scenario [s]."""
         return self.seconds / self.frames
+
+    @property
+    def wall_seconds_per_frame(self) -> float:
+        """Time of one frame of one scenario on the wall [s]."""
+        return self.wall_seconds / self.frames
 
     @property
     def search_per_frame(self) -> float:

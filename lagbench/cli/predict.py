@@ -12,6 +12,7 @@ import typer
 from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, UsageError, check_regular, format_count
+from lagbench.work.machine import available_cores
 
 from .model_options import (
     PREDICTION_LIBRARIES,
@@ -172,7 +173,8 @@ def _predict_onnx(
     lines = [
         f"{result.path}: {result.method}, {result.scenarios} scenarios, "
         f"{result.frames} frames",
-        f"  model   {result.seconds_per_frame:.3g} s per frame, one thread",
+        f"  model   {result.seconds_per_frame:.3g} s per frame, processor time "
+        f"of one thread",
         _next_command(result.path, root),
     ]
     print_result(result, lines, as_json=as_json, quiet=quiet)
@@ -217,6 +219,7 @@ def _describe(
         f"({result.seconds_without_search:.3g} s without the neighbour search) "
         f"on {result.device}"
     )
+    yield f"          {_describe_clock(result)}"
     if solver is not None:
         yield (
             f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
@@ -228,6 +231,17 @@ def _describe(
             marks.append(f"scenario {scenario} at frame {frame}")
         yield f"  frozen  {', '.join(marks)}: not finite from there on"
     yield _next_command(result.path, root)
+
+
+def _describe_clock(result: PredictionResult) -> str:
+    """Return which clock took the time of a model, and what else the machine did."""
+    wall = f"{result.wall_seconds_per_frame:.3g} s on the wall"
+    if result.load is not None:
+        wall += f", with a load of {result.load:.1f} on {available_cores()} cores"
+    if result.clock == "wall":
+        return wall
+    threads = format_count(result.threads, "thread")
+    return f"processor time of {threads}; {wall}"
 
 
 def _next_command(path: Path, root: Path | None) -> str:

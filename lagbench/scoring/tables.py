@@ -218,7 +218,16 @@ def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
 
 
 def _classical_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield the reason why no classical solver stands beside the score, if so."""
+    """Yield the cost that predictions state, and why no classical solver stands beside
+    the score, if so.
+    """
+    header = card.header
+    if header.seconds_per_frame is not None:
+        machine = header.device or "a machine without a name"
+        yield (
+            f"cost: {_number(header.seconds_per_frame)} s per frame on {machine}; the "
+            f"predictions state it, and nothing was timed here"
+        )
     if card.against_classical is None and card.why_not_classical is not None:
         yield f"against_classical: none, because {card.why_not_classical}"
 

@@ -129,9 +129,8 @@ def run(
             weights,
             tmp_path / name,
             root=root,
-            threads=1,
             registry=unmeasured,
-            **options,
+            **({"threads": 1} | options),
         )
 
     return run_prediction
@@ -295,14 +294,44 @@ def test_frozen_frames_are_not_timed(
     Side by side 4 s in vain come before.
     """
     advance = Mock(side_effect=Drift.advance)
-    clock = SimpleNamespace(process_time=lambda: float(advance.call_count))
+
+    def read_clock() -> float:
+        return float(advance.call_count)
+
+    clock = SimpleNamespace(process_time=read_clock, perf_counter=read_clock)
     monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
     monkeypatch.setattr(prediction, "time", clock)
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
-    # With one thread other processes on the machine do not count.
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_other_work_on_the_machine_does_not_count(
+    run: Predict, monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    """The cost of a frame is the processor time of all threads, on any load.
+
+    Threads, load and the time on the wall are told beside it.
+    """
+    advance = Mock(side_effect=Drift.advance)
+    clock = SimpleNamespace(
+        process_time=lambda: float(advance.call_count),
+        perf_counter=lambda: 9.0 * advance.call_count,
+    )
+    monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
+    monkeypatch.setattr(prediction, "time", clock)
+    monkeypatch.setattr("os.getloadavg", lambda: (5.25, 4.0, 3.0))
+    result = run(threads=threads)
     assert result.clock == "processor"
+    assert result.seconds_per_frame == 1.0
+    assert result.wall_seconds_per_frame == 9.0
+    assert result.threads == threads
+    assert result.load == 5.25
+    assert f"{threads} thread" in result.device
+    cost = json.loads(result.path.with_suffix(".json").read_text())
+    assert cost["threads"] == threads
+    assert cost["load"] == 5.25
 
 
 def make_windows(first_x: list[float]) -> Batch:

@@ -732,6 +732,17 @@ def row_name(row: Sequence[str]) -> str:
     return name
 
 
+def test_a_cost_is_told_as_the_predictions_state_it(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """The score measures no cost: the line names the machine, and who says so."""
+    labels = {"seconds_per_frame": 0.25, "device": "a laptop, 2 threads"}
+    path = bench.submit(tmp_path / "predictions.nc", still, **labels)
+    text = "\n".join(flag_lines(bench.evaluate(path)))
+    assert "cost: 0.25 s per frame on a laptop, 2 threads" in text
+    assert "the predictions state" in text
+
+
 def test_tables_show_references_undefined_frames_and_units(
     half_right_card: ScoreCard,
 ) -> None:
