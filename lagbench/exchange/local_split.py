@@ -41,13 +41,13 @@ from lagbench.metrics.coverage import Cloud, fitting_cells
 from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
 
+from .crossings import CrossingCheck
 from .trajectory import (
     FEWEST_CELLS,
     MOST_CELLS,
     Bounds,
     Description,
     Trajectory,
-    bounds_example,
     check_name,
     estimate_spacing,
 )
@@ -63,15 +63,6 @@ HEAD = (
     "# A local split of lagbench, written by `lagbench {}`; "
     'its hashes stand under "measured".\n'
 )
-
-CROSSING = 0.5
-"""Step beyond which a particle crossed a periodic boundary, over the box's length."""
-
-CROSSING_MEDIAN = 0.1
-"""Median step of particles that follow a flow, over the box's length, at most."""
-
-FEWEST_CROSSINGS = 3
-"""Particles that must cross at once before data count as periodic."""
 
 SPACINGS_PER_CELL = 2.5
 """Spacings of particles across a cell of the score grid; our splits have 1.8 to 2.6."""
@@ -368,7 +359,7 @@ class SplitBuilder:
         raw_position, _ = next(trajectory.read())
         raw_position = np.asarray(raw_position)
         position = self._transform_positions(raw_position)
-        self._check_positions(position, where=f"{trajectory.name}, frame 0")
+        self._check_positions(position, trajectory, where=f"{trajectory.name}, frame 0")
         spacing = description.spacing
         if not spacing:
             spacing = estimate_spacing(
@@ -396,13 +387,18 @@ class SplitBuilder:
         description = self.description
         before: NDArray[np.float32] | None = None
         motion = MotionCheck(rate=description.rate)
+        crossings = CrossingCheck(periodic=description.periodic)
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
             position = self._transform_positions(raw_position)
-            self._check_positions(position, where=where)
+            self._check_positions(position, trajectory, where=where)
             if before is not None:
                 step = self._box.displacement(before, position.astype(np.float64))
-                self._check_steps(step, where=where)
+                crossings.add(step, self._lengths, frame=number)
+            if crossings.has_any:
+                # the frames that are left are read for other axes only
+                before = position
+                continue
             if raw_velocity is not None:
                 velocity = self._transform_velocities(raw_velocity, where=where)
                 if before is not None:
@@ -414,6 +410,7 @@ class SplitBuilder:
                     yield before, velocity
                 yield position, velocity
             before = position
+        crossings.finish(where=trajectory.name)
         motion.finish(where=f"{trajectory.name}, velocity")
 
     @property
@@ -428,29 +425,12 @@ class SplitBuilder:
         position = self.description.transform.transform_positions(raw_position)
         return self._box.wrap(position).astype(np.float32, copy=False)
 
-    def _check_steps(self, step: NDArray[np.float64], *, where: str) -> None:
-        """Refuse steps through a periodic boundary that nobody stated.
-
-        There a few particles move nearly the length of the box, and most hardly move.
-        """
-        lengths = self.high - self.low  # [length], shape [axis]
+    @property
+    def _lengths(self) -> NDArray[np.float64]:
+        """Lengths of the box along its axes; those of the positions where unknown."""
         if self.description.box is not None:
-            lengths = self.description.box.lengths
-        share = np.abs(step) / np.where(lengths > 0.0, lengths, np.inf)
-        for axis, name in enumerate(AXES[: step.shape[1]]):
-            crossing_count = int(np.count_nonzero(share[:, axis] > CROSSING))
-            moves_little = np.median(share[:, axis]) < CROSSING_MEDIAN
-            if crossing_count < FEWEST_CROSSINGS or not moves_little:
-                continue
-            axes = ",".join([*self.description.periodic, name])
-            raise DataError(
-                "particles jump by more than half the box",
-                where=f"{where}, along {name}",
-                expected="steps much shorter than the box, as of most particles",
-                got=f"{crossing_count} of {len(step)} particles jump",
-                fix=f"if the box is periodic: --periodic {axes} with the ends of "
-                f"the box, as in {bounds_example(step.shape[1])}",
-            )
+            return self.description.box.lengths
+        return np.asarray(self.high - self.low, np.float64)
 
     def _transform_velocities(
         self, raw_velocity: NDArray[np.floating], *, where: str
@@ -468,7 +448,9 @@ class SplitBuilder:
             )
         return velocity
 
-    def _check_positions(self, position: NDArray[np.float32], *, where: str) -> None:
+    def _check_positions(
+        self, position: NDArray[np.float32], trajectory: Trajectory, *, where: str
+    ) -> None:
         """Refuse positions not finite or outside the box; note their extent."""
         low = position.min(axis=0)
         high = position.max(axis=0)
@@ -485,16 +467,27 @@ class SplitBuilder:
                 "particles lie outside the unit box",
                 where=where,
                 expected=" x ".join(["[0, 1]"] * self.dimension),
-                got=format_box(low, high),
+                got=f"{self._format_extent(trajectory)}, the extent of the trajectory",
                 fix="fit the box of the data into the unit box: --rescale, with "
                 "--bounds if its walls are known",
             )
-        self._check_stated_bounds(low, high, where=where)
+        self._check_stated_bounds(low, high, trajectory, where=where)
         self.low = np.minimum(self.low, low)
         self.high = np.maximum(self.high, high)
 
+    def _format_extent(self, trajectory: Trajectory) -> str:
+        """Return the box that all positions of a trajectory fill, in the unit box."""
+        bounds = self.description.transform.transform_box(find_bounds([trajectory]))
+        low, high = np.array(bounds).T
+        return format_box(low, high)
+
     def _check_stated_bounds(
-        self, low: NDArray[np.float32], high: NDArray[np.float32], *, where: str
+        self,
+        low: NDArray[np.float32],
+        high: NDArray[np.float32],
+        trajectory: Trajectory,
+        *,
+        where: str,
     ) -> None:
         """Refuse particles outside the stated bounds by more than their spacing.
 
@@ -511,13 +504,13 @@ class SplitBuilder:
             excess = max(excess, left - low[axis], high[axis] - right)
         if excess <= self.spacing:
             return
-        corner = np.asarray(transform.corner[: self.dimension])
-        source_low = low * transform.scale + corner
-        source_high = high * transform.scale + corner
+        # of all frames: bounds that hold this one only would be refused by a later one
+        source_low, source_high = np.array(find_bounds([trajectory])).T
         raise UsageError(
             "particles lie outside the stated bounds, by more than their spacing",
             where=f"{where}; --bounds, or bounds of the metadata",
-            expected=f"bounds that hold {format_box(source_low, source_high)}",
+            expected=f"bounds that hold {format_box(source_low, source_high)}, the "
+            "extent of the trajectory",
             got=description.bounds,
             fix="state the box of the data, in their own length",
         )

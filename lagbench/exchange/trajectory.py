@@ -13,6 +13,7 @@ from typing import IO, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic_core import ErrorDetails
 
 # pydantic reads the TypedDict of Python 3.12 and later only
 from typing_extensions import TypedDict
@@ -22,7 +23,13 @@ from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import DataError, UnreadableFileError, UsageError, suggest_name
+from lagbench.errors import (
+    DataError,
+    ErrorCollector,
+    UnreadableFileError,
+    UsageError,
+    suggest_name,
+)
 from lagbench.submission.issues import quote
 
 Array = NDArray[np.floating]
@@ -56,6 +63,9 @@ the memory.
 LEAST = 1e-30
 MOST = 1e30
 """What a length, a time or a density may be: squares of them are floats."""
+
+MOST_MISTAKES = 10
+"""Mistakes of a description that one message tells."""
 
 FEWEST_CELLS = 4
 MOST_CELLS = 4096
@@ -181,23 +191,35 @@ def check_options(options: DataOptions) -> DataOptions:
 
 
 def _validate_options(options: object, *, where: str) -> DataOptions:
+    plain: DataOptions = {}
+    details: list[ErrorDetails] = []
     try:
-        return TypeAdapter(DataOptions).validate_python(options)
+        plain = TypeAdapter(DataOptions).validate_python(options)
     except ValidationError as error:
-        first = error.errors()[0]
+        details = error.errors()
 
-    key = quote(".".join(map(str, first["loc"])))[1:-1]
+    mistakes = ErrorCollector()
+    for detail in details[:MOST_MISTAKES]:
+        with mistakes:
+            raise _option_error(detail, where=where)
+    mistakes.raise_errors()
+    return plain
+
+
+def _option_error(detail: ErrorDetails, *, where: str) -> UsageError:
+    """Return what is wrong with one key of the options."""
+    key = quote(".".join(map(str, detail["loc"])))[1:-1]
     fix = "docs/exchange.md has the keys"
-    if first["type"] == "extra_forbidden":
+    if detail["type"] == "extra_forbidden":
         fix = suggest_name(key, DataOptions.__annotations__)
-    value = first["input"]
+    value = detail["input"]
     got = f"a {type(value).__name__}"
     if isinstance(value, str | int | float):
         got = quote(value)
-    raise UsageError(
+    return UsageError(
         "this does not describe data",
         where=f"{where}{key or '(whole file)'}",
-        expected=first["msg"],
+        expected=detail["msg"],
         got=got,
         fix=fix,
     )
@@ -267,11 +289,16 @@ class Description:
 
     def __post_init__(self) -> None:
         """Check what the user said, and fit the box where that is asked."""
-        check_name(self.name)
-        self._check_quantities()
-        self._check_counts()
-        self._check_bounds()
-        self._check_periodic()
+        mistakes = ErrorCollector()
+        with mistakes:
+            check_name(self.name)
+        self._check_quantities(mistakes)
+        self._check_counts(mistakes)
+        with mistakes:
+            self._check_bounds()
+        with mistakes:
+            self._check_periodic()
+        mistakes.raise_errors()
         if self.rescale:
             if self.bounds is None:
                 raise UsageError(
@@ -282,39 +309,48 @@ class Description:
                 )
             object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
 
-    def _check_quantities(self) -> None:
+    def _check_quantities(self, mistakes: ErrorCollector) -> None:
         for option, value in (
             ("--radius", self.radius),
             ("--frame-interval", self.frame_interval),
             ("density", self.density),
             ("spacing", self.spacing),
         ):
-            if value is not None and not LEAST <= value <= MOST:
+            if value is None or LEAST <= value <= MOST:
+                continue
+            with mistakes:
                 raise UsageError(
                     "not a number above 0",
                     where=option,
                     expected=f"{LEAST:g} to {MOST:g}",
                     got=value,
+                    fix="give it in the length and time of the data",
                 )
 
-    def _check_counts(self) -> None:
+    def _check_counts(self, mistakes: ErrorCollector) -> None:
         for option, count, least in (
             ("--input-frames", self.input_frames, 2),
             ("--horizon", self.horizon, 1),
         ):
-            if count is not None and count < least:
+            if count is None or count >= least:
+                continue
+            with mistakes:
                 raise UsageError(
                     "too few frames for a task",
                     where=option,
                     expected=f"at least {least}",
                     got=count,
+                    fix="give more, or leave the option out",
                 )
-        if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
+        if self.cells is None or FEWEST_CELLS <= self.cells <= MOST_CELLS:
+            return
+        with mistakes:
             raise UsageError(
                 "no such score grid",
                 where="--cells",
                 expected=f"{FEWEST_CELLS} to {MOST_CELLS}",
                 got=self.cells,
+                fix="leave it out: it follows from the spacing of the particles",
             )
 
     def _check_bounds(self) -> None:

@@ -1074,6 +1074,68 @@ def test_a_periodic_axis_without_bounds_is_told_their_form(
     assert caught.value.where == "--periodic"
 
 
+def wrapped_run() -> NDArray[np.float32]:
+    """Particles that leave a periodic square along x early, and along y late."""
+    axis = (np.arange(8) + 0.5) / 8
+    start = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    frames = np.arange(40)[:, None, None]
+    path = start + 0.01 * frames * np.array([1.0, 0.0])
+    path = path + 0.02 * np.maximum(frames - 30, 0) * np.array([0.0, 1.0])
+    return (path % 1.0).astype(np.float32)
+
+
+def test_all_axes_along_which_particles_jump_are_told_at_once(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """The fix names both axes, also where one is crossed frames later."""
+    paths = save_runs(tmp_path / "in", [wrapped_run()] * 3)
+    with pytest.raises(DataError) as caught:
+        adopt_here(paths)
+    fix = str(caught.value.fix)
+    assert "--periodic x,y " in fix
+    place = str(caught.value.where)
+    assert "along x" in place
+    assert "along y" in place
+    own_split = adopt_here(paths, periodic=["x", "y"], bounds=UNIT_SQUARE)
+    assert own_split.frames == 120
+
+
+def test_bounds_are_told_for_all_frames(tmp_path: Path, adopt_here: Adopt) -> None:
+    """Bounds that hold one frame would be refused by a later one."""
+    runs = straight_runs(3)
+    low = float(runs[0].min())
+    high = float(runs[0].max())
+    paths = save_runs(tmp_path / "in", runs)
+    with pytest.raises(UsageError) as caught:
+        adopt_here(paths, bounds=((0.0, 0.1), (0.0, 0.1)))
+    expected = str(caught.value.expected)
+    ends = [float(number) for number in re.findall(r"[\d.]+", expected)]
+    assert min(ends) == pytest.approx(low, rel=1e-4)
+    assert max(ends) == pytest.approx(high, rel=1e-4)
+
+
+def test_all_that_a_description_states_wrongly_is_told_at_once(
+    tmp_path: Path,
+) -> None:
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    wrong = {"radius": -1.0, "input_frames": 1, "cells": 1, "periodic": ["x"]}
+    with pytest.raises(UsageError) as caught:
+        adopt(paths, output=tmp_path / "mine", frame_interval=0.0, **wrong)
+    for option in (
+        "--radius",
+        "--frame-interval",
+        "--input-frames",
+        "--cells",
+        "--periodic",
+    ):
+        assert option in str(caught.value)
+    unknown: dict[str, Any] = {"radios": 0.1, "frame_interval": "soon"}
+    with pytest.raises(UsageError) as caught:
+        adopt(paths, output=tmp_path / "mine", **unknown)
+    for key in ("radios", "frame_interval"):
+        assert key in str(caught.value)
+
+
 def test_a_periodic_axis_needs_a_name_and_bounds(
     tmp_path: Path, adopt_here: Adopt
 ) -> None:
