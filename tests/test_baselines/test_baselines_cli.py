@@ -19,6 +19,7 @@ import netCDF4
 import pytest
 import torch
 from click.testing import Result
+from turns import of_this_turn
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
@@ -75,7 +76,7 @@ def test_a_fault_of_a_package_is_told_as_one(
     assert f"{module}, line 6" in result.stderr
 
 
-@pytest.mark.parametrize("baseline", list_names())
+@pytest.mark.parametrize("baseline", of_this_turn(list_names(), turns=3))
 def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) -> None:
     """Two commands lead from a baseline's name to predictions that are valid and say
     their cost.
@@ -95,6 +96,7 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
     assert validate("predictions.nc", isolated=False).valid
 
 
+@pytest.mark.slow
 def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     """Without --json each command says what it did and which one comes next, down to
     the scores.

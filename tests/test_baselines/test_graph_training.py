@@ -20,6 +20,7 @@ from simple_models import (
     swirl,
 )
 from torch import Tensor
+from turns import of_this_turn
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
@@ -633,7 +634,7 @@ def test_terms_that_count_start_alive(
 OPERATORS = ["gns", "supergat", "gat", "gatv2", "pointnet", "transformer"]
 
 
-@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize("name", of_this_turn(OPERATORS, turns=3))
 def test_every_operator_learns_a_swirl(name: str) -> None:
     """After forty steps a rollout is better than constant velocity in every frame.
 

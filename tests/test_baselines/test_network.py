@@ -12,6 +12,7 @@ import torch
 from simple_models import OPERATORS, Graph, graph
 from torch import Tensor, nn
 from torch.testing import assert_close
+from turns import of_this_turn
 
 from lagbench.baselines import network as layers
 from lagbench.baselines.network import (
@@ -435,7 +436,7 @@ def test_the_loss_of_an_operator_is_the_mean_over_layers() -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch, while it traces
-@pytest.mark.parametrize("operator", [GNS, SuperGAT])
+@pytest.mark.parametrize("operator", of_this_turn([GNS, SuperGAT], turns=2))
 def test_compiled_layers_give_the_same_gradients(operator: type[Operator]) -> None:
     """They give the same values too, for any number of edges."""
     plain = network(operator)

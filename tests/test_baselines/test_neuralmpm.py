@@ -668,6 +668,7 @@ def test_all_walls_have_as_many_nodes_beside_them(cells: int) -> None:
         surrogate(cells=cells + 1)
 
 
+@pytest.mark.slow
 def test_learns_a_swirl() -> None:
     """The rollout's error falls to a third of that of constant velocity.
 

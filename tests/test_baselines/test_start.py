@@ -165,6 +165,7 @@ def test_it_goes_on_where_the_weights_are(
     assert np.array_equal(of_start, of_result)
 
 
+@pytest.mark.slow
 def test_it_learns_from_there(run: Run) -> None:
     """A training from its own end begins at the loss that it ended with; random weights
     do not.

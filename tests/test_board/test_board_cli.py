@@ -53,6 +53,7 @@ def toy(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert end.value.code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
     """From an own model to a page, each command as documented, nothing asked on
@@ -82,6 +83,7 @@ def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
     assert "Toy model" in (tmp_path / "leaderboard" / "index.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toy")
 def test_machines_are_answered_in_json(run: Run) -> None:
     """Every command has --json; the next step keeps --board; a drifted page fails with

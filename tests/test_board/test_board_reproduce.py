@@ -84,6 +84,7 @@ def test_a_model_gives_the_scores_of_its_entry(own: ModelBoard) -> None:
     assert own.find().findings == ()
 
 
+@pytest.mark.slow
 def test_costs_of_a_data_set_are_of_one_run(own: ModelBoard) -> None:
     """An entry without a cost has all rows of its data set measured again."""
     options: dict[str, Any] = {"scores": False, "costs": True}

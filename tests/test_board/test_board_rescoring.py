@@ -441,6 +441,7 @@ def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
     assert not trace.exists()
 
 
+@pytest.mark.slow
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     """Its line goes with it: that is one's own to remove, and nothing else of the
     list.

@@ -205,6 +205,7 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
+@pytest.mark.slow
 def test_each_of_two_entries_with_one_model_is_predicted(twins: ModelBoard) -> None:
     """Entries may run the same model in different ways, as means over mirror images."""
     result = run_season(twins.folder, "twins", root=twins.root)

@@ -52,6 +52,7 @@ def own(run_board: ModelBoard, tmp_path: Path) -> ModelBoard:
     return replace(run_board, folder=tmp_path / "board")
 
 
+@pytest.mark.slow
 def test_the_values_are_those_of_predict_and_score(
     run_board: ModelBoard, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from board_bench import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
+from turns import of_this_turn
 
 from lagbench import __version__
 from lagbench.board import publish
@@ -506,9 +507,9 @@ def test_what_is_not_given(own: BoardBench) -> None:
 
 
 def rounds(few: int, many: int) -> Any:
-    """Return a number of rounds for every run, and one for slow ones."""
-    slow = pytest.param(many, marks=pytest.mark.slow)
-    return pytest.mark.parametrize("count", [few, slow])
+    """Return the first rounds for every run, and those of this turn for slow ones."""
+    slow = pytest.param(of_this_turn(range(many), turns=3), marks=pytest.mark.slow)
+    return pytest.mark.parametrize("numbers", [range(few), slow], ids=["few", "many"])
 
 
 FORK = multiprocessing.get_context("fork")
@@ -539,9 +540,11 @@ def finish(processes: Sequence[Any]) -> list[int]:
 
 
 @rounds(1, 20)
-def test_two_that_add_a_seed_at_once_lose_none(own: BoardBench, count: int) -> None:
+def test_two_that_add_a_seed_at_once_lose_none(
+    own: BoardBench, numbers: Sequence[int]
+) -> None:
     """Both seeds are there, or one was refused and says so."""
-    for number in range(count):
+    for number in numbers:
         name = f"twice-{number}"
         paths = []
         for seed in range(3):
@@ -558,9 +561,11 @@ def test_two_that_add_a_seed_at_once_lose_none(own: BoardBench, count: int) -> N
 
 
 @rounds(1, 20)
-def test_two_that_submit_one_name_at_once(own: BoardBench, count: int) -> None:
+def test_two_that_submit_one_name_at_once(
+    own: BoardBench, numbers: Sequence[int]
+) -> None:
     """One is there, the other is refused; none is a mixture of both."""
-    for number in range(count):
+    for number in numbers:
         name = f"race-{number}"
         paths = []
         for side in (0, 1):
@@ -638,13 +643,16 @@ def test_a_journal_of_strangers_leads_nowhere(
 def test_the_next_submission_mends_thirty_kills(
     own: BoardBench, predictions: Path
 ) -> None:
-    """A process is killed at another moment each time; then the check is green."""
-    rng = np.random.Generator(np.random.PCG64(30))
-    for number in range(30):
+    """A process is killed at another moment each time; then the check is green.
+
+    A third of the thirty at each commit.
+    """
+    moments = np.random.Generator(np.random.PCG64(30)).uniform(0.05, 1.5, 30)
+    for number in of_this_turn(range(30), turns=3):
         name = f"killed-{number}"
         predictions = own.predict(shifted(1000 + number), name)
         process = begin(own, predictions, name, add=False)
-        time.sleep(rng.uniform(0.05, 1.5))
+        time.sleep(moments[number])
         process.kill()
         process.join()
     own.submit(predictions)

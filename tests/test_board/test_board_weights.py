@@ -220,6 +220,7 @@ def assert_sound(own: BoardBench) -> None:
     assert failing_checks(own) == set()
 
 
+@pytest.mark.slow
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     """Weights and records of both seeds are copied and named by hash, and the entry has
     their mean budget.
@@ -263,6 +264,7 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     assert_sound(own)
 
 
+@pytest.mark.slow
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
     """Weights stay with their predictions, and go with them: an entry leaves none
     behind.

@@ -104,6 +104,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_mlcroissant_accepts_and_reads_the_document(folder: Path) -> None:
     """The reference validator only remarks on the missing date; records are what the
     manifest says.
@@ -190,6 +191,7 @@ def written_cards(root: Path, size: Size, manifest: Manifest) -> dict[Path, byte
     return {path: path.read_bytes() for path in write(root, size, manifest)}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_shipped")
 def test_the_same_manifest_gives_the_same_bytes(tmp_path: Path) -> None:
     """Cards written twice, and by another process at another time, do not differ; no

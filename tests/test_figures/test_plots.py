@@ -76,6 +76,7 @@ def chunk_names(png: bytes) -> set[bytes]:
     return names
 
 
+@pytest.mark.slow
 def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
     swirl: Path, tmp_path: Path
 ) -> None:

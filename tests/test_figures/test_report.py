@@ -295,6 +295,7 @@ def test_markup_is_not_escaped_again() -> None:
     assert tag("p", Markup("<b>x</b>")) == "<p><b>x</b></p>"
 
 
+@pytest.mark.slow
 def test_same_bytes_every_time(
     home: Path,
     page: Page,

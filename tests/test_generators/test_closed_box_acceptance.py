@@ -5,7 +5,7 @@ noise.
 from __future__ import annotations
 
 import pytest
-from scenario_draws import of_this_turn
+from turns import of_this_turn
 
 from validation.experiment import (
     CHECK_EVERY,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenario_draws import turn
+from turns import turn
 
 from lagbench.data.registry import Size, load
 from lagbench.generators.batch import ScenarioBatch, SimulationJob

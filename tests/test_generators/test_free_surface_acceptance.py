@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from free_surface_scenarios import Part, scenario, start
 from numpy.typing import NDArray
-from scenario_draws import of_this_turn, state_of
+from scenario_draws import state_of
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import Delaunay, cKDTree
+from turns import of_this_turn
 
 from lagbench.data import registry
 from lagbench.generators.constants import solver_constants

@@ -301,6 +301,7 @@ def test_parts_complete_each_other(
     assert rest.dataset_sha256 == generated.dataset_sha256
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_shipped")
 def test_force_simulates_what_is_there(
     copied: Callable[[], Path],

@@ -232,6 +232,7 @@ def children(process: int) -> list[int]:
     return [int(word) for word in listing.read_text().split()]
 
 
+@pytest.mark.slow
 def test_kernels_that_cannot_be_kept_stop_nothing(
     tmp_path: Path, unmeasured_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -254,6 +255,7 @@ def test_kernels_that_cannot_be_kept_stop_nothing(
     assert errors == ""
 
 
+@pytest.mark.slow
 def test_control_c_is_resumable(
     tmp_path: Path,
     unmeasured_path: Path,
@@ -278,6 +280,7 @@ def test_control_c_is_resumable(
     assert rest.dataset_sha256 == generated.dataset_sha256
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced(
     tmp_path: Path,
     unmeasured_path: Path,
@@ -297,6 +300,7 @@ def test_a_killed_worker_is_replaced(
     assert partial_files(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_killed_parent_is_resumed(
     tmp_path: Path,
     unmeasured_path: Path,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from scenario_draws import of_this_turn, turn
+from turns import of_this_turn, turn
 
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import load
@@ -52,7 +52,7 @@ def test_tiny_is_made_to_the_bit(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("split", OF_THIS_TURN)
+@pytest.mark.parametrize("split", of_this_turn(SPLITS, turns=4))
 def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
     """One scenario, of mini or of full, another one after every commit."""
     names = [name for name in ("mini", "full") if name in load().split(split).sizes]

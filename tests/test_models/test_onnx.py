@@ -234,6 +234,7 @@ def test_a_step_over_a_grid_of_particles_is_exported(
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_entry_carries_an_onnx_model(
     tmp_path: Path, generated: GenerationResult
 ) -> None:

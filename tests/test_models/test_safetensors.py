@@ -95,6 +95,7 @@ def test_what_cannot_be_exported_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_entry_carries_a_file_of_safetensors(
     tmp_path: Path, sound: Path, generated: GenerationResult
 ) -> None:

@@ -314,6 +314,7 @@ METRICS = (
 """
 
 
+@pytest.mark.slow
 def test_a_failing_metric_of_a_package_costs_its_column(
     run: Run, predictions: Path, package: Callable[..., Path]
 ) -> None:

@@ -205,6 +205,7 @@ def test_a_fault_in_the_middle_leaves_whole_objects(
     assert objects(url) == files(generated.root)
 
 
+@pytest.mark.slow
 def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
     full: str, run: Run, generated: GenerationResult, simulated_here: Fill, wrote: Wrote
 ) -> None:

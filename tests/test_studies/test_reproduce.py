@@ -499,6 +499,7 @@ DRAWN = (
 )
 
 
+@pytest.mark.slow
 def test_tables_and_figures_are_written(plan: Plan) -> None:
     """Markdown, CSV and pictures are there, with the scorer's numbers, budget and hours
     in them.

@@ -77,6 +77,7 @@ def label(file: Path, **labels: str) -> None:
         data.setncatts(labels)
 
 
+@pytest.mark.slow
 def test_what_is_there_is_what_was_asked_for(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -259,6 +260,7 @@ def test_the_way_to_full_is_told_without_data(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_committed_weights_are_shown_without_training(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -81,6 +81,7 @@ def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult)
     return call
 
 
+@pytest.mark.slow
 def test_validating_and_scoring(
     commands: Run, bench: ScoreBench, tmp_path: Path
 ) -> None:

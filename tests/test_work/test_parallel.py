@@ -151,6 +151,7 @@ def test_a_job_that_kills_every_worker(cluster: Any) -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_killed_process_changes_nothing(
     bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,50 @@
+"""Which part of what is too much for one run is tested at this commit."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+Case = TypeVar("Case")
+
+
+@functools.cache
+def turn() -> int:
+    """Return the number of commits so far, 0 where git does not tell.
+
+    It picks what this run does of what is too much for one. ``LAGBENCH_TURN`` is taken
+    before it: a number, or ``all``, which is 0 here.
+    """
+    chosen = os.environ.get("LAGBENCH_TURN", "")
+    if chosen == "all":
+        return 0
+    if chosen:
+        return int(chosen)
+    command = ["git", "rev-list", "--count", "HEAD"]
+    folder = Path(__file__).parent
+    try:
+        done = subprocess.run(
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return 0
+    return int(done.stdout)
+
+
+def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[Case]:
+    """Return one case in ``turns``, the next ones after another commit.
+
+    With ``LAGBENCH_TURN=all`` these are all cases.
+    """
+    if os.environ.get("LAGBENCH_TURN") == "all":
+        return list(cases)
+    first = -(turn() + shift) % turns
+    return list(cases[first::turns])
