@@ -640,9 +640,7 @@ def test_a_journal_of_strangers_leads_nowhere(
 
 
 @pytest.mark.slow
-def test_the_next_submission_mends_thirty_kills(
-    own: BoardBench, predictions: Path
-) -> None:
+def test_the_next_submission_mends_thirty_kills(own: BoardBench) -> None:
     """A process is killed at another moment each time; then the check is green.
 
     A third of the thirty at each commit.
@@ -655,7 +653,7 @@ def test_the_next_submission_mends_thirty_kills(
         time.sleep(moments[number])
         process.kill()
         process.join()
-    own.submit(predictions)
+    own.submit(own.predict(shifted(2000), "the next"))
     assert well(own)
 
 
