@@ -653,7 +653,7 @@ def test_the_next_submission_mends_thirty_kills(own: BoardBench) -> None:
         time.sleep(moments[number])
         process.kill()
         process.join()
-    own.submit(own.predict(shifted(2000), "the next"))
+    own.submit(own.predict(shifted(2000), "the-next"))
     assert well(own)
 
 
