@@ -31,20 +31,22 @@ Parameters = TypeVar(
 )
 
 
-class _Field(Protocol):
+class Field(Protocol):
     """The part of a Taichi field that a driver uses."""
 
-    def from_numpy(self, array: NDArray[np.float32]) -> None: ...
+    def from_numpy(self, array: NDArray[np.float32]) -> None:
+        """Set all values."""
 
-    def to_numpy(self) -> NDArray[np.float32]: ...
+    def to_numpy(self) -> NDArray[np.float32]:
+        """Return all values."""
 
 
 class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
-    x: _Field  # particle positions [length], filled up with zeros
-    carried: _Field  # what particles spread, the velocity first
-    fill: _Field  # m / (rho dx^d), shape [scenario]
+    x: Field  # particle positions [length], filled up with zeros
+    carried: Field  # what particles spread, the velocity first
+    fill: Field  # m / (rho dx^d), shape [scenario]
     speed_bound: float  # the CFL bound dx/dt [length/s]
 
     @property
@@ -52,7 +54,7 @@ class Kernels(Protocol):
         """What a particle at rest spreads at first, shape [4]."""
 
     @property
-    def slopes(self) -> Sequence[_Field]:
+    def slopes(self) -> Sequence[Field]:
         """Derivative of the velocity, first, at the particles, along each axis."""
 
     @property
@@ -137,12 +139,12 @@ class Driver(ABC, Generic[Parameters]):
         # what stands behind the velocity keeps its value at rest; its slopes are 0
         carried[...] = self._kernels.at_rest
         carried[..., : self.dimension] = stack(states, "velocity")
-        self._kernels.carried.from_numpy(carried)
+        self._write(self._kernels.carried, carried, at_rest=self._kernels.at_rest)
         affine = stack(states, "affine")
         for axis, field in enumerate(self._kernels.slopes):
             slope = np.zeros_like(carried)
             slope[..., : self.dimension] = affine[..., axis]
-            field.from_numpy(slope)
+            self._write(field, slope)
 
         # volume of a particle [length^d], shape [scenario]
         self._volume = np.array(
@@ -221,12 +223,13 @@ class Driver(ABC, Generic[Parameters]):
 
     def velocity(self) -> NDArray[np.float32]:
         """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
-        return self._kernels.carried.to_numpy()[..., : self.dimension]
+        carried = self._kernels.carried.to_numpy()
+        return carried[:, : self.parameters.particles, : self.dimension]
 
-    def _read(self, field: _Field) -> NDArray[np.float32]:
+    def _read(self, field: Field) -> NDArray[np.float32]:
         """Return a field of the particles, shape [scenario, particle, 4]."""
         if self.device is not Device.CPU:
-            return field.to_numpy()
+            return field.to_numpy()[:, : self.parameters.particles]
         values = np.empty((1, self.parameters.particles, 4), np.float32)
         _copy(field, values)
         return values
@@ -242,6 +245,22 @@ class Driver(ABC, Generic[Parameters]):
         padded = np.zeros((*position.shape[:-1], 4), np.float32)
         padded[..., : self.dimension] = self._inside(position)
         self._kernels.x.from_numpy(padded)
+
+    def _write(
+        self,
+        field: Field,
+        values: NDArray[np.float32],
+        at_rest: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """Fill a field of the particles.
+
+        Args:
+            field: field of a formulation.
+            values: shape [scenario, particle, 4].
+            at_rest: value of particles that the formulation adds, which never move.
+        """
+        del at_rest  # this driver adds none
+        field.from_numpy(values)
 
     def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return positions clipped to the box [length], shape [..., axis]."""

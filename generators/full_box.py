@@ -11,16 +11,22 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .driver import Driver
+from .box_tables import LANES
+from .driver import Driver, Field
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import JACOBIAN_BOUND
 from .nodal_stress_nd import NodalStressND
+from .obstacle import Obstacle
 from .solver import Health
 from .split import InitialState
 
 
 class FullBox(Driver[FullBoxParameters]):
-    """Solver of a full box; its methods are those of :class:`.Solver`."""
+    """Solver of a full box; its methods are those of :class:`.Solver`.
+
+    The particles of an obstacle are rows of the kernels' fields behind those of the
+    fluid. Nobody else sees them.
+    """
 
     _kernels: NodalStressND
 
@@ -43,6 +49,10 @@ class FullBox(Driver[FullBoxParameters]):
         viscosity = np.array([state.viscosity for state in states])
         spread = viscosity * p.dt * p.grid**2
         kernels.spread.from_numpy(spread.astype(np.float32))
+        if p.obstacle_particles:
+            kernels.place_obstacles(_obstacles_of(states))
+        if p.fringe_rate:
+            kernels.set_stream(_streams_of(states))
         for field in (kernels.drag, kernels.node, kernels.moved, kernels.gain):
             field.fill(0.0)
 
@@ -56,6 +66,34 @@ class FullBox(Driver[FullBoxParameters]):
         wrapped = np.where(is_at_end & box.periodic, start, wrapped)
         clipped = super()._inside(wrapped)
         return np.where(box.periodic, wrapped, clipped)
+
+    def load(self, states: Sequence[InitialState]) -> None:
+        """Start one scenario per state; see :meth:`.Driver.load`."""
+        for index, state in enumerate(states):
+            self._check_obstacle(index, state)
+        count = self.parameters.obstacle_particles
+        # positions of the obstacles' particles, filled up with zeros
+        self._solid = np.zeros((len(states), count, LANES), np.float32)
+        for rows, state in zip(self._solid, states, strict=True):
+            if state.obstacle is not None:
+                rows[:, : self.dimension] = state.obstacle.position
+        super().load(states)
+
+    def _place(self, position: NDArray[np.float32]) -> None:
+        padded = np.zeros((*position.shape[:-1], LANES), np.float32)
+        padded[..., : self.dimension] = self._inside(position)
+        rows = np.concatenate([padded, self._solid], axis=1)
+        self._kernels.x.from_numpy(rows)
+
+    def _write(
+        self,
+        field: Field,
+        values: NDArray[np.float32],
+        at_rest: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        solid = np.empty_like(self._solid)
+        solid[...] = at_rest
+        field.from_numpy(np.concatenate([values, solid], axis=1))
 
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""
@@ -75,8 +113,9 @@ class FullBox(Driver[FullBoxParameters]):
         return min(end, (frame + 1) * interval)
 
     def jacobian(self) -> NDArray[np.float32]:
-        """Volume ratio J of the particles [1], shape [scenario, particle]."""
-        return np.asarray(self._kernels.carried.to_numpy()[:, :, 3])
+        """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
+        carried = self._kernels.carried.to_numpy()
+        return np.asarray(carried[:, : self.parameters.particles, 3])
 
     def grid_velocity(self) -> NDArray[np.float32]:
         """Nodal velocities of the last substep [length/s].
@@ -126,6 +165,7 @@ class FullBox(Driver[FullBoxParameters]):
         super()._check_state(index, state)
         self._check_walls(index, state)
         self._check_force(index, state)
+        self._check_stream(index, state)
 
     def _check_walls(self, index: int, state: InitialState) -> None:
         """Refuse walls that move as no wall of this box can."""
@@ -161,6 +201,52 @@ class FullBox(Driver[FullBoxParameters]):
                 expected=f"finite, shape [frame, {layer_count}, {self.dimension}]",
                 got=f"shape [frame, {force.shape[0]}, {force.shape[1]}]",
             )
+
+    def _check_obstacle(self, index: int, state: InitialState) -> None:
+        """Refuse an obstacle of other particles than the solver has room for."""
+        count = self.parameters.obstacle_particles
+        got = 0
+        if state.obstacle is not None:
+            got = len(state.obstacle.position)
+        if got != count:
+            raise UsageError(
+                "the obstacle does not fit the solver",
+                where=f"scenario {index}, obstacle",
+                expected=f"{count} particles",
+                got=f"{got} particles",
+            )
+
+    def _check_stream(self, index: int, state: InitialState) -> None:
+        """Refuse a stream where no fringe is, a fringe without one, or a fast one."""
+        stream = state.stream
+        if stream is None and not self.parameters.fringe_rate:
+            return
+        speed_bound = self._kernels.speed_bound
+        is_valid = (
+            stream is not None
+            and self.parameters.fringe_rate > 0.0
+            and stream.shape == (self.dimension,)
+            and bool((np.abs(stream) <= speed_bound).all())
+        )
+        if not is_valid:
+            raise UsageError(
+                "a fringe needs a stream, and a stream a fringe",
+                where=f"scenario {index}, stream",
+                expected=f"fringe_rate above 0, and a velocity of {self.dimension} "
+                f"components up to dx/dt = {speed_bound:.6g}",
+                got=f"fringe_rate {self.parameters.fringe_rate:g}, stream {stream}",
+            )
+
+
+def _obstacles_of(states: Sequence[InitialState]) -> list[Obstacle]:
+    """Return the obstacles of states that all have one."""
+    return [state.obstacle for state in states if state.obstacle is not None]
+
+
+def _streams_of(states: Sequence[InitialState]) -> NDArray[np.float32]:
+    """Return the streams of states that all have one, shape [scenario, axis]."""
+    streams = [state.stream for state in states if state.stream is not None]
+    return np.stack(streams).astype(np.float32)
 
 
 def _has_program(state: InitialState) -> bool:

@@ -7,7 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lagbench.data.box import Box
+from lagbench.data.fringe import fringe_rates
 
 __all__ = ["FullBoxParameters"]
 
@@ -39,6 +43,10 @@ class FullBoxParameters:
     force_layers: int = 0
     # substeps for which one row of a program of walls or forces acts
     substeps_per_frame: int = 1
+    obstacle_particles: int = 0  # particles of a fixed obstacle; 0 for no obstacle
+    # the last part of the box along x, in which the velocity is drawn to the stream
+    fringe_length: float = 0.0  # [length]
+    fringe_rate: float = 0.0  # rate in the middle of the fringe [1/s]; 0 for no fringe
 
     @property
     def cells(self) -> tuple[int, ...]:
@@ -50,3 +58,18 @@ class FullBoxParameters:
         """Coordinate of the ghost nodes below each axis [cells], shape [axis]."""
         # twelve digits: a sum of halves and whole cells is exact
         return tuple(round(low * self.grid - 0.5, 12) for low in self.box.low)
+
+    def fringe_rates(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rate at which the fringe draws to the stream [1/s].
+
+        Args:
+            place: coordinates along x [length].
+        """
+        if self.fringe_rate == 0.0:
+            return np.zeros_like(place)
+        return fringe_rates(
+            place,
+            end=self.box.high[0],
+            length=self.fringe_length,
+            rate=self.fringe_rate,
+        )

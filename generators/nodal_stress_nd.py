@@ -7,9 +7,14 @@ that acts at the nodes:
 2. Fold: ghosts give what they received to the nodes that they stand for
    (:mod:`.box_tables`), then v = (n v)/n,  Jbar = (n J)/n,  r = n m / (rho dx^d).
 3. Forces: a = (E/rho) grad Jbar + nu lap v + f,  v <- v + dt a. Gradients are central
-   differences, weighted 1/8, 3/4, 1/8 along every other axis.
+   differences, weighted 1/8, 3/4, 1/8 along every other axis. In a fringe f also holds
+   sigma (U - v), which draws the velocity to the stream U (Nordstrom, Nordin and
+   Henningson, SIAM J. Sci. Comput. 20 (1999) 1365). Nodes inside an obstacle are at
+   rest: v = 0, a = 0.
 4. G2P as in two dimensions. Particles stay between walls, and are wrapped along
-   periodic axes.
+   periodic axes. Particles of the fluid that would enter an obstacle are put on its
+   surface. Those of an obstacle neither move nor get a velocity, but their J follows
+   that of the nodes, so that the pressure goes on inside.
 
 In a square with four walls the bits are those of :mod:`.nodal_stress`, which is faster
 there. Sums are integers (:mod:`.transfer`): no order of particles or threads changes a
@@ -21,6 +26,7 @@ Valid while max abs(v) dt <= dx and while J stays in (0, 8].
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +37,7 @@ from . import backend
 from .box_tables import LANES, BoxTables
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import JACOBIAN_BOUND
+from .obstacle import Obstacle, is_inside
 from .transfer import (
     Nothing,
     Template,
@@ -72,6 +79,10 @@ class NodalStressND:
         self.dimension = p.box.dimension
         self.periodic = p.box.periodic
         self.has_walls = not all(p.box.periodic)
+        self.has_obstacle = p.obstacle_particles > 0
+        self.has_fringe = p.fringe_rate > 0.0
+        # particles of the fluid, and behind them those of the obstacle
+        self.particles = p.particles + p.obstacle_particles
         self.cells = p.cells
         self.tables = BoxTables(p.cells, periodic=p.box.periodic, no_slip=p.no_slip)
         self.inv_dx = float(p.grid)
@@ -84,8 +95,8 @@ class NodalStressND:
         self.period = p.box.lengths.tolist()
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         speed_reach = _REACH[self.dimension] * self.speed_bound
-        self.velocity_scale = fixed_point_scale(p.particles, speed_reach)
-        self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
+        self.velocity_scale = fixed_point_scale(self.particles, speed_reach)
+        self.count_scale = fixed_point_scale(self.particles, JACOBIAN_BOUND)
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
         self.cell_scale = self.velocity_scale * dx
@@ -147,6 +158,12 @@ class NodalStressND:
         self.peak = ti.field(ti.f32)
         self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
         self.fill = ti.field(ti.f32)  # m / (rho dx^d), shape [scenario]
+        # 1 at nodes of the fluid, 0 at those at rest inside an obstacle
+        self.open = ti.field(ti.f32)
+        # centre of the obstacle, and the least distance from it [length]
+        self.obstacle = ti.Vector.field(LANES, ti.f32)
+        self.damping = ti.field(ti.f32)  # dt sigma of the fringe, shape [node]
+        self.stream = ti.Vector.field(LANES, ti.f32)  # U, shape [scenario]
 
         # tables, shape [ghost], [edge], [edge, image], [interior] and [node]
         self.ghost = ti.field(ti.i32)
@@ -185,13 +202,15 @@ class NodalStressND:
             self.peak,
         )
         tables = self.tables
-        particle_shape = (self.scenarios, self.parameters.particles)
+        particle_shape = (self.scenarios, self.particles)
         node_shape = (self.scenarios, tables.node_count)
         # Two more: a node counts the rows of the two nodes before it as well.
         row_shape = (self.scenarios, tables.node_count + 2)
         ghost_shape = tables.ghosts.node.shape
         image_shape = tables.images.ghost.shape
         layer_count = max(1, self.parameters.force_layers)
+        obstacle_shape = node_shape if self.has_obstacle else (1, 1)
+        fringe_shape = (tables.node_count,) if self.has_fringe else (1,)
         return backend.place(
             *((particle_shape, [field]) for field in particle_fields),
             *((node_shape, [field]) for field in node_fields),
@@ -205,6 +224,9 @@ class NodalStressND:
             ((self.scenarios, *image_shape), [self.image_drag]),
             ((self.scenarios, layer_count), [self.force]),
             ((self.scenarios,), [self.spread, self.fill]),
+            (obstacle_shape, [self.open]),
+            ((self.scenarios,), [self.obstacle, self.stream]),
+            (fringe_shape, [self.damping]),
         )
 
     def _fill_tables(self) -> None:
@@ -219,6 +241,14 @@ class NodalStressND:
         row = np.clip(tables.index[:, 1] - 1, 0, self.cells[1] - 1)
         layer = row * max(1, self.parameters.force_layers) // self.cells[1]
         self.layer.from_numpy(layer.astype(np.int32))
+        if self.has_fringe:
+            rates = self.parameters.fringe_rates(self._node_places()[:, 0])
+            self.damping.from_numpy((self.dt * rates).astype(np.float32))
+
+    def _node_places(self) -> NDArray[np.float64]:
+        """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
+        place = (self.tables.index + np.array(self.origin)) / self.inv_dx
+        return np.asarray(place)
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
@@ -231,6 +261,24 @@ class NodalStressND:
         gain = np.zeros((scenarios, layers, LANES), np.float32)
         gain[..., :dimension] = np.float32(self.dt) * acceleration
         self.force.from_numpy(gain)
+
+    def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Set the nodes that each scenario's obstacle holds at rest."""
+        place = self._node_places()
+        is_open = np.empty((self.scenarios, len(place)), np.float32)
+        values = np.zeros((self.scenarios, LANES), np.float32)
+        for index, obstacle in enumerate(obstacles):
+            is_open[index] = ~is_inside(place, obstacle.centre, obstacle.radius)
+            values[index, : self.dimension] = obstacle.centre
+            values[index, 3] = obstacle.radius + _INSET / self.inv_dx
+        self.open.from_numpy(is_open)
+        self.obstacle.from_numpy(values)
+
+    def set_stream(self, velocity: NDArray[np.float32]) -> None:
+        """Let the fringe draw to a velocity [length/s], shape [scenario, axis]."""
+        stream = np.zeros((self.scenarios, LANES), np.float32)
+        stream[:, : self.dimension] = velocity
+        self.stream.from_numpy(stream)
 
     def release(self) -> None:
         """Give the memory back; the fields cannot be used afterwards."""
@@ -452,7 +500,12 @@ class NodalStressND:
         gain = self.pressure * gradient + self.spread[s] * laplacian
         if ti.static(self.parameters.force_layers > 0):
             gain = gain + self.force[s, self.layer[n]]
+        if ti.static(self.has_fringe):
+            gain = gain + self.damping[n] * (self.stream[s] - here)
         v = here + gain
+        if ti.static(self.has_obstacle):
+            gain = self.open[s, n] * gain
+            v = self.open[s, n] * v
         self.gain[s, n] = ti.Vector([gain[0], gain[1], gain[2], self.ratio[s, n]])
         self.moved[s, n] = ti.Vector([v[0], v[1], v[2], here[3]])
         peak = self.peak[s, n]
@@ -556,6 +609,8 @@ class NodalStressND:
         for axis in ti.static(range(self.dimension)):
             target = self.x[s, p][axis] + (self.dt * grid_v[axis] + shift[axis])
             x[axis] = self.kept_inside(target, axis)
+        if ti.static(self.has_obstacle):
+            x = self.kept_outside(s, x)
         jacobian = carried[3]
         jacobian = (
             jacobian
@@ -568,6 +623,34 @@ class NodalStressND:
         self.extremes[s, p] = largest(reached, self.extremes[s, p])
         lowest = largest(-jacobian, self.x[s, p][3])
         self.x[s, p] = ti.Vector([x[0], x[1], x[2], lowest])
+
+    @ti.func
+    def hold(self, s: ti.i32, p: ti.i32) -> None:
+        """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
+        here = self.here[s, p]
+        push = self.push[s, p]
+        volume = 1.0 / largest(here[3], 0.5)
+        for axis in ti.static(range(self.dimension)):
+            self.slopes[axis][s, p] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        jacobian = self.carried[s, p][3]
+        jacobian = (
+            jacobian
+            + self.parameters.jacobian_relaxation * (push[3] - jacobian)
+            + self.parameters.density_coupling * (volume - push[3])
+        )
+        self.carried[s, p] = ti.Vector([0.0, 0.0, 0.0, jacobian])
+
+    @ti.func
+    def kept_outside(self, s: ti.i32, target: ti.math.vec3) -> Value:
+        """Return a place, or the nearest on the obstacle's surface if inside."""
+        obstacle = self.obstacle[s]
+        way = target - ti.Vector([obstacle[0], obstacle[1], obstacle[2]])
+        square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+        # A place at the very centre has no nearest one; it stays.
+        is_inside = (square < obstacle[3] * obstacle[3]) and (square > 0.0)
+        stretch = obstacle[3] / ti.sqrt(ti.select(is_inside, square, 1.0))
+        moved = target + (stretch - 1.0) * way
+        return ti.select(is_inside, moved, target)
 
     @ti.func
     def kept_inside(self, target: ti.f32, axis: Template) -> ti.f32:
@@ -592,6 +675,7 @@ class NodalStressND:
         tables = self.tables
         self._serial_substeps(
             substeps,
+            self.particles,
             self.parameters.particles,
             tables.node_count,
             len(tables.interior),
@@ -603,6 +687,7 @@ class NodalStressND:
         """Advance every scenario by one substep: one launch per phase."""
         tables = self.tables
         self._parallel_substep(
+            self.particles,
             self.parameters.particles,
             tables.node_count,
             len(tables.interior),
@@ -615,6 +700,7 @@ class NodalStressND:
         self,
         substeps: ti.i32,
         particles: ti.i32,
+        fluid: ti.i32,
         nodes: ti.i32,
         interior: ti.i32,
         edges: ti.i32,
@@ -645,13 +731,17 @@ class NodalStressND:
                 self.mirror_moved(0, g)
             for p in range(particles):
                 self.g2p(0, p)
-            for p in range(particles):
+            for p in range(fluid):
                 self.update(0, p)
+            if ti.static(self.has_obstacle):
+                for p in range(fluid, particles):
+                    self.hold(0, p)
 
     @ti.kernel
     def _parallel_substep(
         self,
         particles: ti.i32,
+        fluid: ti.i32,
         nodes: ti.i32,
         interior: ti.i32,
         edges: ti.i32,
@@ -685,7 +775,13 @@ class NodalStressND:
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
             self.g2p(s, p)
-            self.update(s, p)
+            if ti.static(self.has_obstacle):
+                if p < fluid:
+                    self.update(s, p)
+                else:
+                    self.hold(s, p)
+            else:
+                self.update(s, p)
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .full_box_parameters import FullBoxParameters
+from .obstacle import Obstacle
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -160,6 +161,12 @@ class InitialState:
     # acceleration of layers of equal height along y [length/s^2], lowest first, a
     # program of shape [frame, layer, axis] whose rows act as those of the walls
     body_force: NDArray[np.float64] | None = None
+    # a disc or ball that never moves, in a full box whose parameters count its
+    # particles
+    obstacle: Obstacle | None = None
+    # velocity to which the fringe of a full box draws the fluid [length/s], shape
+    # [axis]
+    stream: NDArray[np.float64] | None = None
     friction: float = 0.0  # Coulomb friction of the walls (free surface only) [1]
     start_frame: int = 0  # frames simulated before frame 0 is recorded
     # what was drawn for this scenario; stored as attributes and hashed

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.obstacle import Obstacle
 from lagbench.generators.split import InitialState
 
 Array = NDArray[np.float64]
@@ -43,7 +44,13 @@ class ReferenceFullBox:
         self.x = state.position.copy()
         self.v = state.velocity.copy()
         self.c = state.affine.copy()
-        self.j = np.ones(parameters.particles)
+        # the particles of an obstacle, which follow those of the fluid
+        self.solid = slice(parameters.particles, None)
+        self.solid_nodes = np.zeros(self.shape, bool)
+        self.obstacle = state.obstacle
+        if state.obstacle is not None:
+            self.add_obstacle(state.obstacle)
+        self.j = np.ones(len(self.x))
         self.force = np.zeros(self.vector_shape)
         if state.body_force is not None:
             layers = state.body_force[0]
@@ -54,9 +61,43 @@ class ReferenceFullBox:
             per_row = layers[layer_of_row]
             other_axes = [axis for axis in range(self.dimension) if axis != 1]
             self.force += np.expand_dims(per_row, tuple(other_axes))
+        self.rate = np.zeros(self.vector_shape)
+        self.stream = np.zeros(self.dimension)
+        if state.stream is not None:
+            self.stream = state.stream
+            rate = self.fringe(parameters)
+            along_x = rate.reshape(-1, *(1,) * self.dimension)
+            self.rate += along_x
         self.tangential = 1.0
         if parameters.no_slip:
             self.tangential = -1.0
+
+    def add_obstacle(self, obstacle: Obstacle) -> None:
+        """Append the particles of an obstacle, and mark the nodes that it stops."""
+        solid = obstacle.position
+        resting = np.zeros_like(solid)
+        self.x = np.concatenate([self.x, solid])
+        self.v = np.concatenate([self.v, resting])
+        still = np.zeros((len(solid), self.dimension, self.dimension))
+        self.c = np.concatenate([self.c, still])
+        distance = np.linalg.norm(self.node_places() - obstacle.centre, axis=-1)
+        self.solid_nodes = distance < obstacle.radius
+
+    def node_places(self) -> Array:
+        """Return where the nodes lie [length], ghosts included."""
+        number = np.moveaxis(np.indices(self.shape), 0, -1)
+        place = np.array(self.box.low) + (number - 0.5) * self.dx
+        return np.asarray(place)
+
+    def fringe(self, parameters: FullBoxParameters) -> Array:
+        """Return the rate of the fringe at each column of nodes along x [1/s]."""
+        column = np.arange(self.shape[0])
+        place = self.box.low[0] + (column - 0.5) * self.dx
+        way = place - (self.box.high[0] - parameters.fringe_length)
+        share = way / parameters.fringe_length
+        bump = 16.0 * (share * (1.0 - share)) ** 2
+        is_in_fringe = (share > 0.0) & (share < 1.0)
+        return np.where(is_in_fringe, parameters.fringe_rate * bump, 0.0)
 
     def step(self, count: int) -> None:
         """Advance by some substeps."""
@@ -66,8 +107,11 @@ class ReferenceFullBox:
             self.fill_scalar(r)
             self.fill_scalar(jbar)
             acceleration = self.acceleration(v, jbar) + self.force
+            acceleration += self.rate * (self.stream - v)
             gain = self.p.dt * acceleration
             v = v + gain
+            v[self.solid_nodes] = 0.0
+            gain[self.solid_nodes] = 0.0
             self.fill(v, moving=True)
             self.fill(gain, moving=False)
             self.to_particles(v, gain, r, jbar)
@@ -251,15 +295,31 @@ class ReferenceFullBox:
         u += p.velocity_relaxation * (here - u)
         self.v = u + np.einsum("pab,pb->pa", c, shift)
         moved = self.x + p.dt * here + shift
+        start = self.x
         inset = 1e-3 * self.dx
         low = np.array(self.box.low)
         high = np.array(self.box.high)
         wrapped = low + (moved - low) % (high - low)
         clipped = np.clip(moved, low + inset, high - inset)
         self.x = np.where(self.box.periodic, wrapped, clipped)
+        if self.obstacle is not None:
+            self.keep_outside(self.obstacle)
+        self.x[self.solid] = start[self.solid]
+        self.v[self.solid] = 0.0
+        c[self.solid] = 0.0
         self.c = c
         divergence = np.einsum("paa->p", c)
         growth = p.dt * divergence * self.j
         relaxation = p.jacobian_relaxation * (ratio - self.j)
         coupling = p.density_coupling * (1.0 / density - ratio)
         self.j = self.j + growth + relaxation + coupling
+
+    def keep_outside(self, obstacle: Obstacle) -> None:
+        """Put particles that are inside an obstacle on its surface."""
+        least = obstacle.radius + 1e-3 * self.dx
+        way = self.x - obstacle.centre
+        distance = np.linalg.norm(way, axis=1)
+        is_inside = distance < least
+        direction = way / distance[:, None]
+        surface = obstacle.centre + least * direction
+        self.x = np.where(is_inside[:, None], surface, self.x)

@@ -21,11 +21,20 @@ cube
 cube-1000
     Lid-driven cube at Re 1000 on a grid of 32 cells beside Albensoeder and Kuhlmann
     (2005). The data have Reynolds numbers up to 50, so the bound is wide.
+strouhal
+    Frequency of the vortices behind a disc at Re 100, f D / U, against Williamson
+    (1989). The disc has 8 cells across and blocks 1/12 of a channel, which raises the
+    frequency; Williamson's stream has no walls.
+cylinder-drag
+    Mean drag coefficient of the same disc against Park, Kwon and Choi (1998). It is
+    taken from the momentum that the fringe gives to the stream.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -36,7 +45,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.data.box import Box
+from lagbench.generators.cylinder import eddy, moved_out
 from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.obstacle import Obstacle, is_inside
 from lagbench.generators.periodic_noise import fill_box
 from lagbench.generators.solver import Solver, build
 from lagbench.generators.split import InitialState, Material
@@ -409,6 +420,142 @@ def cube_at_1000(grid: int = 32) -> CaseResult:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Shedding:
+    """What a disc in a stream does once its wake is periodic."""
+
+    strouhal: float  # frequency times the diameter over the speed of the stream
+    drag: float  # mean drag over rho U^2 D / 2
+    amplitude: float  # of the velocity across the stream behind the disc, over U
+
+
+@functools.cache
+def shedding(
+    grid: int = 128,
+    *,
+    diameter: float = 1.0 / 16.0,
+    height: float = 0.75,
+    reynolds: float = 100.0,
+    duration: float = 60.0,
+) -> Shedding:
+    """Return what a disc in a channel of length 1 sheds.
+
+    Speeds and Reynolds number are those of the stream that reaches the disc.
+
+    Args:
+        grid: cells across a length of 1.
+        diameter: D of the disc [length].
+        height: of the channel [length].
+        reynolds: U D / nu.
+        duration: simulated time in D / U; its second half is measured.
+    """
+    speed = 0.25
+    low = 0.5 - 0.5 * height
+    box = Box.from_bounds([(0.0, 1.0), (low, low + height)], [True, False])
+    centre = np.array([0.3125, 0.5])
+    counts = (2 * grid, round(2 * grid * height))
+    position = lattice(box, counts)
+    cell = np.indices(counts).reshape(2, -1).T
+    places = np.array(box.low) + (cell + 0.5) / (2 * grid)
+    is_solid = is_inside(places, (0.3125, 0.5), 0.5 * diameter)
+    fluid = moved_out(position[~is_solid], centre, 0.5 * diameter)
+    parameters = dataclasses.replace(
+        constants(box, grid, len(fluid), no_slip=False),
+        obstacle_particles=int(is_solid.sum()),
+        fringe_length=0.15,
+        fringe_rate=20.0,
+    )
+    behind = centre + np.array([1.5 * diameter, 0.0])
+    velocity, affine = eddy(fluid, behind, radius=1.5 * diameter, speed=speed)
+    velocity[:, 0] += speed
+    stream = np.array([speed, 0.0])
+    state = InitialState(
+        position=fluid,
+        velocity=velocity,
+        affine=affine,
+        material=np.full(len(fluid), Material.LIQUID, dtype=np.int8),
+        area=box.volume * len(fluid) / len(places),
+        viscosity=speed * diameter / reynolds,
+        obstacle=Obstacle(
+            centre=(0.3125, 0.5), radius=0.5 * diameter, position=places[is_solid]
+        ),
+        stream=stream,
+    )
+    solver = build(parameters)
+    solver.load([state])
+
+    unit = diameter / speed  # of time [s]
+    steps = round(0.1 * unit / parameters.dt)
+    interval = steps * parameters.dt
+    solver.advance(round(0.5 * duration * unit / parameters.dt))
+    node = (np.arange(grid) + 0.5) / grid
+    rates = parameters.fringe_rates(node)
+    column = int(behind[0] * grid)
+    row = round(0.5 * height * grid)
+    across = []
+    drags = []
+    bulks = []
+    for _ in range(round(0.5 * duration * unit / interval)):
+        solver.advance(steps)
+        field = nodal_velocity(solver)
+        across.append(field[column, row, 1])
+        gain = rates[:, None] * (speed - field[..., 0])  # [length/s^2]
+        drags.append(gain.sum() / grid**2)
+        bulks.append(field[: grid // 8, :, 0].mean())
+    bulk = float(np.mean(bulks))  # the stream that reaches the disc [length/s]
+    signal = np.array(across)
+    frequency = crossing_rate(signal) / interval
+    drag = float(np.mean(drags)) / (0.5 * bulk**2 * diameter)
+    return Shedding(
+        strouhal=frequency * diameter / bulk,
+        drag=drag,
+        amplitude=float(np.sqrt(2.0) * signal.std() / bulk),
+    )
+
+
+def crossing_rate(signal: Array) -> float:
+    """Return how often per sample a signal rises through zero.
+
+    Crossings lie between samples, where the line through them is zero.
+    """
+    before = signal[:-1]
+    after = signal[1:]
+    number = np.flatnonzero((before < 0.0) & (after >= 0.0))
+    if len(number) < 3:
+        return 0.0
+    share = before[number] / (before[number] - after[number])
+    place = number + share
+    return float((len(place) - 1) / (place[-1] - place[0]))
+
+
+def strouhal() -> CaseResult:
+    """Strouhal number of a disc at Re 100; C. H. K. Williamson, J. Fluid Mech. 206
+    (1989) 579-627, has 0.164 to 0.166.
+    """
+    measured = shedding().strouhal
+    truth = 0.165
+    return CaseResult(
+        measured=measured,
+        truth=truth,
+        deviation=abs(measured / truth - 1.0),
+        tolerance=0.12,
+    )
+
+
+def cylinder_drag() -> CaseResult:
+    """Drag coefficient of a disc at Re 100; J. Park, K. Kwon, H. Choi, KSME Int. J. 12
+    (1998) 1200-1205, have 1.33.
+    """
+    measured = shedding().drag
+    truth = 1.33
+    return CaseResult(
+        measured=measured,
+        truth=truth,
+        deviation=abs(measured / truth - 1.0),
+        tolerance=0.12,
+    )
+
+
 CASES: dict[str, Callable[[], CaseResult]] = {
     "taylor-green": taylor_green,
     "poiseuille": poiseuille,
@@ -416,6 +563,8 @@ CASES: dict[str, Callable[[], CaseResult]] = {
     "thin-cavity": thin_cavity,
     "cube": cube,
     "cube-1000": cube_at_1000,
+    "strouhal": strouhal,
+    "cylinder-drag": cylinder_drag,
 }
 
 

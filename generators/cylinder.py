@@ -1,0 +1,223 @@
+"""Flow past a cylinder: a channel with a fixed disc, which sheds vortices.
+
+The channel is periodic along x and has walls along y, along which the fluid slides. In
+its last part along x, the fringe, the velocity is drawn to the stream (U, 0): there the
+wake dies, the stream that comes round to the disc is even, and its speed stays U. The
+disc of diameter D stands off the middle of the channel by a drawn number of particle
+spacings. At the start the fluid flows past it without friction, and an eddy behind the
+disc disturbs it:
+
+    v = 3.5 U' s (1 - s^2)^2 along circles, s = r / R < 1,
+
+with drawn centre, radius R, speed U' and sense; it has no divergence. The Reynolds
+number U D / nu is drawn between 80 and 200, where the flow is two-dimensional and
+periodic (Williamson, Annu. Rev. Fluid Mech. 28 (1996) 477).
+
+Expected behaviour: after some 25 D/U the wake is a street of vortices of either sign,
+shed in turn from both sides with the frequency St U / D. The Strouhal number St is
+about 0.16 at Re 100 and 0.2 at Re 200 in an unbounded stream (Williamson, J. Fluid
+Mech. 206 (1989) 579), and larger in a channel.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError
+
+from .constants import constants, interval
+from .draws import RandomSource, choice, log_uniform, quantise, uniform
+from .full_box_parameters import FullBoxParameters
+from .obstacle import Obstacle, is_inside
+from .periodic_noise import fill_box
+from .programs import draw_integer
+from .split import InitialState, Material
+
+if TYPE_CHECKING:
+    from lagbench.data.registry import Size
+
+__all__ = ["initial_state", "solver_parameters", "start_frame"]
+
+Array = NDArray[np.float64]
+
+
+def solver_parameters(size: Size) -> FullBoxParameters:
+    """Return the solver's constants at this size; walls let the fluid slide."""
+    return constants(FullBoxParameters, size, box=size.box, no_slip=False)
+
+
+def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
+    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
+    del scenario  # the same range for all
+    return draw_integer(rng, *interval(size, "start_frame"))
+
+
+def lattice_counts(size: Size) -> tuple[int, int]:
+    """Return the particles along each axis of the lattice that fills the channel."""
+    per_length = int(size.value("lattice"))
+    along_x, along_y = size.box.lengths.tolist()
+    return round(per_length * along_x), round(per_length * along_y)
+
+
+def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
+    """Draw where the disc stands [length].
+
+    It moves by whole spacings of the lattice, so that all discs hold as many particles.
+    """
+    most = int(size.value("offset_max"))
+    steps = choice(rng, 2 * most + 1) - most
+    x = float(size.value("obstacle_x"))
+    middle = float(size.box.centre[1])
+    return x, middle + steps / size.value("lattice")
+
+
+def _square(way: Array) -> Array:
+    """Return the squared length of vectors in the plane, shape [vector]."""
+    x = way[:, 0]
+    y = way[:, 1]
+    return np.asarray(x * x + y * y)
+
+
+def moved_out(position: Array, centre: Array, radius: float) -> Array:
+    """Return positions of which those inside a disc are put on its rim [length]."""
+    way = position - centre
+    distance = np.sqrt(_square(way))
+    is_in = distance < radius
+    stretch = np.where(is_in, radius / distance, 1.0)
+    return quantise(centre + stretch[:, None] * way)
+
+
+def potential_flow(
+    position: Array, centre: Array, *, radius: float, speed: float
+) -> tuple[Array, Array]:
+    """Return velocity [length/s] and gradient [1/s] of potential flow past a disc.
+
+        u = U (1 - R^2 (x^2 - y^2) / r^4),    v = -2 U R^2 x y / r^4,
+
+    with x, y from the centre. No fluid goes through the disc: a stream that met it at
+    once would be compressed by a sound wave.
+
+    Args:
+        position: points outside the disc [length], shape [point, 2].
+        centre: of the disc [length].
+        radius: R of the disc [length].
+        speed: U of the stream along x [length/s].
+    """
+    way = position - centre
+    x = way[:, 0]
+    y = way[:, 1]
+    square = _square(way)
+    dipole = speed * radius * radius / (square * square)
+    velocity = np.stack(
+        [speed - dipole * (x * x - y * y), -2.0 * dipole * x * y], axis=1
+    )
+    # The flow is harmonic: two numbers make the gradient.
+    stretch = 2.0 * dipole * x * (x * x - 3.0 * y * y) / square
+    shear = 2.0 * dipole * y * (3.0 * x * x - y * y) / square
+    gradient = np.empty((len(position), 2, 2))
+    gradient[:, 0, 0] = stretch
+    gradient[:, 0, 1] = shear
+    gradient[:, 1, 0] = shear
+    gradient[:, 1, 1] = -stretch
+    return velocity, gradient
+
+
+def eddy(
+    position: Array, centre: Array, *, radius: float, speed: float
+) -> tuple[Array, Array]:
+    """Return velocity [length/s] and gradient [1/s] of an eddy of finite size.
+
+    With s = r / R the speed is 3.5 U' s (1 - s^2)^2 along circles; its largest value
+    is U', nearly, at s = 1 / sqrt(5).
+
+    Args:
+        position: points [length], shape [point, 2].
+        centre: of the eddy [length].
+        radius: R [length].
+        speed: U', positive for a turn against the clock [length/s].
+    """
+    way = (position - centre) / radius
+    square = _square(way)
+    rest = np.where(square < 1.0, 1.0 - square, 0.0)
+    rate = 3.5 * speed * rest * rest
+    x = way[:, 0]
+    y = way[:, 1]
+    velocity = np.stack([-rate * y, rate * x], axis=1)
+    # derivative of the rate with respect to the square, times 2
+    slope = -14.0 * speed * rest
+    gradient = np.empty((len(position), 2, 2))
+    gradient[:, 0, 0] = -slope * x * y
+    gradient[:, 0, 1] = -slope * y * y - rate
+    gradient[:, 1, 0] = slope * x * x + rate
+    gradient[:, 1, 1] = slope * x * y
+    return velocity, gradient / radius
+
+
+def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
+    """Draw the place of the disc, the Reynolds number, and an eddy behind the disc."""
+    start = start_frame(size, scenario, rng)
+    counts = lattice_counts(size)
+    box = size.box
+    diameter = float(size.value("obstacle_diameter"))
+    radius = 0.5 * diameter
+    centre = np.array(draw_centre(size, rng))
+    position = fill_box(
+        rng, counts, low=box.low, high=box.high, jitter=size.value("jitter")
+    )
+    cell = np.indices(counts).reshape(2, -1).T
+    places = quantise(np.array(box.low) + (cell + 0.5) / size.value("lattice"))
+    x, y = centre.tolist()
+    is_solid = is_inside(places, (x, y), radius)
+    _check_counts(size, int(is_solid.sum()), len(places))
+
+    speed = float(size.value("speed"))
+    way = np.array([uniform(rng, 1.0, 2.0), uniform(rng, -0.5, 0.5)])
+    eddy_radius = uniform(rng, 1.0, 1.5) * diameter
+    eddy_speed = uniform(rng, 0.5, 1.0) * speed
+    if choice(rng, 2):
+        eddy_speed = -eddy_speed
+    fluid = moved_out(position[~is_solid], centre, radius)
+    eddy_centre = centre + diameter * way
+    velocity, affine = eddy(fluid, eddy_centre, radius=eddy_radius, speed=eddy_speed)
+    past, past_affine = potential_flow(fluid, centre, radius=radius, speed=speed)
+    velocity += past
+    affine += past_affine
+
+    reynolds = log_uniform(rng, *interval(size, "reynolds"))
+    viscosity = speed * diameter / reynolds
+    return InitialState(
+        position=fluid,
+        velocity=quantise(velocity),
+        affine=quantise(affine),
+        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        area=box.volume * size.particles / len(places),
+        viscosity=viscosity,
+        obstacle=Obstacle(centre=(x, y), radius=radius, position=places[is_solid]),
+        stream=np.array([speed, 0.0]),
+        start_frame=start,
+        parameters={
+            "obstacle_y": y,
+            "reynolds": reynolds,
+            "viscosity": viscosity,
+        },
+    )
+
+
+def _check_counts(size: Size, solid_count: int, lattice_count: int) -> None:
+    """Refuse counts that do not follow from the lattice and the disc.
+
+    Raises:
+        UsageError: datasets.yaml states other numbers of particles.
+    """
+    expected = (lattice_count - solid_count, solid_count)
+    stated = (size.particles, int(size.value("obstacle_particles")))
+    if stated != expected:
+        raise UsageError(
+            "the lattice does not hold the particles",
+            where=f"datasets.yaml, {size.split} {size.name}",
+            expected=f"particles, obstacle_particles = {expected}",
+            got=stated,
+        )
