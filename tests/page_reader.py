@@ -33,6 +33,8 @@ def read_page_data(page: str) -> PageData:
     data = json.loads(decode(element_text(page, "page-data"), longest=LONGEST))
     arrays = decode(element_text(page, "page-arrays"), longest=LONGEST)
     levels = read_levels(arrays)
+    for tab in data["tabs"]:
+        tab["columns"] = [data["columns"][place] for place in tab["columns"]]
     return PageData(tabs=data["tabs"], hero=data["hero"], levels=levels)
 
 

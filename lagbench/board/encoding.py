@@ -37,6 +37,11 @@ SMALLEST_TOP = sys.float_info.min / SMALLEST_SHARE
 DIGITS = 9  # most digits of a zero
 STEP_DIGITS = 6  # 4000 steps are then off by at most a fiftieth of one
 
+HARMLESS = bytes.maketrans(b"<>&", b",/.")
+"""Digits of base 85 that mean something in HTML, and those that stand for them."""
+
+HARMFUL = bytes.maketrans(b",/.", b"<>&")
+
 GZIP = 16 + zlib.MAX_WBITS  # window bits that mean gzip
 
 
@@ -161,12 +166,13 @@ def _fold_signs(numbers: NDArray[np.int16]) -> NDArray[np.uint16]:
 
 
 def encode(data: bytes) -> str:
-    """Return bytes as text that may stand in an HTML element: gzip, then base64.
+    """Return bytes as text that may stand in an HTML element: gzip, then base 85.
 
     >>> decode(encode(b"abc"), longest=3)
     b'abc'
     """
-    return base64.b64encode(gzip.compress(data, mtime=0)).decode("ascii")
+    text = base64.b85encode(gzip.compress(data, mtime=0))
+    return text.translate(HARMLESS).decode("ascii")
 
 
 def decode(text: str, *, longest: int) -> bytes:
@@ -175,7 +181,9 @@ def decode(text: str, *, longest: int) -> bytes:
     Raises:
         ValueError: the text encodes nothing, or more than ``longest`` bytes.
     """
-    compressed = base64.b64decode(text, validate=True)
+    if not text.isascii():
+        raise ValueError("no digits of base 85")
+    compressed = base64.b85decode(text.encode("ascii").translate(HARMFUL))
     decompressor = zlib.decompressobj(wbits=GZIP)
     try:
         data = decompressor.decompress(compressed, longest + 1)

@@ -112,7 +112,7 @@ OVERVIEW_WORDS = (
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
 
 DATA_ELEMENT = re.compile(
-    rb'(<script type="text/plain" id="page-(?:data|arrays)">)([A-Za-z0-9+/=]*)(?=</)'
+    rb'(<script type="text/plain" id="page-(?:data|arrays)">)([!-;=?-~]*)(?=</)'
 )
 """The elements that hold encoded data."""
 
@@ -409,6 +409,17 @@ def _overview_lines(method: MethodOverview, overview: SizeOverview) -> list[Mark
     return lines
 
 
+def _name_some(names: Sequence[str]) -> str:
+    """Return names in words: of more than three the first two and how many follow.
+
+    >>> _name_some(["cavity", "fluid", "poiseuille", "cavity-3d"])
+    'cavity, fluid and 2 more'
+    """
+    if len(names) <= 3:
+        return ", ".join(names)
+    return f"{names[0]}, {names[1]} and {len(names) - 2} more"
+
+
 def _overview_line(
     method: MethodOverview, overview: SizeOverview, *, variant_of: str | None = None
 ) -> Markup:
@@ -422,8 +433,7 @@ def _overview_line(
         button = fold_button(method.method, len(method.variants))
         name.append(button)
     if method.missing:
-        missing = ", ".join(method.missing)
-        skill = tag("span", f"not on {missing}", class_="ci gaps")
+        skill = tag("span", f"not on {_name_some(method.missing)}", class_="ci gaps")
     else:
         skill = tag("span", text(method.mean_skill), class_="n")
     cells = [

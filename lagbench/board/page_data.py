@@ -33,6 +33,7 @@ from .model import (
     Value,
 )
 from .sampling import spaced
+from .table import heading_of
 from .table_view import Line, TableView, describe_verification, target_loss
 
 FILM_FRAMES = 20  # most frames of a film
@@ -71,10 +72,11 @@ def page_data(
         hero: tab and row whose film stands first on the page.
     """
     arrays = ArrayStore()
+    columns: list[Plain] = []  # most tabs have the same ones
     tabs = []
     for view in views:
-        tabs.append(_TabWriter(view, arrays).tab())
-    data = {"colours": COLOURS, "hero": None, "tabs": tabs}
+        tabs.append(_TabWriter(view, arrays, columns).tab())
+    data = {"colours": COLOURS, "hero": None, "columns": columns, "tabs": tabs}
     if hero is not None:
         data["hero"] = _hero(*hero, arrays)
     encoded = json.dumps(
@@ -105,10 +107,13 @@ def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
 class _TabWriter:
     """Turns one tab into plain values and arrays."""
 
-    def __init__(self, view: TableView, arrays: ArrayStore) -> None:
+    def __init__(
+        self, view: TableView, arrays: ArrayStore, columns: list[Plain]
+    ) -> None:
         self._view = view
         self._tab = view.tab
         self._arrays = arrays
+        self._all_columns = columns
         greatest = 0.0
         if self._tab.truth is not None:
             true_vorticity = np.abs(self._tab.truth.vorticity)
@@ -136,7 +141,7 @@ class _TabWriter:
             "frames": [tab.frames[0], tab.frames[-1]],
             "marked": list(tab.marked),
             "ranking": tab.ranking,
-            "columns": list(self._columns()),
+            "columns": self._columns(),
             "presets": self._view.presets,
             "curves": curves,
             "energy": self._mean_curve(tab.energy),
@@ -145,15 +150,24 @@ class _TabWriter:
             "rows": rows,
         }
 
-    def _columns(self) -> Iterator[Plain]:
+    def _columns(self) -> list[int]:
+        """Return the places of the tab's columns among those of all tabs."""
+        places = []
         for key, column in self._view.columns.items():
-            yield {
+            heading = heading_of(column)
+            plain = {
                 "key": key,
-                "label": column.label,
+                "label": heading.label,
+                "marks": list(heading.marks),
+                "meaning": heading.meaning,
                 "quantity": column.quantity,
                 "direction": str(column.direction),
                 "form": column.form,
             }
+            if plain not in self._all_columns:
+                self._all_columns.append(plain)
+            places.append(self._all_columns.index(plain))
+        return places
 
     def _reference(self, line: Line, row: ReferenceRow) -> Plain:
         energy = None

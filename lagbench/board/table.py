@@ -1,10 +1,13 @@
 """The board's table as HTML: every row, and the columns that are shown at first.
 
 It stands there without any script. The page's script sorts rows, filters them, and adds
-the cells of the other columns from the page data; it reads no number from the table.
+headings and cells of the other columns from the page data; it reads no number from the
+table.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 from lagbench.figures.html import MISSING, Markup, interval, join, tag, text
 from lagbench.metrics.metric import Direction
@@ -21,6 +24,15 @@ ARROWS = {
 }
 REPORTED = "Self-reported: stated by the submitter, computed again by nobody."
 REPORTED_MARK = "self\u2011reported"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heading:
+    """What the heading of a column says."""
+
+    label: str
+    marks: tuple[str, ...]  # unit and direction, and who states the values
+    meaning: str
 
 
 def draw_table(view: TableView) -> Markup:
@@ -42,7 +54,8 @@ def draw_table(view: TableView) -> Markup:
         ),
     ]
     for key, column in view.columns.items():
-        headings.append(_column_heading(column, is_hidden=key not in view.main))
+        if key in view.main:
+            headings.append(_column_heading(column))
     lines = []
     for line in view.lines:
         lines.append(_draw_line(view, line))
@@ -55,6 +68,19 @@ def draw_table(view: TableView) -> Markup:
     )
 
 
+def heading_of(column: Column) -> Heading:
+    """Return what the heading of a column says."""
+    marks = []
+    unit = f"{column.unit} {ARROWS[column.direction]}".strip()
+    if unit:
+        marks.append(unit)
+    meaning = column.meaning
+    if column.reported:
+        marks.append(REPORTED_MARK)
+        meaning = f"{meaning} {REPORTED}"
+    return Heading(label=column.label, marks=tuple(marks), meaning=meaning)
+
+
 def _heading(key: str, label: object, meaning: str, **attributes: object) -> Markup:
     sorter = tag(
         "button", label, type="button", class_="sorter", data_sort=key, title=meaning
@@ -62,19 +88,16 @@ def _heading(key: str, label: object, meaning: str, **attributes: object) -> Mar
     return tag("th", sorter, scope="col", **attributes)
 
 
-def _column_heading(column: Column, *, is_hidden: bool) -> Markup:
-    label = [tag("span", column.label, class_="metric")]
-    unit = f"{column.unit} {ARROWS[column.direction]}".strip()
-    if unit:
-        label.append(tag("span", unit, class_="unit"))
-    meaning = column.meaning
-    if column.reported:
-        label.append(tag("span", REPORTED_MARK, class_="unit"))
-        meaning = f"{meaning} {REPORTED}"
+def _column_heading(column: Column) -> Markup:
+    """Return a heading; headingCell in page/table.js makes the same."""
+    heading = heading_of(column)
+    label = [tag("span", heading.label, class_="metric")]
+    for mark in heading.marks:
+        label.append(tag("span", mark, class_="unit"))
     class_ = None
     if column.form == "text":
         class_ = "words"
-    return _heading(column.key, join(label), meaning, class_=class_, hidden=is_hidden)
+    return _heading(column.key, join(label), heading.meaning, class_=class_)
 
 
 def _draw_line(view: TableView, line: Line) -> Markup:
@@ -159,7 +182,7 @@ def _reference_heading(row: ReferenceRow) -> Markup:
         tag("span", str(row.kind), class_="flag"),
     ]
     if row.definition:
-        parts.append(tag("span", row.definition, class_="sub", title=row.definition))
+        parts.append(tag("span", row.definition, class_="sub"))
     return tag("th", *parts, scope="row", class_="method")
 
 
@@ -170,7 +193,7 @@ def _entry_heading(tab: Tab, line: Line, row: BoardRow) -> Markup:
     variants = tab.variants_of(row)
     if variants:
         parts.append(fold_button(line.id, len(variants)))
-    parts.append(tag("span", line.byline, class_="sub", title=line.byline))
+    parts.append(tag("span", line.byline, class_="sub"))
     if line.links:
         links = []
         for label, target in line.links:

@@ -98,7 +98,8 @@ def test_bytes_survive_as_text_without_markup(data: bytes) -> None:
     [
         "",
         "AAAA",
-        "not base64!",
+        'no "digits"',
+        "über",
         encode(bytes(10_000)),
     ],
 )

@@ -3,16 +3,34 @@
 
 const MISSING_LEVEL = -32768;
 
-/** Return the bytes that an element holds, as base64 of gzip. */
+// The digits of base 85, without those that mean something in HTML.
+const DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%.()*+-;,=/?@^_`{|}~";
+
+/** Return the bytes that a text encodes in base 85: five digits are four bytes; a shorter group ends the text. */
+function bytesOf(text) {
+  const places = new Uint8Array(128);
+  for (let i = 0; i < DIGITS.length; i += 1) places[DIGITS.charCodeAt(i)] = i;
+  const lacking = (5 - (text.length % 5)) % 5;
+  const whole = text + DIGITS.at(-1).repeat(lacking);
+  const view = new DataView(new ArrayBuffer((whole.length / 5) * 4));
+  for (let i = 0; i < whole.length; i += 5) {
+    let group = 0;
+    for (let k = i; k < i + 5; k += 1) group = 85 * group + places[whole.charCodeAt(k)];
+    view.setUint32((i / 5) * 4, group);
+  }
+  return new Uint8Array(view.buffer, 0, view.byteLength - lacking);
+}
+
+/** Return the bytes that an element holds, as gzip in base 85. */
 async function bytesIn(id) {
-  const text = document.getElementById(id).textContent;
-  const compressed = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const compressed = bytesOf(document.getElementById(id).textContent);
   const stream = new Blob([compressed]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).arrayBuffer();
 }
 
 const [dataBytes, arrayBytes] = await Promise.all([bytesIn("page-data"), bytesIn("page-arrays")]);
 const BOARD = JSON.parse(new TextDecoder().decode(dataBytes));
+for (const tab of BOARD.tabs) tab.columns = tab.columns.map((place) => BOARD.columns[place]);
 const STORED = new Uint8Array(arrayBytes);
 const STORED_COUNT = STORED.length / 2;
 

@@ -54,6 +54,8 @@ function linkTools(tab) {
   const inactive = whole.querySelector(".tools input[type=checkbox]");
   inactive?.addEventListener("change", () => change({ inactive: inactive.checked }));
   whole.querySelector(".csv").addEventListener("click", () => saveCsv(tab, state));
+  // what is too long for its place is read in full under the pointer
+  for (const one of whole.querySelectorAll(".board .sub")) one.title = one.textContent;
   for (const name of whole.querySelectorAll("tr[data-entry] .name")) {
     name.addEventListener("click", (event) => {
       event.preventDefault();

@@ -1,4 +1,4 @@
-// The table is drawn in lagbench/board/table.py. Here its lines are sorted and filtered, and its cells shown or hidden,
+// The table is drawn in lagbench/board/table.py. Here its lines are sorted and filtered, and its columns shown or hidden,
 // by the data of the page; no number is read from a cell.
 
 // Cells before those of the columns: rank and name.
@@ -90,6 +90,26 @@ function nextSort(tab, key, sort) {
   return { key, down: ["higher", "none"].includes(direction) && form !== "text" };
 }
 
+/** Return the heading of a column; lagbench/board/table.py draws those that are shown at first. */
+function headingCell({ key, label, marks, meaning, form }) {
+  const units = marks.map((mark) => el("span", { class: "unit" }, mark));
+  const sorter = el("button", { type: "button", class: "sorter", "data-sort": key, title: meaning }, el("span", { class: "metric" }, label), units);
+  sorter.addEventListener("click", () => act.sort(key));
+  return el("th", { scope: "col", class: form === "text" ? "words" : null }, sorter);
+}
+
+/** Return the headings of a tab by key; those that are not in the page yet are made. */
+function headsOf(tab) {
+  if (tab.heads) return tab.heads;
+  const row = sectionOf(tab).querySelector("thead tr");
+  tab.heads = new Map([...row.cells].map((cell) => [cell.querySelector("[data-sort]").dataset.sort, cell]));
+  for (const column of tab.columns) {
+    if (!tab.heads.has(column.key)) tab.heads.set(column.key, headingCell(column));
+  }
+  row.append(...cellKeys(tab).map((key) => tab.heads.get(key)));
+  return tab.heads;
+}
+
 /** Return the cells of a line by key; those that are not in the page yet are made when asked for. */
 function cellsOf(tab, row) {
   if (!row.cells) {
@@ -119,14 +139,11 @@ function completeLine(tab, row) {
 /** Show the lines and columns that were asked for, in order; return the entries shown and all that could be. */
 function arrange(tab, state) {
   const shownKeys = new Set([...FIRST_CELLS, ...tab.presets[state.preset]]);
-  const keys = cellKeys(tab);
-  const heads = sectionOf(tab).querySelectorAll("thead th");
-  keys.forEach((key, place) => {
-    const head = heads[place];
+  for (const [key, head] of headsOf(tab)) {
     head.hidden = !shownKeys.has(key);
     if (key === state.sort.key) head.ariaSort = state.sort.down ? "descending" : "ascending";
     else head.removeAttribute("aria-sort");
-  });
+  }
 
   const { every, entries } = shownRows(tab, state);
   const shown = new Set([...tab.references, ...entries]);
