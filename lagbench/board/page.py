@@ -237,12 +237,13 @@ def draw_intro(board: Board) -> Markup:
         rows += tab.rows
     entries = _count(len(rows), "entry", "entries")
     data_sets = _count(len(board.tabs), "data set", "data sets")
-    return escaped(
+    sentences = escaped(
         "Which neural surrogate predicts how fluids and soft bodies move, and is it "
         f"better than a classical solver of the same cost? {entries} on {data_sets} "
         "that anyone regenerates bit for bit. Every score follows from committed "
-        f"score files. {_describe_levels(rows)} {_describe_costs(rows)}"
+        f"score files. {_describe_levels(rows)} {_describe_costs(rows)} "
     )
+    return join([sentences, tag("a", "Take part", href="#take-part")])
 
 
 def _describe_levels(rows: Sequence[BoardRow]) -> str:
@@ -254,15 +255,25 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
         if row.verified is not None and row.verified.cost is not None:
             machines.add(row.verified.cost.machine)
     clauses = []
-    for level in (Level.BLIND, Level.REPRODUCED, Level.SCORED_AGAIN):
-        if counts[level]:
-            clauses.append(f"{counts[level]} {level}")
+    run_again = counts[Level.REPRODUCED] + counts[Level.BLIND]
+    if run_again:
+        models = _count(run_again, "entry", "entries")
+        clause = f"ran the models of {models} again and got the same scores"
+        if counts[Level.BLIND]:
+            clause += (
+                f", {counts[Level.BLIND]} of them also on scenarios that were drawn "
+                "after the models were frozen (blind)"
+            )
+        clauses.append(clause)
+    if counts[Level.SCORED_AGAIN]:
+        predictions = _count(counts[Level.SCORED_AGAIN], "entry", "entries")
+        clauses.append(f"scored the predictions of {predictions} again")
     if not clauses:
         return "All entries stand as submitted: nobody has scored them again yet."
-    sentence = f"Run again by the maintainers: {', '.join(clauses)}"
+    sentence = f"The maintainers {' and '.join(clauses)}"
     if machines:
-        sentence += f" (on {', '.join(sorted(machines))})"
-    return f"{sentence}; the others stand as submitted."
+        sentence += f"; machine: {', '.join(sorted(machines))}"
+    return f"{sentence}. The others stand as submitted."
 
 
 def _describe_costs(rows: Sequence[BoardRow]) -> str:

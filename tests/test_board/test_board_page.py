@@ -588,3 +588,12 @@ def test_score_files_without_a_skill_leave_no_gap() -> None:
     page = render(make_board((("cavity", "full"),), skill=False))
     assert 'data-sort="skill"' not in page
     assert read_html(page).faults == []
+
+
+def test_the_introduction_leads_to_taking_part(page: str) -> None:
+    """The link is above the tables; what it leads to is on the page."""
+    parsed = read_html(page)
+    (link,) = [a for a in parsed.named("a") if a.text == "Take part"]
+    assert link.attributes["href"] == "#take-part"
+    places = [section.attributes.get("id") for section in parsed.named("section")]
+    assert "take-part" in places
