@@ -472,10 +472,14 @@ def _make_tab(
             curves.append(name)
     scenarios = tuple(sorted(size.subsets["test"]))
     reference_rows = []
+    baselines = _naive_scores(references, ranking)
     for reference in references:
         reference_row = _make_reference(
             reference, size, ranking, scope, solver_time=solver_time
         )
+        if ranking in reference.scores:
+            skill = compute_skill([reference.scores[ranking]], baselines)
+            reference_row = replace(reference_row, skill=_value_of_ratio(skill))
         shift_score = shift_references.get(reference.name)
         if shift_score is not None:
             on_shift = _on_shift([shift_score], shift_references)
@@ -553,12 +557,19 @@ def _skill_of(
     """Return the skill beside the best naive baseline, where one was scored."""
     if not method.is_current:
         return None
-    ranking = method.ranking
-    baselines = {}
+    baselines = _naive_scores(references, method.ranking)
+    return _value_of_ratio(compute_skill(method.seeds, baselines))
+
+
+def _naive_scores(
+    references: Sequence[ReferenceScores], ranking: str
+) -> dict[str, Score]:
+    """Return the scores of the naive baselines in the ranking metric, by name."""
+    scores = {}
     for reference in references:
         if reference.name in NAIVE and ranking in reference.scores:
-            baselines[reference.name] = reference.scores[ranking]
-    return _value_of_ratio(compute_skill(method.seeds, baselines))
+            scores[reference.name] = reference.scores[ranking]
+    return scores
 
 
 def _against_classical(

@@ -542,11 +542,10 @@ def metric_value(row: TableRow, key: str) -> Value | None:
             return row.on_shift.skill
         if key == SCORE_ON_SHIFT.key:
             return row.on_shift.score
-    if isinstance(row, BoardRow):
-        if key == SKILL.key:
-            return row.skill
-        if key == AGAINST_CLASSICAL.key:
-            return row.against_classical
+    if key == SKILL.key:
+        return row.skill
+    if isinstance(row, BoardRow) and key == AGAINST_CLASSICAL.key:
+        return row.against_classical
     return row.values.get(key)
 
 

@@ -92,6 +92,8 @@ class ReferenceRow:
     curves: Mapping[str, Curve]
     energy: Curve | None
     kind: Kind  # naive or classical
+    # 1 - score / score of the best naive baseline; 0 for that one itself
+    skill: Value | None = None
     # cost of a frame, and that of the solver, on the machine that measured
     cost: EntryCost | None = None
     on_shift: OnShift | None = None

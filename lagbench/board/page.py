@@ -103,10 +103,12 @@ FOOT = (
 )
 
 OVERVIEW_WORDS = (
-    "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
-    "prediction. “0.9× classical” is the error beside that of the best classical "
-    "solver that costs no more per frame: below 1, learning pays. Ranks are ranges in "
-    "95 % of the resamples. Variants of a method are folded behind it, without a rank."
+    "Size mini is what a laptop makes in minutes, full is larger. Skill is 0 for the "
+    "best naive baseline, which learns nothing, and 1 for a perfect prediction. “0.9× "
+    "classical” is the error beside that of the best classical solver that costs no "
+    "more per frame: below 1, learning pays. A rank such as 2–4 names the places that a "
+    "method takes when the test scenarios are drawn again (95 %). Variants of a method "
+    "are folded behind it, without a rank."
 )
 
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
@@ -585,12 +587,12 @@ def _speed_tiles(tab: Tab) -> Iterator[Markup]:
     cost = None if fastest is None else cost_of(fastest)
     if fastest is None or cost is None:
         return
-    comparison = "faster than the solver"
+    comparison = "faster than the simulator"
     if greatest < 1.0:
-        comparison = "slower than the solver"
+        comparison = "slower than the simulator"
     name = clipped(fastest.entry.name, 40)
     yield _tile(
-        "speed of the fastest entry with skill, solver = 1×",
+        "speed of the fastest entry with skill; the simulator that made the data = 1×",
         format_value(greatest, "factor"),
         f"{comparison}: {name}, {cost.device}; {source_of_cost(fastest)}",
     )
@@ -675,7 +677,7 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "Budget, parameters and hardware are self-reported: submitters state them and "
         "nobody computes them again. So are times, except where the column says "
         "measured: then we timed all rows in one run on one core. A speed-up below 1× "
-        "means slower than the solver."
+        "means slower than the simulator that made the data."
     )
     raised: set[str] = set()
     for row in tab.rows:

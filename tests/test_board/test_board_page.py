@@ -508,7 +508,7 @@ def test_budgets_are_marked_as_self_reported(page: str) -> None:
 def test_speed_is_told_against_the_solver(
     board: Board, speed: float, word: str
 ) -> None:
-    """The tile of the fastest entry says on which side of the solver it is."""
+    """The tile of the fastest entry says on which side of the simulator it is."""
     cost = EntryCost(
         seconds_per_frame=2.0,
         device="a machine",
@@ -518,7 +518,7 @@ def test_speed_is_told_against_the_solver(
     page = with_rows(board, with_entry(first_row, cost=cost))
     items = [element.text for element in read_html(page).named("li")]
     (tile,) = [item for item in items if "fastest" in item]
-    assert f"{word} than the solver" in tile
+    assert f"{word} than the simulator" in tile
     assert "self-reported" in tile
 
 

@@ -25,8 +25,10 @@ function drawHero(tab) {
   const isFirst = Boolean(tab) && tab === heroTab();
   const leader = isFirst ? tab.rows.find((row) => row.id === BOARD.hero.entry) : tab && leaderOf(tab);
   const isShown = isFirst || Boolean(leader?.pictures);
+  const content = isShown ? heroFilm(tab, leader) : null;
+  const isOfOneMaterial = new Set(content?.materials).size === 1;
   hero.tab = tab;
-  hero.film = isShown ? new Film(heroFilm(tab, leader), { pixels: 440, rest: 1.2, ended: nextHero }) : null;
+  hero.film = isShown ? new Film(content, { pixels: 440, rest: 1.2, ended: nextHero }) : null;
   hero.holder.hidden = !isShown;
   if (!isShown) return;
   hero.film.play.addEventListener("click", () => { hero.isWanted = hero.film.playing; });
@@ -40,6 +42,7 @@ function drawHero(tab) {
     el("a", { href: address }, short(leader.name)),
     ` (${columnOf(tab, by).label} ${textOf(tab, leader, by)}).`,
     isFirst ? materialKey() : null,
+    isOfOneMaterial ? " A colour tells where a particle started." : null,
   );
   hero.holder.replaceChildren(...hero.film.element(), caption);
   playHero();
