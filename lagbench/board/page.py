@@ -106,9 +106,9 @@ OVERVIEW_WORDS = (
     "Size mini is what a laptop makes in minutes, full is larger. Skill is 0 for the "
     "best naive baseline, which learns nothing, and 1 for a perfect prediction. “0.9× "
     "classical” is the error beside that of the best classical solver that costs no "
-    "more per frame: below 1, learning pays. A rank such as 2–4 names the places that a "
-    "method takes when the test scenarios are drawn again (95 %). Variants of a method "
-    "are folded behind it, without a rank."
+    "more per frame: below 1, learning pays. A rank such as 2–4 names the places that "
+    "a method takes when the test scenarios are drawn again (95 %). Variants of a "
+    "method are folded behind it, without a rank."
 )
 
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
