@@ -1,35 +1,34 @@
 """How many rooms lie between a command and its effect.
 
-    python benchmarks/journeys.py
+    python benchmarks/journeys.py [--files]
 
 Runs each command in this process on a made-up root and prints in how many files of ours
 a function ran, and how many functions: class bodies, imports and child processes are
 left out. Then what the source says: files, lines, comments, the longest chain of
-imports. Its table stands in CONTRIBUTING.md.
+imports. With --files it also lists the files of each command and the modules of the
+chain. Its table stands in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
 
-import ast
+import argparse
 import io
 import os
 import sys
 import tempfile
 import tokenize
+from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
 
+from import_graph import import_graph, longest_chains, package_modules
+
 import lagbench
 from lagbench.__main__ import app
 
-PACKAGE = Path(lagbench.__file__).parent
-ROOTS = {
-    PACKAGE: "lagbench",
-    PACKAGE / "generators": "lagbench.generators",
-    PACKAGE / "baselines": "lagbench.baselines",
-}
-"""Folders of modules; rglob does not follow the links inside the package."""
+CLONE = Path(lagbench.__file__).parents[1]
+MODULES = package_modules(CLONE)
 
 MOST_FILES = {"generate": 40, "score": 42, "verify": 26}
 """Files that a newcomer should at most have to open, by command."""
@@ -37,21 +36,11 @@ MOST_FILES = {"generate": 40, "score": 42, "verify": 26}
 OWN_LOCALS = 0x02  # flag of code objects of functions; class bodies lack it
 
 
-def module_paths() -> dict[str, Path]:
-    """Return the file of every module by its dotted name."""
-    paths = {}
-    for folder, name in ROOTS.items():
-        for path in folder.rglob("*.py"):
-            parts = path.relative_to(folder).with_suffix("").parts
-            paths[".".join((name, *parts))] = path
-    return paths
-
-
-def trace_command(words: list[str]) -> tuple[int, int]:
-    """Run a command; return how many files and functions of the package ran."""
-    package_files = {str(path.resolve()) for path in module_paths().values()}
-    real_paths: dict[str, str] = {}
-    functions: set[tuple[str, int]] = set()
+def trace_command(words: list[str]) -> Counter[Path]:
+    """Run a command; return how many functions ran in each file of the package."""
+    package_files = {path.resolve() for path in MODULES.values()}
+    real_paths: dict[str, Path] = {}
+    functions: set[tuple[Path, int]] = set()
 
     def watch(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
@@ -59,7 +48,7 @@ def trace_command(words: list[str]) -> tuple[int, int]:
         if event != "call" or not is_named:
             return
         if code.co_filename not in real_paths:
-            real_paths[code.co_filename] = os.path.realpath(code.co_filename)
+            real_paths[code.co_filename] = Path(os.path.realpath(code.co_filename))
         file = real_paths[code.co_filename]
         if file in package_files and code.co_flags & OWN_LOCALS:
             functions.add((file, code.co_firstlineno))
@@ -73,50 +62,7 @@ def trace_command(words: list[str]) -> tuple[int, int]:
                 raise
         finally:
             sys.setprofile(None)
-    return len({file for file, _ in functions}), len(functions)
-
-
-def imported_modules(name: str, path: Path, paths: dict[str, Path]) -> set[str]:
-    """Return the package's modules that a module imports, for type checkers too."""
-    package = name.rpartition(".")[0]
-    if path.name == "__init__.py":
-        package = name.removesuffix(".__init__")
-
-    modules = set()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.ImportFrom):
-            continue
-        base_parts = []
-        if node.level:
-            package_parts = package.split(".")
-            base_parts = package_parts[: len(package_parts) - node.level + 1]
-        if node.module:
-            base_parts.append(node.module)
-        base = ".".join(base_parts)
-        for alias in node.names:
-            for candidate in (f"{base}.{alias.name}", base, f"{base}.__init__"):
-                if candidate in paths and candidate != name:
-                    modules.add(candidate)
-                    break
-    return modules
-
-
-def longest_chain(paths: dict[str, Path]) -> int:
-    """Return the number of modules in the longest chain of imports."""
-    graph = {}
-    for name, path in paths.items():
-        graph[name] = imported_modules(name, path, paths)
-    depths: dict[str, int] = {}
-
-    def depth(name: str) -> int:
-        if name not in depths:
-            depths[name] = 1  # a cycle, were there one, would end here
-            below = [depth(imported) for imported in graph[name]]
-            depths[name] = 1 + max(below, default=0)
-        return depths[name]
-
-    return max(depth(name) for name in graph)
+    return Counter(file for file, _ in functions)
 
 
 def count_comments(text: str) -> int:
@@ -125,9 +71,20 @@ def count_comments(text: str) -> int:
     return sum(token.type == tokenize.COMMENT for token in tokens)
 
 
+def print_files(name: str, functions: Counter[Path]) -> None:
+    """Print the files of a command, each with the number of functions that ran."""
+    print(f"\n{name}")
+    for file in sorted(functions):
+        print(f"  {functions[file]:4d}  {file.relative_to(CLONE.resolve())}")
+
+
 def main() -> int:
     """Print the files behind each command, and the size of the package."""
-    too_long = []
+    parser = argparse.ArgumentParser(description="Count the files behind each command.")
+    parser.add_argument("--files", action="store_true", help="list the files too")
+    options = parser.parse_args()
+
+    traces = {}
     with tempfile.TemporaryDirectory() as folder:
         # a generation notes its speed there
         os.environ["LAGBENCH_CACHE"] = folder
@@ -142,25 +99,34 @@ def main() -> int:
             "score": ["score", predictions, "--root", root],
             "info": ["info", "cavity"],
         }
-        print("| command | files | functions | at most |\n|---|---:|---:|---:|")
         for name, words in commands.items():
-            files, functions = trace_command(words)
-            print(f"| `{name}` | {files} | {functions} | {MOST_FILES.get(name, '')} |")
-            if files > MOST_FILES.get(name, files):
-                too_long.append(name)
+            traces[name] = trace_command(words)
 
-    paths = module_paths()
+    too_long = []
+    print("| command | files | functions | at most |\n|---|---:|---:|---:|")
+    for name, functions in traces.items():
+        most_files = MOST_FILES.get(name, "")
+        print(f"| `{name}` | {len(functions)} | {functions.total()} | {most_files} |")
+        if len(functions) > MOST_FILES.get(name, len(functions)):
+            too_long.append(name)
+
     line_count = 0
     comment_count = 0
-    for path in paths.values():
+    for path in MODULES.values():
         text = path.read_text(encoding="utf-8")
         line_count += text.count("\n")
         comment_count += count_comments(text)
     comments_per_100 = 100 * comment_count / line_count
+    chains = longest_chains(import_graph(MODULES, for_types=True))
+    chain = max(chains.values(), key=len)
     print(
-        f"\n{len(paths)} files, {line_count} lines, {comments_per_100:.1f} comments "
-        f"per 100 lines; longest chain of imports {longest_chain(paths)}"
+        f"\n{len(MODULES)} files, {line_count} lines, {comments_per_100:.1f} comments "
+        f"per 100 lines; longest chain of imports {len(chain)}"
     )
+    if options.files:
+        for name, functions in traces.items():
+            print_files(name, functions)
+        print("\nlongest chain of imports", *chain, sep="\n  ")
     return 1 if too_long else 0
 
 

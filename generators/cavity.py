@@ -27,8 +27,15 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 
 from .constants import closed_box_walls, constants, interval, shift_number
-from .draws import RandomSource, choice, fill, log_uniform, uniform
-from .programs import draw_integer, draw_program
+from .draws import (
+    RandomSource,
+    choice,
+    draw_integer,
+    draw_program,
+    fill,
+    log_uniform,
+    uniform,
+)
 from .split import ClosedBoxParameters, InitialState, Material
 
 if TYPE_CHECKING:

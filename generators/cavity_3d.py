@@ -28,10 +28,9 @@ from lagbench.data.box import WALL_NAMES
 
 from .constants import constants, interval
 from .decaying_vortices import particles_per_side
-from .draws import RandomSource, log_uniform
+from .draws import RandomSource, draw_integer, draw_program, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import fill_box
-from .programs import draw_integer, draw_program
 from .split import InitialState, Material
 
 if TYPE_CHECKING:

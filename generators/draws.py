@@ -144,6 +144,11 @@ def choice(rng: RandomSource, count: int) -> int:
     return math.floor(_draw_unit(rng) * count)
 
 
+def draw_integer(rng: RandomSource, low: float, high: float) -> int:
+    """Draw an integer, end points included."""
+    return int(low) + choice(rng, int(high) - int(low) + 1)
+
+
 def direction(rng: RandomSource) -> tuple[float, float]:
     """Draw a unit vector, uniform over the circle, without sine or cosine."""
     # until a point of the square lies in the unit disc, and not at its very centre
@@ -165,6 +170,43 @@ def direction_in_space(rng: RandomSource) -> tuple[float, float, float]:
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
             return x / length, y / length, z / length
+
+
+def draw_program(
+    rng: RandomSource,
+    frame_count: int,
+    *,
+    amplitude: float,
+    knot_gap: tuple[float, float],
+) -> NDArray[np.float64]:
+    """Draw the values of a program towards each frame, shape [frame].
+
+    A program is smooth: the speed of a wall, or a body force. Its knots have values
+    from [-A, A], of the other sign at each knot. Between two knots, at frames t0 and t1
+    with values a and b, the value is
+
+        f(t) = a + (b - a) s^2 (3 - 2 s),    s = (t - t0) / (t1 - t0).
+
+    Args:
+        rng: source of the knots.
+        frame_count: frames that the program lasts.
+        amplitude: A, the largest absolute value of a knot.
+        knot_gap: least and greatest distance between two knots [frame].
+    """
+    values = np.empty(frame_count)
+    start = 0
+    start_value = uniform(rng, -amplitude, amplitude)
+    while start < frame_count:
+        end = start + draw_integer(rng, *knot_gap)
+        end_value = uniform(rng, 0.0, amplitude)
+        if start_value > 0.0:
+            end_value = -end_value
+        s = np.arange(min(end, frame_count) - start) / (end - start)
+        rise = s * s * (3.0 - 2.0 * s)
+        values[start:end] = start_value + (end_value - start_value) * rise
+        start = end
+        start_value = end_value
+    return quantise(values)
 
 
 def fill(

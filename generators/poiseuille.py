@@ -24,10 +24,9 @@ import numpy as np
 
 from .constants import constants, interval
 from .decaying_vortices import kinetic_energy, particles_per_side
-from .draws import RandomSource, log_uniform, uniform
+from .draws import RandomSource, draw_integer, draw_program, log_uniform, uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import draw_lattice, fill_box, noise, rotated_gradient, scaled_to
-from .programs import draw_integer, draw_program
 from .split import InitialState, Material
 
 if TYPE_CHECKING:

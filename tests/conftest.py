@@ -28,11 +28,11 @@ from typer.main import get_command
 
 from lagbench.__main__ import app
 from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import PICTURES
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.make import painting
-from lagbench.make.card_files import PICTURES
+from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scorer
@@ -70,11 +70,11 @@ SIZE = "tiny"
 
 # The parts that session fixtures exchange below, as they ship.
 SCORE_SCENARIOS = scorer.score_scenarios
-PAINT_PICTURES = painting.paint_pictures
+PAINT_PICTURES = cards.paint_pictures
 POOL_USERS = ("lagbench.make.generate.Pool", "lagbench.make.verify.Pool")
 VALIDATION_USERS = ("lagbench.scoring.score.validate", "lagbench.board.submit.validate")
 SCENARIO_SCORER = "lagbench.scoring.score.score_scenarios"
-PICTURE_PAINTER = "lagbench.make.painting.paint_pictures"
+PICTURE_PAINTER = "lagbench.make.cards.paint_pictures"
 
 
 def pytest_collection_finish() -> None:

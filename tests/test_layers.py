@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import ast
 import functools
+import graphlib
 import os
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import lagbench
+from benchmarks.import_graph import (
+    Graph,
+    import_graph,
+    imported_names,
+    list_modules,
+    longest_chains,
+    package_modules,
+)
 
 PACKAGE = Path(lagbench.__file__).parent
 STUDIES = PACKAGE.parent / "studies"
@@ -73,61 +81,26 @@ HEAVY = {
 }
 
 
-def imports(name: str, path: Path) -> Iterator[str]:
-    """Yield the dotted names that a module imports, those for type checkers left
-    out.
-    """
-    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
-    while pending:
-        node = pending.pop()
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            pending += node.orelse
-            continue
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            here = (
-                name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-            )
-            above = here[: len(here) - node.level + 1] if node.level else []
-            base = ".".join([*above, *([node.module] if node.module else [])])
-            yield from (f"{base}.{alias.name}" for alias in node.names)
-        pending += ast.iter_child_nodes(node)
-
-
 # parsed by the test that asks first, not by every process that collects tests
 @functools.cache
-def edges() -> dict[str, set[str]]:
-    """Return which module of ours imports which.
+def edges(*, for_types: bool = False) -> Graph:
+    """Return which module of the package and the studies imports which.
 
     No module of the package imports generators or baselines by the bare name, and none
     imports the studies, which are no part of the wheel.
+
+    Args:
+        for_types: whether imports for type checkers count too.
     """
-    graph = {}
-    # Path.rglob does not follow the links that hold generators and baselines.
-    for folder in (PACKAGE, PACKAGE / "generators", PACKAGE / "baselines"):
-        for path in folder.rglob("*.py"):
-            parts = path.relative_to(PACKAGE).with_suffix("").parts
-            name = ".".join(("lagbench", *parts)).removesuffix(".__init__")
-            graph[name] = set(imports(name, path))
-            heads = {target.split(".")[0] for target in graph[name]}
-            hidden = {"generators", "baselines", "leaderboard", "studies"}
-            assert not heads & hidden, name
+    modules = package_modules(PACKAGE.parent)
+    for name, path in modules.items():
+        targets = imported_names(name, path, for_types=for_types)
+        heads = {target.split(".")[0] for target in targets}
+        hidden = {"generators", "baselines", "leaderboard", "studies"}
+        assert not heads & hidden, name
 
-    for path in STUDIES.rglob("*.py"):
-        parts = path.relative_to(STUDIES.parent).with_suffix("").parts
-        name = ".".join(parts).removesuffix(".__init__")
-        graph[name] = set(imports(name, path))
-
-    def module(target: str) -> str:
-        while target and target not in graph:
-            target = target.rpartition(".")[0]
-        return target
-
-    return {
-        name: {module(target) for target in targets} - {"", name}
-        for name, targets in graph.items()
-    }
+    modules.update(list_modules(STUDIES, "studies"))
+    return import_graph(modules, for_types=for_types)
 
 
 def test_imports_stay_below() -> None:
@@ -162,34 +135,52 @@ def test_imports_stay_below() -> None:
 
 
 def test_no_import_cycle() -> None:
-    """Following imports never leads back: modules can be put in a line."""
-    left = {name: set(targets) for name, targets in edges().items()}
-    while left:
-        free = [name for name, targets in left.items() if not targets & left.keys()]
-        assert free, f"a cycle among {sorted(left)}"
-        for name in free:
-            del left[name]
+    """Following imports never leads back: modules can be put in a line.
+
+    This holds for imports of type checkers too: what is read first is read alone.
+    """
+    for for_types in (False, True):
+        order = graphlib.TopologicalSorter(edges(for_types=for_types))
+        order.prepare()
 
 
 def test_no_chain_of_imports_is_long() -> None:
-    """A reader who follows imports from any module of the package ends soon."""
-    graph = edges()
+    """A reader who follows imports from any module of the package ends soon.
 
-    @functools.cache
-    def chain_length(module: str) -> int:
-        lengths_below = [chain_length(imported) for imported in graph[module]]
-        return 1 + max(lengths_below, default=0)
-
-    chain_lengths = {}
-    for module in graph:
-        if not module.startswith("studies"):
-            chain_lengths[module] = chain_length(module)
-    long_chains = {}
-    for module, length in chain_lengths.items():
-        if length > LONGEST_CHAIN:
-            long_chains[module] = length
-    assert max(chain_lengths.values()) > 1
+    Imports for type checkers count: a reader follows them too.
+    """
+    chains = longest_chains(edges(for_types=True))
+    long_chains = []
+    for module, chain in chains.items():
+        if not module.startswith("studies") and len(chain) > LONGEST_CHAIN:
+            long_chains.append(chain)
+    assert len(chains["lagbench.data.registry"]) > 1
     assert not long_chains
+
+
+def test_imports_for_type_checkers_are_told_apart(tmp_path: Path) -> None:
+    """A chain over an import for type checkers is longer by it; a cycle is refused."""
+    top = tmp_path / "top.py"
+    top.write_text("from . import middle\n", encoding="utf-8")
+    middle = tmp_path / "middle.py"
+    middle.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "if TYPE_CHECKING:\n"
+        "    from .bottom import Name\n",
+        encoding="utf-8",
+    )
+    bottom = tmp_path / "bottom.py"
+    bottom.write_text("Name = int\n", encoding="utf-8")
+
+    modules = list_modules(tmp_path, "room")
+    running = longest_chains(import_graph(modules, for_types=False))
+    reading = longest_chains(import_graph(modules, for_types=True))
+    assert running["room.top"] == ["room.top", "room.middle"]
+    assert reading["room.top"] == ["room.top", "room.middle", "room.bottom"]
+
+    bottom.write_text("def work():\n    from . import top\n", encoding="utf-8")
+    with pytest.raises(graphlib.CycleError):
+        longest_chains(import_graph(modules, for_types=True))
 
 
 def test_no_two_classes_have_one_name() -> None:

@@ -17,8 +17,9 @@ import numpy as np
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
+from lagbench.data.layout import format_ids
 from lagbench.data.local import load_rooted_registry, resolve_root
-from lagbench.data.registry import Registry, format_ids
+from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, score

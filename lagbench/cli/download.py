@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from lagbench.data.registry import format_ids
+from lagbench.data.layout import format_ids
 from lagbench.exchange.downloading import DownloadResult, download
 
 from .options import (

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from lagbench.data.layout import url_of
+from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import locate_new
-from lagbench.data.registry import Registry, format_ids, load
+from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, format_count
 from lagbench.make.generate import GenerationResult, generate
 

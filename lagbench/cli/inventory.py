@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from lagbench.data.layout import url_of
+from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
-from lagbench.data.registry import Registry, Size, Split, format_ids, load
+from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError
 from lagbench.make.inventory import Overview, overview
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lagbench.data.registry import parse_ids
+from lagbench.data.layout import parse_ids
 from lagbench.errors import UsageError
 from lagbench.exchange.adoption import adopt, import_split
 from lagbench.exchange.local_split import LocalSplit

@@ -1,7 +1,8 @@
-"""Where data sets live below a root folder: the path of every scenario.
+"""Where data sets live below a root folder: ids, paths and names of files.
 
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside
-the subsets. Nothing here writes to the disk.
+the subsets. Nothing here writes to the disk. As text ids are written ``0,3-5``, which
+means 0, 3, 4 and 5.
 
 A root in an object store has a local working copy, because netCDF4 and HDF5 read and
 write files. A root given as a URL (``s3://bucket/prefix``) becomes a folder of the
@@ -17,7 +18,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,6 +98,18 @@ MANIFEST_NAME = "manifest.json"
 NOTES_NAME = ".verified.json"
 """Name of the file beside the manifest with the hashes that this machine computed."""
 
+CARD_NAME = "README.md"
+"""Name of the file beside the manifest that describes the data set to people."""
+
+CROISSANT_NAME = "croissant.json"
+"""Name of the file beside the manifest that describes the data set to programs."""
+
+PICTURES: Mapping[str, str] = {
+    "pictures/scenarios.png": "scenarios of this data set",
+    "pictures/frame.png": "one frame of a test scenario",
+}
+"""Pictures of a card: path relative to the card, and what each shows."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioKey:
@@ -126,6 +139,74 @@ class ScenarioKey:
             "seed": seed,
             "parameters": dict(parameters),
         }
+
+
+MAX_ID = 9999
+"""Largest scenario id: file names have four digits."""
+
+
+def parse_ids(
+    text: str | int, *, where: str = "--scenarios", noun: str = "id"
+) -> tuple[int, ...]:
+    """Return the scenario ids that a text names, in its order.
+
+    Args:
+        text: comma-separated ids and inclusive ranges; an int stands for itself.
+        where: option that gave the text, for messages.
+        noun: what the numbers are, for messages.
+
+    Raises:
+        UsageError: the text is no list of ids, a range runs backwards, or an id stands
+            twice.
+
+    >>> parse_ids("0,3-5")
+    (0, 3, 4, 5)
+    """
+    ids: list[int] = []
+    issue = None
+    for part in str(text).replace(" ", "").split(","):
+        match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
+        if match is None:
+            issue = f"{part!r} is no {noun} and no range"
+            break
+        first = int(match[1])
+        last = int(match[2] or match[1])
+        if last < first:
+            issue = f"{part!r} runs backwards"
+            break
+        ids.extend(range(first, last + 1))
+    if issue is None and len(set(ids)) != len(ids):
+        issue = "a number stands twice"
+    if issue is not None:
+        raise UsageError(
+            f"bad list of {noun}s {text!r}",
+            where=where,
+            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
+            got=issue,
+            fix=f"write {noun}s in ascending order, each once",
+        )
+    return tuple(ids)
+
+
+def format_ids(ids: Iterable[int]) -> str:
+    """Return the shortest text that :func:`parse_ids` reads as these ids.
+
+    >>> format_ids([0, 3, 4, 5])
+    '0,3-5'
+    """
+    runs: list[list[int]] = []
+    for scenario in ids:
+        if runs and scenario == runs[-1][-1] + 1:
+            runs[-1].append(scenario)
+        else:
+            runs.append([scenario])
+    texts = []
+    for run in runs:
+        if len(run) > 1:
+            texts.append(f"{run[0]}-{run[-1]}")
+        else:
+            texts.append(str(run[0]))
+    return ",".join(texts)
 
 
 def major_of(version: str) -> int:

@@ -1,21 +1,18 @@
-"""Limits of the parameters, subsets and frames of a size, and scenario ids as text.
+"""Limits of the parameters, subsets and frames of a size.
 
 The limits are checked when a datasets.yaml is loaded, for every split alike. The limits
 of a solver's constants stand in ``lagbench.generators.constants``. Every refusal is a
 ``ValueError`` whose message names key, expected, got and, for names, the nearest known
 one.
-
-Scenario ids as text: ``0,3-5`` means 0, 3, 4 and 5.
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lagbench.errors import UsageError, suggest_name
+from lagbench.errors import suggest_name
 
 Value = int | float | bool | str
 
@@ -218,71 +215,3 @@ def _all_ids(subsets: Mapping[str, Sequence[int]]) -> list[int]:
     for subset in subsets.values():
         ids += subset
     return sorted(ids)
-
-
-MAX_ID = 9999
-"""Largest scenario id: file names have four digits."""
-
-
-def parse_ids(
-    text: str | int, *, where: str = "--scenarios", noun: str = "id"
-) -> tuple[int, ...]:
-    """Return the scenario ids that a text names, in its order.
-
-    Args:
-        text: comma-separated ids and inclusive ranges; an int stands for itself.
-        where: option that gave the text, for messages.
-        noun: what the numbers are, for messages.
-
-    Raises:
-        UsageError: the text is no list of ids, a range runs backwards, or an id stands
-            twice.
-
-    >>> parse_ids("0,3-5")
-    (0, 3, 4, 5)
-    """
-    ids: list[int] = []
-    issue = None
-    for part in str(text).replace(" ", "").split(","):
-        match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
-        if match is None:
-            issue = f"{part!r} is no {noun} and no range"
-            break
-        first = int(match[1])
-        last = int(match[2] or match[1])
-        if last < first:
-            issue = f"{part!r} runs backwards"
-            break
-        ids.extend(range(first, last + 1))
-    if issue is None and len(set(ids)) != len(ids):
-        issue = "a number stands twice"
-    if issue is not None:
-        raise UsageError(
-            f"bad list of {noun}s {text!r}",
-            where=where,
-            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
-            got=issue,
-            fix=f"write {noun}s in ascending order, each once",
-        )
-    return tuple(ids)
-
-
-def format_ids(ids: Iterable[int]) -> str:
-    """Return the shortest text that :func:`parse_ids` reads as these ids.
-
-    >>> format_ids([0, 3, 4, 5])
-    '0,3-5'
-    """
-    runs: list[list[int]] = []
-    for scenario in ids:
-        if runs and scenario == runs[-1][-1] + 1:
-            runs[-1].append(scenario)
-        else:
-            runs.append([scenario])
-    texts = []
-    for run in runs:
-        if len(run) > 1:
-            texts.append(f"{run[0]}-{run[-1]}")
-        else:
-            texts.append(str(run[0]))
-    return ",".join(texts)

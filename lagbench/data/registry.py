@@ -41,8 +41,14 @@ from lagbench.errors import (
 
 from .box import Box, parse_periodic
 from .grid import Grid, Placement
-from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
-from .limits import MAX_ID as MAX_ID
+from .layout import (
+    ScenarioKey,
+    dataset_folder,
+    format_ids,
+    major_of,
+    parse_ids,
+    scenario_path,
+)
 from .limits import (
     SCORED_SUBSETS,
     Value,
@@ -51,8 +57,6 @@ from .limits import (
     check_particle_counts,
     check_subsets,
 )
-from .limits import format_ids as format_ids
-from .limits import parse_ids as parse_ids
 
 GROUP = "lagbench.generators"
 """Entry points that name a split and its module; ours register the same way."""

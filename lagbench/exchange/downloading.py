@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.addresses import ARCHIVES, describe
-from lagbench.data.layout import MANIFEST_NAME, scenario_path
+from lagbench.data.layout import MANIFEST_NAME, format_ids, scenario_path
 from lagbench.data.local import locate_new, suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -23,7 +23,7 @@ from lagbench.data.manifest import (
     record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, format_ids
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate

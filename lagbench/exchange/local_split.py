@@ -22,7 +22,13 @@ from lagbench.atomic import temporary_name
 from lagbench.data.box import AXES, Box, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
-from lagbench.data.layout import ScenarioKey, expand_path, scenario_path
+from lagbench.data.layout import (
+    MAX_ID,
+    ScenarioKey,
+    expand_path,
+    format_ids,
+    scenario_path,
+)
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import (
     FileEntry,
@@ -31,7 +37,7 @@ from lagbench.data.manifest import (
     describe_file,
     write_manifest,
 )
-from lagbench.data.registry import MAX_ID, NO_GENERATOR, Size, format_ids, load
+from lagbench.data.registry import NO_GENERATOR, Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter

@@ -7,6 +7,7 @@ are paler.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ SLICE = "across z, in the middle"
 """What a slice is, for titles and captions."""
 
 
+@functools.cache
 def _axes_of_view() -> Floats:
     """Return the unit vectors to the right, up and away, shape [3, axis]."""
     sine = math.sin(AZIMUTH)
@@ -40,9 +42,6 @@ def _axes_of_view() -> Floats:
     return np.array([right, up, away])
 
 
-_VIEW = _axes_of_view()
-
-
 class View:
     """How a box of three dimensions fills the unit square of a picture."""
 
@@ -51,7 +50,7 @@ class View:
         corners = itertools.product(*box.bounds)
         self._corners = np.array(list(corners))
         from_centre = self._corners - self._centre
-        seen = from_centre @ _VIEW.T
+        seen = from_centre @ _axes_of_view().T
         reach = np.abs(seen).max(axis=0)  # right, up, away [length]
         largest = float(reach[:2].max())
         self.scale = (0.5 - RIM) / largest
@@ -68,7 +67,7 @@ class View:
             Shape [..., 2], in sides of the picture.
         """
         from_centre = np.asarray(position, np.float64) - self._centre
-        seen = from_centre @ _VIEW[:2].T
+        seen = from_centre @ _axes_of_view()[:2].T
         return np.asarray(0.5 + self.scale * seen)
 
     def depth(self, position: NDArray[np.floating]) -> Floats:
@@ -77,7 +76,7 @@ class View:
         The points [length] have the shape [..., axis].
         """
         from_centre = np.asarray(position, np.float64) - self._centre
-        away = from_centre @ _VIEW[2]
+        away = from_centre @ _axes_of_view()[2]
         depth = 0.5 + 0.5 * away / self._reach
         return np.asarray(np.clip(depth, 0.0, 1.0))
 

@@ -13,11 +13,12 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.box import AXES, WALL_NAMES
+from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
 from lagbench.data.manifest import FileEntry, Manifest
-from lagbench.data.registry import Parameter, Size, Split, format_ids
+from lagbench.data.registry import Parameter, Registry, Size, Split
+from lagbench.figures.plot import contact_sheet, plot_frame
 from lagbench.figures.tables import escape, markdown
 
-from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
 from .croissant import KEYWORDS, croissant_json
 
 _PAIRS_WITH_SNOW = (
@@ -81,13 +82,32 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
 
     if not _is_current(texts, pictures):
         if pictures:
-            # loads the drawing modules, so only where there is something to paint
-            from .painting import paint_pictures
-
             paint_pictures(root, size, split, manifest)
         for path, text in texts.items():
             write_atomically(path, text)
     return [*texts, *pictures]
+
+
+def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
+    """Paint a contact sheet of all scenarios and one frame of a test scenario."""
+    registry = Registry({size.split: split}, {})
+    folder = size.folder(root)
+    sheet_name, frame_name = PICTURES
+    contact_sheet(
+        size.split, size.name, folder / sheet_name, root=root, registry=registry
+    )
+
+    entry = _first_test_entry(manifest)
+    frame = min(size.task.frames_of_interest[-1], entry.frames - 1)
+    plot_frame(folder / entry.path, frame, folder / frame_name, registry=registry)
+
+
+def _first_test_entry(manifest: Manifest) -> FileEntry:
+    """Return the first file of test, of a manifest without one its first file."""
+    for entry in manifest.files:
+        if entry.subset == "test":
+            return entry
+    return manifest.files[0]
 
 
 def _is_current(texts: Mapping[Path, bytes], pictures: list[Path]) -> bool:

@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import SUFFIX
-from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME
+from lagbench.data.layout import (
+    CARD_NAME,
+    CROISSANT_NAME,
+    MANIFEST_NAME,
+    NOTES_NAME,
+    PICTURES,
+)
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import WorkFailedError
-
-from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
 
 # what lagbench writes beside the subsets
 CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)

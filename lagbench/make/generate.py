@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expand_path
+from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -32,7 +32,7 @@ from lagbench.data.manifest import (
     record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, Split, format_ids
+from lagbench.data.registry import Registry, Size, Split
 from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.generators.batch import SimulationJob, SimulationPace
@@ -555,7 +555,8 @@ def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None
     for result in simulated:
         if is_promised:
             keeper.promised.append(result.scenario)
-        await_file(setup.path(result.scenario))
+        if setup.scheduler is not None:
+            await_file(setup.path(result.scenario))
     entries = []
     for result in simulated:
         entries.append(describe_file(setup.root, setup.size.key(result.scenario)))

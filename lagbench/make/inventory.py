@@ -15,21 +15,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, to_plain
-from lagbench.data.layout import scenario_path, url_of
+from lagbench.data.layout import PICTURES, format_ids, scenario_path, url_of
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
     load_recorded_hashes,
 )
-from lagbench.data.registry import Size, format_ids
+from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.simulate import OUTCOMES, file_parameters
 from lagbench.work.machine import available_cores, may_differ
 
-from .card_files import PICTURES
 from .plan import estimate
 
 

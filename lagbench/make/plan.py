@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.atomic import write_atomically
-from lagbench.data.layout import CACHE_VARIABLE, cache_folder
+from lagbench.data.layout import CACHE_VARIABLE, cache_folder, format_ids, parse_ids
 from lagbench.data.limits import NEEDED, Limit
-from lagbench.data.registry import Size, format_ids, parse_ids
+from lagbench.data.registry import Size
 from lagbench.errors import UsageError, WorkFailedError, suggest_name
 from lagbench.generators.batch import SimulationPace, substep_count
 from lagbench.generators.constants import solver_constants

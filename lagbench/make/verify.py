@@ -20,9 +20,10 @@ from lagbench.data.checksums import (
     file_sha256,
     subset_hash,
 )
+from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest, record_hashes
-from lagbench.data.registry import Registry, Size, format_ids
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate

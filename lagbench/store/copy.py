@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, url_of
+from lagbench.data.layout import MANIFEST_NAME, format_ids, url_of
 from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -33,7 +33,7 @@ from lagbench.data.manifest import (
     record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Size, format_ids
+from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError, suggest_name
 from lagbench.work.machine import may_differ

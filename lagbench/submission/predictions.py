@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import ContentHasher
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
-from lagbench.data.registry import format_ids
+from lagbench.data.layout import format_ids
 from lagbench.data.structure import estimate_chunk_cache
 from lagbench.errors import UsageError
 

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from lagbench.data.layout import major_of, quote_root
+from lagbench.data.layout import format_ids, major_of, quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
-from lagbench.data.registry import Size, format_ids
+from lagbench.data.registry import Size
 from lagbench.errors import format_count
 
 from .format import FileInfo

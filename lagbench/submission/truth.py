@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.contents import check_contents, registered_hash
+from lagbench.data.layout import format_ids
 from lagbench.data.local import suggest_repair
-from lagbench.data.registry import Size, format_ids
+from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 

@@ -20,12 +20,11 @@ from hypothesis import strategies as st
 from rotating_disc import write_swirl
 
 from lagbench.data import registry
-from lagbench.data.layout import dataset_folder
+from lagbench.data.layout import PICTURES, dataset_folder
 from lagbench.data.manifest import Manifest, build_manifest, describe_file
 from lagbench.data.registry import Size
 from lagbench.figures.tables import escape, markdown
-from lagbench.make import cards, painting
-from lagbench.make.card_files import PICTURES
+from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
 
 STATISTICS = {
@@ -96,7 +95,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size, manifest = make(root)
     assert manifest.complete
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(painting, "paint_pictures", PAINT_PICTURES)
+        patch.setattr(cards, "paint_pictures", PAINT_PICTURES)
         written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
     names = {path.relative_to(folder).as_posix() for path in written}

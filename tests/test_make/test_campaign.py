@@ -20,7 +20,7 @@ from lagbench.data.manifest import Manifest, read_manifest, write_manifest
 from lagbench.data.registry import Measured, Registry
 from lagbench.errors import DataError
 from lagbench.generators.record import measured_values
-from lagbench.make import painting
+from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
 from lagbench.work.progress import Progress
@@ -219,7 +219,7 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
 
     for module in ("make.inventory", "data.manifest"):
         monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
-    monkeypatch.setattr(painting, "paint_pictures", refuse)
+    monkeypatch.setattr(cards, "paint_pictures", refuse)
     generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
     read.clear()
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)

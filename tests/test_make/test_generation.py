@@ -22,6 +22,7 @@ from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
+from lagbench.data.layout import PICTURES
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
@@ -33,8 +34,7 @@ from lagbench.generators.batch import (
 )
 from lagbench.generators.draws import generator
 from lagbench.generators.simulate import active_frames, draw_perturbation
-from lagbench.make import painting
-from lagbench.make.card_files import PICTURES
+from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import SECONDS_TO_START, estimate, select
 from lagbench.work.progress import Progress
@@ -96,14 +96,14 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
         "test/0003.nc",
         "test/0004.nc",
     }
-    cards = {
+    card_files = {
         "manifest.json",
         "README.md",
         "croissant.json",
         "pictures/frame.png",
         "pictures/scenarios.png",
     }
-    assert names == scenarios | cards | {".lock", ".verified.json"}
+    assert names == scenarios | card_files | {".lock", ".verified.json"}
 
 
 def test_a_file_holds_what_its_scenario_says(
@@ -631,7 +631,7 @@ def test_a_registry_of_ones_own_is_all_that_counts(
     """A split that only the given registry knows is generated, drawn and described with
     its own title.
     """
-    monkeypatch.setattr(painting, "paint_pictures", PAINT_PICTURES)
+    monkeypatch.setattr(cards, "paint_pictures", PAINT_PICTURES)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate(

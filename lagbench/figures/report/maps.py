@@ -6,6 +6,7 @@ pages: the page shines through where a value is 0. Equal pixels give equal bytes
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -51,12 +52,13 @@ def draw_diverging_map(field: NDArray[np.floating], limit: float) -> bytes:
 
     Blue is below 0, vermilion above, clear is 0, and colours are full at the limit.
     """
-    return _draw_map(field, limit, _DIVERGING)
+    palette = _build_palette(CLOCKWISE, COUNTER_CLOCKWISE)
+    return _draw_map(field, limit, palette)
 
 
 def draw_sequential_map(field: NDArray[np.floating], limit: float) -> bytes:
     """Return a picture of magnitudes: clear at 0, green at the limit."""
-    return _draw_map(field, limit, _SEQUENTIAL)
+    return _draw_map(field, limit, _build_palette(FAST, FAST))
 
 
 def _draw_map(field: NDArray[np.floating], limit: float, palette: Bytes) -> bytes:
@@ -71,6 +73,7 @@ def _draw_map(field: NDArray[np.floating], limit: float, palette: Bytes) -> byte
     return encode_indexed_png(np.ascontiguousarray(rows), palette)
 
 
+@functools.cache
 def _build_palette(below: str, above: str) -> Bytes:
     """Return the colour of each level, then that of no value, shape [entry, 4]."""
     entries = []
@@ -82,10 +85,6 @@ def _build_palette(below: str, above: str) -> Bytes:
         entries.append((*parse_rgb(colour), opacity))
     entries.append(NO_VALUE_COLOUR)
     return np.array(entries, np.uint8)
-
-
-_DIVERGING = _build_palette(CLOCKWISE, COUNTER_CLOCKWISE)
-_SEQUENTIAL = _build_palette(FAST, FAST)
 
 
 def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:

@@ -34,9 +34,6 @@ POLICY = (
     "form-action 'none'"
 )
 
-POLICY_TAG = tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
-"""It is in the head of every report, and of no other page."""
-
 OPEN_SECTIONS = 2
 """Sections that are unfolded when the page is opened: the scores and the rollout."""
 
@@ -103,15 +100,21 @@ def check_folder(folder: str | Path) -> None:
     path = Path(folder) / FILE_NAME
     if not path.is_file():
         return
+    policy_tag = _policy_tag().encode()
     with path.open("rb") as stream:
-        head = stream.read(4 * len(POLICY_TAG))
-    if POLICY_TAG.encode() not in head:
+        head = stream.read(4 * len(policy_tag))
+    if policy_tag not in head:
         raise UsageError(
             "a page that is no report lies there",
             where="--report",
             got=str(path),
             fix="name another folder, or remove the page",
         )
+
+
+def _policy_tag() -> Markup:
+    """Return the tag that is in the head of every report, and of no other page."""
+    return tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
 
 
 def render(subject: Subject) -> str:
@@ -235,7 +238,7 @@ def compose_page(title: str, head: Markup, sections: Sequence[Section]) -> str:
 
     meta = [
         tag("meta", charset="utf-8"),
-        POLICY_TAG,
+        _policy_tag(),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("meta", name="color-scheme", content="light dark"),
         tag("meta", name="referrer", content="no-referrer"),

@@ -1,0 +1,116 @@
+"""Which module imports which: the graph that journeys.py measures and tests walk.
+
+It is read from the source; nothing is imported. Imports in functions count, and so do,
+if asked, those that only a type checker sees.
+"""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+Graph = Mapping[str, set[str]]
+"""The modules that each module imports, by dotted name."""
+
+
+def package_modules(root: Path) -> dict[str, Path]:
+    """Return the file of every module of lagbench, by its dotted name.
+
+    A package has the name of its folder.
+
+    Args:
+        root: folder of the clone.
+    """
+    # Path.rglob does not follow the links that hold generators and baselines.
+    folders = {
+        "lagbench": root / "lagbench",
+        "lagbench.generators": root / "generators",
+        "lagbench.baselines": root / "baselines",
+    }
+    paths = {}
+    for prefix, folder in folders.items():
+        paths.update(list_modules(folder, prefix))
+    return paths
+
+
+def list_modules(folder: Path, prefix: str) -> dict[str, Path]:
+    """Return the file of every module below a folder, by its dotted name."""
+    paths = {}
+    for path in folder.rglob("*.py"):
+        parts = path.relative_to(folder).with_suffix("").parts
+        name = ".".join((prefix, *parts))
+        paths[name.removesuffix(".__init__")] = path
+    return paths
+
+
+def imported_names(name: str, path: Path, *, for_types: bool) -> Iterator[str]:
+    """Yield the dotted names that a module imports.
+
+    Args:
+        name: dotted name of the module.
+        path: its file.
+        for_types: whether imports under ``if TYPE_CHECKING`` count.
+    """
+    package_parts = name.split(".")
+    if path.name != "__init__.py":
+        package_parts.pop()
+    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while pending:
+        node = pending.pop()
+        if not for_types and _is_for_types(node):
+            continue
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name
+        elif isinstance(node, ast.ImportFrom):
+            base = _base_of(node, package_parts)
+            for alias in node.names:
+                yield f"{base}.{alias.name}"
+        pending += ast.iter_child_nodes(node)
+
+
+def _is_for_types(node: ast.AST) -> bool:
+    """Tell whether a statement is ``if TYPE_CHECKING``; ours have no ``else``."""
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+def _base_of(node: ast.ImportFrom, package_parts: list[str]) -> str:
+    """Return the dotted name between ``from`` and ``import``, made absolute."""
+    parts = []
+    if node.level:
+        parts += package_parts[: len(package_parts) - node.level + 1]
+    if node.module:
+        parts.append(node.module)
+    return ".".join(parts)
+
+
+def import_graph(paths: Mapping[str, Path], *, for_types: bool) -> Graph:
+    """Return which of some modules imports which others of them."""
+    graph = {}
+    for name, path in paths.items():
+        modules = set()
+        for target in imported_names(name, path, for_types=for_types):
+            module = target
+            # The last words of a target may name what the module holds.
+            while module and module not in paths:
+                module = module.rpartition(".")[0]
+            modules.add(module)
+        graph[name] = modules - {"", name}
+    return graph
+
+
+def longest_chains(graph: Graph) -> dict[str, list[str]]:
+    """Return the longest chain of imports that begins with each module.
+
+    Raises:
+        graphlib.CycleError: following imports leads back to a module.
+    """
+    chains: dict[str, list[str]] = {}
+    # sorted, so that of two chains of one length always the same is told
+    order = graphlib.TopologicalSorter({name: sorted(graph[name]) for name in graph})
+    for name in order.static_order():
+        below = [chains[imported] for imported in sorted(graph[name])]
+        chains[name] = [name, *max(below, key=len, default=[])]
+    return chains
