@@ -40,14 +40,15 @@ def export_command(
         option(
             "--from-walls/--unit-box",
             "lagrangebench-h5: measure positions from the lower walls, as is the "
-            "default for closed boxes.",
+            "default for full boxes.",
         ),
     ] = None,
     wall_particles: Annotated[
         bool,
         option(
             "--wall-particles",
-            "Closed boxes: add particles that move along with the walls.",
+            "Full boxes of two dimensions with four walls: add particles that move "
+            "along with the walls.",
         ),
     ] = False,
     force: Annotated[bool, option("--force", "Replace an earlier export.")] = False,

@@ -51,6 +51,11 @@ class Placement(enum.StrEnum):
     CELL_CENTRES = "cell_centres"
     NODES = "nodes"
 
+    @property
+    def is_full_box(self) -> bool:
+        """Whether fluid fills the boxes with such nodes; others have a free surface."""
+        return self is Placement.CELL_CENTRES
+
 
 @dataclass(frozen=True)
 class Grid:

@@ -259,6 +259,11 @@ class Size(BaseModel):
         return Box.from_bounds(self.bounds, periodic)
 
     @property
+    def is_full_box(self) -> bool:
+        """Whether one fluid fills the box; else the material has a free surface."""
+        return Placement(self.task.score_grid.placement).is_full_box
+
+    @property
     def record_name(self) -> str:
         """Name of the file that describes the size and records its hashes.
 

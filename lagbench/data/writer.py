@@ -1,8 +1,8 @@
 """Write scenario files: one netCDF4 file per trajectory, for any netCDF or HDF5 reader.
 
-Dimensions are frame, particle, space and, in a closed box, wall; docs/format.md has
-every variable and attribute. Writing needs netCDF4 only, so that generation workers
-stay small.
+Dimensions are frame, particle, space and, in a full box with walls, wall;
+docs/format.md has every variable and attribute. Writing needs netCDF4 only, so that
+generation workers stay small.
 """
 
 from __future__ import annotations

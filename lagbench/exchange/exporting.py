@@ -98,9 +98,10 @@ def export(
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so
             that the bounds that its models see are the walls; no bit is lost. Else
             positions are ours, and the bounds those of the unit box, which that
-            program's neighbour search needs. None: from the walls in closed boxes.
-        wall_particles: closed boxes only: add particles beside the walls that move
-            along with them, since neither format has wall velocities.
+            program's neighbour search needs. None: from the walls in full boxes.
+        wall_particles: full boxes of two dimensions with four walls only: add
+            particles beside the walls that move along with them, since neither
+            format has wall velocities.
         force: write over an earlier export.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
@@ -128,15 +129,17 @@ def export(
 
     frames_of = _frames_by_subset(entry, folder)
     statistics, dataset_sha256 = _recorded_statistics(entry, folder)
-    spacing, is_closed = _inspect_scenario(next(iter(frames_of["train"])), entry)
+    spacing, has_moving_walls = _inspect_scenario(next(iter(frames_of["train"])), entry)
     if from_walls is None:
-        is_measured_from_walls = is_closed or entry.box.is_periodic
+        is_measured_from_walls = has_moving_walls or entry.box.is_periodic
     else:
         is_measured_from_walls = from_walls
     walls = None
     if wall_particles:
         has_unit_box = from_walls is False and form is Format.LAGRANGEBENCH_H5
-        _check_walls(entry, is_closed=is_closed, has_unit_box=has_unit_box)
+        _check_walls(
+            entry, has_moving_walls=has_moving_walls, has_unit_box=has_unit_box
+        )
         walls = WallParticles(entry.bounds, spacing)
     wall_thickness = None
     if walls is not None:
@@ -246,9 +249,9 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
         )
 
 
-def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
+def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> None:
     """Refuse wall particles where no wall can move, or where they have no room."""
-    if not is_closed or size.box.is_periodic or size.dimension != 2:
+    if not has_moving_walls or size.box.is_periodic or size.dimension != 2:
         raise UsageError(
             "the box is no plane one with walls that could move on every side",
             where="--wall-particles",
@@ -263,14 +266,14 @@ def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
 
 
 def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
-    """Return the spacing of particles [length], and whether the box is closed."""
+    """Return the spacing of particles [length], and whether walls may move."""
     with read_scenario(path) as file:
         mass = float(file.read("particle_mass"))
-        is_closed = "wall_velocity" in file.variables
+        has_moving_walls = "wall_velocity" in file.variables
     volume = mass / float(size.value("density"))
     if size.dimension == 2:
-        return math.sqrt(volume), is_closed
-    return math.cbrt(volume), is_closed
+        return math.sqrt(volume), has_moving_walls
+    return math.cbrt(volume), has_moving_walls
 
 
 def _is_free_slip(size: Size) -> bool:

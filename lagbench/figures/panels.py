@@ -80,7 +80,7 @@ def title_of(panel: Panel, scene: Scene) -> str:
 
 def name_slice(scene: Scene) -> str:
     """Return where the plane lies that is drawn of a box of three dimensions."""
-    if scene.recording.is_full_box:
+    if scene.recording.size.is_full_box:
         return SLICE
     place = scene.recording.size.field_grid.places(2)[scene.layer]
     return f"across z at {place:.2f}"

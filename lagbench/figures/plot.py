@@ -170,7 +170,7 @@ def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
     if kind != ALL:
         _check_view(Panel(kind), recording.size)
         return [Panel(kind)]
-    if recording.is_solid and not recording.is_full_box:
+    if recording.is_solid and not recording.size.is_full_box:
         # a slice of a splash is thin or empty
         first = Panel.MATERIAL if recording.is_mixed else Panel.SPEED
         return [first, Panel.FRONT, Panel.ABOVE]

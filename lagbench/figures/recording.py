@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
-from lagbench.data.grid import Placement
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
@@ -78,7 +77,7 @@ class Scene:
         """
         whole = self._whole_fields
         middle = whole.grid.middle_layer
-        if self.recording.is_full_box:
+        if self.recording.size.is_full_box:
             return middle
         if self.recording.layer is not None:
             return self.recording.layer
@@ -183,15 +182,9 @@ class Recording:
         """Whether the box has three dimensions."""
         return self.size.dimension == 3
 
-    @property
-    def is_full_box(self) -> bool:
-        """Whether material fills the box; else it has a free surface."""
-        placement = Placement(self.size.task.score_grid.placement)
-        return placement is Placement.CELL_CENTRES
-
     def fix_layer(self, frames: Iterable[int]) -> None:
         """Draw one plane across z of all frames: the best one of these frames."""
-        if self.is_full_box or not self.is_solid:
+        if self.size.is_full_box or not self.is_solid:
             return
         counts = np.sum([self.scene(frame).nodes_of_layers for frame in frames], axis=0)
         differentiable, counted = counts

@@ -279,7 +279,7 @@ def _variables(size: Size) -> list[tuple[str, str, str, str, str]]:
     rows.append(("`particle_mass`", "", "float64", mass, "mass of one particle"))
     if size.box.walls:
         names = ", ".join(WALL_NAMES[: 2 * size.dimension])
-        meaning = f"closed box: what acts towards each frame; walls {names}"
+        meaning = f"full box: what acts towards each frame; walls {names}"
         motion = ("`wall_velocity`", "frame, wall, space", "float32", "length/s")
         rows.append((*motion, meaning))
     if FORCE_PARAMETER in size.parameters:

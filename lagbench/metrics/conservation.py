@@ -1,4 +1,4 @@
-"""Quantities that a flow conserves: energy, momentum, density, and the closed box.
+"""Quantities that a flow conserves: energy, momentum, density, and what is in the box.
 
 A surrogate that damps loses energy, one that blows up gains it; more energy than the
 truth is no merit, so the ratio aims at 1 and the error counts both ways. Errors of

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data import MATERIALS
 from lagbench.data.box import UNIT_SQUARE, Box
-from lagbench.data.grid import Fields, Grid, Placement, curl, fields
+from lagbench.data.grid import Fields, Grid, curl, fields
 from lagbench.errors import ChecksFailedError, UsageError
 
 Floats = NDArray[np.float64]
@@ -206,8 +206,8 @@ class TaskConfig:
 
     @property
     def is_full_box(self) -> bool:
-        """Whether the material fills the box: no surface, one material."""
-        return self.grid.placement is Placement.CELL_CENTRES
+        """Whether one fluid fills the box; else the material has a free surface."""
+        return self.grid.placement.is_full_box
 
     @property
     def predicted_frames(self) -> range:

@@ -33,7 +33,6 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
-    fills_box,
     given_in,
     velocity_field,
     wall_motion,
@@ -134,7 +133,7 @@ def predict(given: Given) -> Prediction:
     """Yield where the analog takes the particles."""
     scenario, mirror = find_analog(given)
     with _open(given, scenario) as file:
-        if fills_box(given.size):
+        if given.size.is_full_box:
             yield from _carry(given, file, mirror)
         else:
             yield from _follow(given, file, mirror)

@@ -38,7 +38,6 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
-    fills_box,
     velocity_field,
     with_wall_images,
 )
@@ -112,7 +111,7 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
     for frame in given.predicted_frames:
         solver.advance(coarse.substeps_per_frame)
         after = solver.position()[0].astype(np.float64)
-        if fills_box(given.size) and others.size:
+        if given.size.is_full_box and others.size:
             points, velocities = with_wall_images(
                 given,
                 before,
@@ -195,7 +194,7 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     """Return the start of the solver: the particles that carry mass."""
     size = given.size
     interval = size.frame_interval
-    if fills_box(size):
+    if size.is_full_box:
         step_before = given.box.displacement(given.position[-3], given.position[-2])
         velocity = (1.5 * given.step - 0.5 * step_before) / interval
     else:

@@ -21,7 +21,6 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
-    fills_box,
     velocity_field,
     with_wall_images,
 )
@@ -70,6 +69,6 @@ PREDICTOR = ReferencePredictor(
     kind=Kind.NAIVE,
     definition="The velocity field of the last given frame carries the particles; in a"
     " box that nothing drives it decays as the given frames do.",
-    applies=fills_box,
+    applies=lambda size: size.is_full_box,
     predict=predict,
 )

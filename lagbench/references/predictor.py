@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.grid import Placement
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 
@@ -153,14 +152,9 @@ class ReferencePredictor:
         return self.kind is Kind.NAIVE
 
 
-def fills_box(size: Size) -> bool:
-    """Tell whether the material fills the box: no surface, one material."""
-    return Placement(size.task.score_grid.placement) is Placement.CELL_CENTRES
-
-
 def falls(size: Size) -> bool:
     """Tell whether the material has a free surface and falls."""
-    return not fills_box(size) and "gravity" in size.parameters
+    return not size.is_full_box and "gravity" in size.parameters
 
 
 def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:

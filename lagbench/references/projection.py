@@ -21,7 +21,6 @@ from .predictor import (
     Kind,
     Prediction,
     ReferencePredictor,
-    fills_box,
 )
 from .staggered import StaggeredGrid
 
@@ -101,7 +100,7 @@ def _describe(name: str, resolution: int) -> ReferencePredictor:
         definition="Incompressible Navier-Stokes on a staggered grid with"
         f" {resolution} times the cells of the score grid along each axis; it knows the"
         " viscosity and the motion of the walls.",
-        applies=fills_box,
+        applies=lambda size: size.is_full_box,
         predict=predict_at(resolution),
     )
 

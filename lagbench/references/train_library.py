@@ -23,7 +23,7 @@ from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.metrics.frame import directions
 
-from .predictor import Floats, fills_box
+from .predictor import Floats
 
 FEATURE_LEVELS = (np.arange(16) + 0.5) / 16
 """Levels of the quantiles that describe a cloud along a direction."""
@@ -83,7 +83,7 @@ def mirrors_of(size: Size) -> tuple[Mirror, ...]:
     """Return the mirror images under which a split is the same; the first is itself."""
     box = size.box
     symmetric_axes = list(range(box.dimension))
-    if not fills_box(size):
+    if not size.is_full_box:
         symmetric_axes.remove(UP)
     mirrors = []
     for count in range(len(symmetric_axes) + 1):

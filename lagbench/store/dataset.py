@@ -80,7 +80,7 @@ def open_split(
     Returns:
         ``position`` and ``velocity`` with dims (scenario, frame, particle, space) as
         dask arrays, ``material`` (scenario, particle), ``particle_mass`` (scenario), in
-        a closed box ``wall_velocity`` (scenario, frame, wall, space), and
+        a full box with walls ``wall_velocity`` (scenario, frame, wall, space), and
         ``frame_count`` and ``particle_count`` (scenario). Coordinate ``scenario`` holds
         the ids, ``viscosity`` (scenario) the kinematic viscosity that a model is given
         [length^2/s], NaN where none is known. Scenarios with fewer frames or particles

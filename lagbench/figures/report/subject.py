@@ -126,7 +126,7 @@ class Subject:
 
     @property
     def is_full_box(self) -> bool:
-        """Whether the material fills the box: no surface, one material."""
+        """Whether one fluid fills the box; else the material has a free surface."""
         return self.task.config.is_full_box
 
     @property
