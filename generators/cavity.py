@@ -1,15 +1,15 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
-Every moving wall follows a program of its own (:mod:`.programs`): knots with speeds
-drawn from [-U, U], of the other sign at each knot. Without the change of sign half of
-the walls would slide as before when it matters, and the frozen flow would do for an
-answer. One scenario in eight is the classic: lid at rest, then a constant speed.
+Every moving wall follows a program of its own (:func:`.draw_program`): knots with
+speeds drawn from [-U, U], of the other sign at each knot. Without the change of sign
+half of the walls would slide as before when it matters, and the frozen flow would do
+for an answer. One scenario in eight is the classic: lid at rest, then a constant speed.
 Expected behaviour: vortices grow from the moving walls, are cut off where a wall turns
-and merge; the flow never settles. The id decides which walls move, so that every
-subset holds all six choices alike. Two walls that meet in a corner never move both,
-because their corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean
-absolute speed of a wall at the knots of its program (over time it is about 0.35 U), L
-the box's width.
+and merge; the flow never settles. The id decides which walls move, so that every subset
+holds all six choices alike. Two walls that meet in a corner never move both, because
+their corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute
+speed of a wall at the knots of its program (over time it is about 0.35 U), L the box's
+width.
 
 The subset ``shift`` lies outside train on purpose. Its scenarios alternate: a Reynolds
 number beyond train's range, then two walls that meet in a corner. These slide as one

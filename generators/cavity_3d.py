@@ -1,12 +1,12 @@
 """Lid-driven cavity in three dimensions: a cube of which one wall or two slide.
 
-Every moving wall follows smooth random programs (:mod:`.programs`), one along each of
-its two axes, of the other sign at each knot. So the direction turns, and a predictor
+Every moving wall follows smooth random programs (:func:`.draw_program`), one along each
+of its two axes, of the other sign at each knot. So the direction turns, and a predictor
 that keeps the flow frozen fails. The id decides which walls move: every subset of mini
 holds all six choices alike. Two walls that move lie opposite, because two that meet at
 an edge would tear the fluid there. The Reynolds number is (U/2) L / nu: U/2 is the mean
-absolute speed along an axis at the knots of a program (over time it is about 0.35 U),
-L = 1 the side of the cube.
+absolute speed along an axis at the knots of a program (over time it is about 0.35 U).
+L = 1 is the side of the cube.
 
 Where a sliding wall meets the wall beside it the velocity jumps and the pressure of an
 incompressible fluid has no bound. There J departs from 1 by an amount that goes with

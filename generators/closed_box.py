@@ -15,7 +15,7 @@ from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
 from .driver import Driver
-from .nodal_stress import JACOBIAN_BOUND, NodalStress
+from .nodal_stress import NodalStress, broken_jacobian_bounds
 from .solver import Health
 from .split import ClosedBoxParameters, InitialState
 
@@ -118,12 +118,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        broken = {}
-        if health.jacobian_min <= 0.0:
-            broken["J > 0"] = f"J = {health.jacobian_min:.6g}"
-        if health.jacobian_max > JACOBIAN_BOUND:
-            broken[f"J <= {JACOBIAN_BOUND:g}"] = f"J = {health.jacobian_max:.6g}"
-        return broken
+        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)

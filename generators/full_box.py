@@ -14,7 +14,7 @@ from lagbench.errors import UsageError
 from .box_tables import LANES
 from .driver import Driver, Field
 from .full_box_parameters import FullBoxParameters
-from .nodal_stress import JACOBIAN_BOUND
+from .nodal_stress import broken_jacobian_bounds
 from .nodal_stress_nd import NodalStressND
 from .obstacle import Obstacle
 from .solver import Health
@@ -154,12 +154,7 @@ class FullBox(Driver[FullBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        broken = {}
-        if health.jacobian_min <= 0.0:
-            broken["J > 0"] = f"J = {health.jacobian_min:.6g}"
-        if health.jacobian_max > JACOBIAN_BOUND:
-            broken[f"J <= {JACOBIAN_BOUND:g}"] = f"J = {health.jacobian_max:.6g}"
-        return broken
+        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -50,8 +51,19 @@ TRIPLES = (
 )
 """Materials of the three bodies of shift, by place in the subset modulo 4."""
 
-ShapeDraw: TypeAlias = "Callable[[RandomSource, Material, Size], Shape]"
-"""Draws the shape of a body of a material."""
+ShapeDraw: TypeAlias = "Callable[[RandomSource, Size, float], Shape]"
+"""Draws a shape of a length, area or volume."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyShapes:
+    """The shapes that bodies have in the plane, or in space."""
+
+    measure: str  # parameter for the area or volume of a ball or block
+    rope: ShapeDraw  # of a length
+    ball: Callable[[float], Shape]  # of an area or volume
+    block: ShapeDraw  # of an area or volume
+
 
 _NAMES = ("first", "second", "third")
 
@@ -64,15 +76,31 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
     return constants(FreeSurfaceParameters, size)
 
 
-def _draw_shape(rng: RandomSource, material: Material, size: Size) -> Shape:
-    """Draw a rope, a ball of jelly, or a rectangle or disc of anything else."""
+def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
+    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
+
+
+def _draw_rope(rng: RandomSource, size: Size, length: float) -> Shape:
+    return Rectangle(length, size.value("rope_width"), direction(rng))
+
+
+PLANE_SHAPES = BodyShapes(
+    measure="area", rope=_draw_rope, ball=Disc.of_area, block=_draw_rectangle
+)
+"""Shapes of the bodies in the plane: a rope and a block are rectangles."""
+
+
+def _draw_shape(
+    rng: RandomSource, material: Material, size: Size, kinds: BodyShapes
+) -> Shape:
+    """Draw a rope, a ball of jelly, or a block or ball of anything else."""
     if material is Material.ROPE:
         length = uniform(rng, *interval(size, "rope_length"))
-        return Rectangle(length, size.value("rope_width"), direction(rng))
-    area = uniform(rng, *interval(size, "area"))
+        return kinds.rope(rng, size, length)
+    measure = uniform(rng, *interval(size, kinds.measure))
     if material is Material.JELLY or choice(rng, 2) == 1:
-        return Disc.of_area(area)
-    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
+        return kinds.ball(measure)
+    return kinds.block(rng, size, measure)
 
 
 def _probe_nodes(shape: Shape, cell_count: int) -> NDArray[np.float64]:
@@ -167,11 +195,11 @@ def _draw_attractor(rng: RandomSource, size: Size) -> NDArray[np.float64]:
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw the bodies, their places and their velocities."""
-    return draw_bodies(size, scenario, rng, _draw_shape)
+    return draw_bodies(size, scenario, rng, PLANE_SHAPES)
 
 
 def draw_bodies(
-    size: Size, scenario: int, rng: RandomSource, draw_shape: ShapeDraw
+    size: Size, scenario: int, rng: RandomSource, kinds: BodyShapes
 ) -> InitialState:
     """Draw the bodies of a scenario in the plane or in space, by their shapes.
 
@@ -179,13 +207,13 @@ def draw_bodies(
         size: the split and size.
         scenario: number of the scenario; it chooses the materials.
         rng: source of the draws.
-        draw_shape: draws a shape for a material, in the plane or in space.
+        kinds: shapes of the bodies, in the plane or in space.
 
     Raises:
         WorkFailedError: the bodies find no places apart from one another.
     """
     materials = _materials(size, scenario)
-    shapes = [draw_shape(rng, material, size) for material in materials]
+    shapes = [_draw_shape(rng, material, size, kinds) for material in materials]
     bodies = _place_apart(rng, size, shapes)
     measures = [shape.measure for shape in shapes]
     counts = _share_particles(size.particles, measures)

@@ -11,14 +11,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .constants import constants, interval
-from .draws import RandomSource, choice, direction_in_space, uniform
-from .multimaterial import draw_bodies
+from .draws import RandomSource, direction_in_space, uniform
+from .multimaterial import BodyShapes, draw_bodies
 from .solids import Ball, Block, Rod, Solid
 from .split import (
     FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
-    Material,
 )
 
 if TYPE_CHECKING:
@@ -30,19 +29,22 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
     return constants(FreeSurface3DParameters, size)
 
 
-def _draw_solid(rng: RandomSource, material: Material, size: Size) -> Solid:
-    """Draw a rope, a ball of jelly, or a block or ball of anything else."""
-    if material is Material.ROPE:
-        length = uniform(rng, *interval(size, "rope_length"))
-        return Rod(length, size.value("rope_radius"), direction_in_space(rng))
-    volume = uniform(rng, *interval(size, "volume"))
-    if material is Material.JELLY or choice(rng, 2) == 1:
-        return Ball.of_volume(volume)
+def _draw_rod(rng: RandomSource, size: Size, length: float) -> Solid:
+    return Rod(length, size.value("rope_radius"), direction_in_space(rng))
+
+
+def _draw_block(rng: RandomSource, size: Size, volume: float) -> Solid:
     along_x = uniform(rng, *interval(size, "aspect"))
     along_z = uniform(rng, *interval(size, "aspect"))
     return Block.of_volume(volume, (along_x, along_z))
 
 
+SOLIDS = BodyShapes(
+    measure="volume", rope=_draw_rod, ball=Ball.of_volume, block=_draw_block
+)
+"""Shapes of the bodies in space."""
+
+
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw the bodies, their places and their velocities."""
-    return draw_bodies(size, scenario, rng, _draw_solid)
+    return draw_bodies(size, scenario, rng, SOLIDS)

@@ -58,6 +58,16 @@ axis: 1 + 2 x 4 x 1.5 = 13.
 """
 
 
+def broken_jacobian_bounds(lowest: float, highest: float) -> dict[str, str]:
+    """Return the bounds of J that extremes lie outside, each with the value reached."""
+    broken = {}
+    if lowest <= 0.0:
+        broken["J > 0"] = f"J = {lowest:.6g}"
+    if highest > JACOBIAN_BOUND:
+        broken[f"J <= {JACOBIAN_BOUND:g}"] = f"J = {highest:.6g}"
+    return broken
+
+
 @ti.data_oriented
 class NodalStress:
     """Fields of a batch of scenarios and the kernels that advance them."""

@@ -47,6 +47,7 @@ from .transfer import (
     from_fixed,
     largest,
     shifted,
+    spline_weights,
     stepped,
 )
 
@@ -304,14 +305,9 @@ class NodalStressND:
             last = ti.static(self.cells[axis] - 1)
             lowest = ti.min(ti.cast(scaled - 0.5, ti.i32), last)
             f = scaled - ti.cast(lowest, ti.f32)
-            to_low = 1.5 - f
-            to_mid = f - 1.0
-            to_high = f - 0.5
-            low = 0.5 * (to_low * to_low)
-            mid = 0.75 - to_mid * to_mid
-            high = 0.5 * (to_high * to_high)
+            low, mid, high = spline_weights(f)
             self.weights[axis][s, p] = ti.Vector([low, mid, high, 0.0])
-            offset[axis] = to_mid
+            offset[axis] = f - 1.0
             number += lowest * ti.static(self.tables.stride[axis])
         bits = ti.bit_cast(number, ti.f32)
         self.spot[s, p] = ti.Vector([offset[0], offset[1], offset[2], bits])

@@ -23,6 +23,7 @@ from .transfer import (
     accumulate,
     bounded,
     from_fixed,
+    spline_weights,
     stepped,
     to_fixed,
 )
@@ -86,14 +87,9 @@ class ParticleStress3D(FreeSurfaceKernels):
             scaled = self.x[s, p][axis] * self.inv_dx
             lowest = ti.cast(scaled - 0.5, ti.i32)
             f = scaled - ti.cast(lowest, ti.f32)
-            to_low = 1.5 - f
-            to_mid = f - 1.0
-            to_high = f - 0.5
-            low = 0.5 * (to_low * to_low)
-            mid = 0.75 - to_mid * to_mid
-            high = 0.5 * (to_high * to_high)
+            low, mid, high = spline_weights(f)
             self.weights[axis][s, p] = ti.Vector([low, mid, high, 0.0])
-            offset[axis] = to_mid
+            offset[axis] = f - 1.0
             number += lowest * ti.static(self.stride[axis])
         bits = ti.bit_cast(number, ti.f32)
         self.spot[s, p] = ti.Vector([offset[0], offset[1], offset[2], bits])

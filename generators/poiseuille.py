@@ -6,9 +6,9 @@ by -f(t). A constant f would end in a parabola in each half, of height H = 1/2,
     u(y) = f y (H - y) / (2 nu),    0 <= y <= H,
 
 with the speed f H^2 / (8 nu) in its middle (Backer et al., J. Chem. Phys. 122 (2005)
-154503). Here f follows a smooth random program (:mod:`.programs`), so that the flow
-never settles, and eddies are added at the start: gradient noise on a wrapped lattice,
-as in :mod:`.decaying_vortices`. The force of all frames is given to predictors.
+154503). Here f follows a smooth random program (:func:`.draw_program`), so that the
+flow never settles. The eddies at the start are those of :mod:`.decaying_vortices`. The
+force of all frames is given to predictors.
 
 Expected behaviour: the parallel flow follows the force with a lag; viscosity smooths
 its kinks at y = 0 and y = 1/2. It shears the eddies, and feeds them where its profile
@@ -18,16 +18,16 @@ with U the drawn speed of the eddies and L = 1.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from . import decaying_vortices
 from .constants import constants, interval
-from .decaying_vortices import kinetic_energy, particles_per_side
-from .draws import RandomSource, draw_integer, draw_program, log_uniform, uniform
+from .draws import RandomSource, draw_integer, draw_program
 from .full_box_parameters import FullBoxParameters
-from .periodic_noise import draw_lattice, fill_box, noise, rotated_gradient, scaled_to
-from .split import InitialState, Material
+from .split import InitialState
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -62,31 +62,5 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     body_force[:, 0, 0] = program
     body_force[:, 1, 0] = -program
 
-    side = particles_per_side(size)
-    box = size.box
-    position = fill_box(
-        rng, (side, side), low=box.low, high=box.high, jitter=size.value("jitter")
-    )
-    frequency = size.value("frequency_min") + scenario % size.value("frequency_count")
-    psi = noise(position, draw_lattice(rng, frequency, 2))
-    speed = uniform(rng, *interval(size, "speed"))
-    flow = scaled_to(rotated_gradient(psi), speed)
-    reynolds = log_uniform(rng, *interval(size, "reynolds"))
-    viscosity = speed / reynolds
-    return InitialState(
-        position=position,
-        velocity=flow.velocity,
-        affine=flow.affine,
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
-        area=box.volume,
-        viscosity=viscosity,
-        body_force=body_force,
-        start_frame=start,
-        parameters={
-            "frequency": frequency,
-            "speed_rms": speed,
-            "reynolds": reynolds,
-            "viscosity": viscosity,
-            "initial_kinetic_energy": kinetic_energy(flow),
-        },
-    )
+    eddies = decaying_vortices.initial_state(size, scenario, rng)
+    return replace(eddies, body_force=body_force, start_frame=start)

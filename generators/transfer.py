@@ -56,6 +56,21 @@ def fixed_point_scale(particles: int, bound: float) -> float:
 
 
 @ti.func
+def spline_weights(f: Value) -> Value:
+    """Return the weights w_0, w_1 and w_2 of the three nodes along an axis.
+
+    f = x/dx - base is a number, or a vector over axes.
+    """
+    to_low = 1.5 - f
+    to_mid = f - 1.0
+    to_high = f - 0.5
+    low = 0.5 * (to_low * to_low)
+    mid = 0.75 - to_mid * to_mid
+    high = 0.5 * (to_high * to_high)
+    return low, mid, high
+
+
+@ti.func
 def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
     """Return three rows of weights w_i w_j, each with a fourth number.
 
@@ -65,12 +80,8 @@ def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
     scaled = ti.Vector([x[0], x[1]]) * inv_dx
     base = ti.cast(scaled - 0.5, ti.i32)
     f = scaled - ti.cast(base, ti.f32)
-    to_low = 1.5 - f
+    low, mid, high = spline_weights(f)
     to_mid = f - 1.0
-    to_high = f - 0.5
-    low = 0.5 * (to_low * to_low)
-    mid = 0.75 - to_mid * to_mid
-    high = 0.5 * (to_high * to_high)
     node = ti.bit_cast(base[0] * width + base[1], ti.f32)
     weight = ti.Vector([low[1], mid[1], high[1]])  # along y
     first = low[0] * weight
