@@ -26,6 +26,7 @@ import time
 
 import numpy as np
 import taichi as ti
+from conventional_fluid import ConventionalFluid
 
 from lagbench.data import WALLS
 from lagbench.generators.split import ClosedBoxParameters, InitialState
@@ -38,7 +39,7 @@ from validation.experiment import (
 
 
 @ti.data_oriented
-class ConventionalSquare:
+class ConventionalSquare(ConventionalFluid):
     """Fields and kernels of one cavity whose top wall moves along x.
 
     Args:
@@ -48,58 +49,25 @@ class ConventionalSquare:
 
     def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
         """Take the memory and load the particles."""
-        self.p = parameters
         # numbers of the nodes on the walls, and of those beside them in the box
         self.low = parameters.wall
         self.high = parameters.grid - parameters.wall
         self.first = self.low + 1
         self.last = self.high - 1
         self.inside = (self.first, self.high)
-        self.dx = 1.0 / parameters.grid
         top = WALLS.index("top")
         self.lid = float(state.wall_velocity[top, 0])
-        self.mass = parameters.density * state.area / parameters.particles
-        self.pressure = (
-            0.5
-            * parameters.grid
-            * parameters.dt
-            * parameters.modulus
-            / parameters.density
-        )
-        self.diffusion = state.viscosity * parameters.dt * parameters.grid**2
-        self.inset = (self.low + 0.5 + 1e-3) * self.dx
-
-        # Particles: position, velocity, affine velocity and J.
-        count = parameters.particles
-        self.x = ti.Vector.field(2, ti.f32, count)
-        self.v = ti.Vector.field(2, ti.f32, count)
-        self.c = ti.Matrix.field(2, 2, ti.f32, count)
-        self.j = ti.field(ti.f32, count)
-        # Nodes: mass or density, J, momentum or velocity, and acceleration.
         side = parameters.grid + 1
-        nodes = (side, side)
-        self.m = ti.field(ti.f32, nodes)
-        self.q = ti.field(ti.f32, nodes)
-        self.gv = ti.Vector.field(2, ti.f32, nodes)
-        self.ga = ti.Vector.field(2, ti.f32, nodes)
-
-        position = state.position.astype(np.float32)
-        velocity = state.velocity.astype(np.float32)
-        affine = state.affine.astype(np.float32)
-        self.x.from_numpy(position)
-        self.v.from_numpy(velocity)
-        self.c.from_numpy(affine)
-        self.j.fill(1.0)
+        mass = parameters.density * state.area / parameters.particles
+        super().__init__(parameters, state, nodes=(side, side), mass=mass)
+        self.inset = (self.low + 0.5 + 1e-3) * self.dx
 
     @ti.func
     def weights(self, x):
         """Return base node, offset in cells and quadratic B-spline weights."""
         base = ti.cast(x * self.p.grid - 0.5, ti.i32)
         f = x * self.p.grid - ti.cast(base, ti.f32)
-        first = 0.5 * (1.5 - f) ** 2
-        second = 0.75 - (f - 1) ** 2
-        third = 0.5 * (f - 0.5) ** 2
-        return (base, f, [first, second, third])
+        return (base, f, self.spline(f))
 
     @ti.func
     def ends_of_row(self, k):
@@ -258,22 +226,8 @@ class ConventionalSquare:
         c *= 4.0 * self.p.grid
         density = ti.max(density, 0.5)
 
-        # Particles move a little to where the matter is thinner.
-        limit = 0.1 * self.dx
-        wanted_shift = -4.0 * self.p.shift * self.dx * thinner / density
-        shift = ti.math.clamp(wanted_shift, -limit, limit)
-        moved = self.v[p] + a
-        relaxation = self.p.velocity_relaxation * (v - moved)
-        self.v[p] = moved + relaxation + c @ shift
-        position = self.x[p] + self.p.dt * v + shift
+        position = self.move(p, v, a, c, density, thinner, smooth)
         self.x[p] = ti.math.clamp(position, self.inset, 1.0 - self.inset)
-        self.c[p] = c
-
-        old = self.j[p]
-        expanded = old * (1.0 + self.p.dt * c.trace())
-        smoothing = self.p.jacobian_relaxation * (smooth - old)
-        coupling = self.p.density_coupling * (1.0 / density - smooth)
-        self.j[p] = expanded + smoothing + coupling
 
 
 def main() -> int:

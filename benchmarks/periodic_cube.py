@@ -27,49 +27,28 @@ import time
 
 import numpy as np
 import taichi as ti
+from conventional_fluid import ConventionalFluid
 
 from lagbench.generators import curl_noise_3d
 from lagbench.generators.draws import generator
 from lagbench.generators.solver import build
-from lagbench.generators.split import InitialState
+from lagbench.generators.split import FullBoxParameters, InitialState
 from validation.full_box import Box, constants, lattice
 
 TARGET = 3.0
 
 
 @ti.data_oriented
-class ConventionalCube:
+class ConventionalCube(ConventionalFluid):
     """Fields and kernels of a periodic cube."""
 
-    def __init__(self, parameters, state: InitialState) -> None:
+    def __init__(self, parameters: FullBoxParameters, state: InitialState) -> None:
         """Take the memory and load the particles."""
-        self.p = parameters
         self.n = parameters.grid
-        self.dx = 1.0 / parameters.grid
-        self.mass = 1.0 / parameters.particles
-        self.pressure = 0.5 * self.n * parameters.dt * 5.0
-        self.diffusion = state.viscosity * parameters.dt * self.n**2
-
-        # Particles: position, velocity, affine velocity and J.
-        count = parameters.particles
-        self.x = ti.Vector.field(3, ti.f32, count)
-        self.v = ti.Vector.field(3, ti.f32, count)
-        self.c = ti.Matrix.field(3, 3, ti.f32, count)
-        self.j = ti.field(ti.f32, count)
-        # Nodes: mass or density, J, momentum or velocity, and acceleration.
         nodes = (self.n, self.n, self.n)
-        self.m = ti.field(ti.f32, nodes)
-        self.q = ti.field(ti.f32, nodes)
-        self.gv = ti.Vector.field(3, ti.f32, nodes)
-        self.ga = ti.Vector.field(3, ti.f32, nodes)
-
-        position = state.position.astype(np.float32)
-        velocity = state.velocity.astype(np.float32)
-        affine = state.affine.astype(np.float32)
-        self.x.from_numpy(position)
-        self.v.from_numpy(velocity)
-        self.c.from_numpy(affine)
-        self.j.fill(1.0)
+        super().__init__(
+            parameters, state, nodes=nodes, mass=1.0 / parameters.particles
+        )
 
     @ti.func
     def weights(self, x):
@@ -77,10 +56,7 @@ class ConventionalCube:
         scaled = x * self.n - 0.5
         base = ti.cast(ti.floor(scaled - 0.5), ti.i32)
         f = scaled - ti.cast(base, ti.f32)
-        first = 0.5 * (1.5 - f) ** 2
-        second = 0.75 - (f - 1) ** 2
-        third = 0.5 * (f - 0.5) ** 2
-        return (base, f, [first, second, third])
+        return (base, f, self.spline(f))
 
     @ti.func
     def wrapped(self, node):
@@ -165,22 +141,8 @@ class ConventionalCube:
         c *= 4.0 * self.n
         density = ti.max(density, 0.5)
 
-        # Particles move a little to where the matter is thinner.
-        limit = 0.1 * self.dx
-        wanted_shift = -4.0 * self.p.shift * self.dx * thinner / density
-        shift = ti.math.clamp(wanted_shift, -limit, limit)
-        moved = self.v[p] + a
-        relaxation = self.p.velocity_relaxation * (v - moved)
-        self.v[p] = moved + relaxation + c @ shift
-        x = self.x[p] + self.p.dt * v + shift
+        x = self.move(p, v, a, c, density, thinner, smooth)
         self.x[p] = x - ti.floor(x)
-        self.c[p] = c
-
-        old = self.j[p]
-        expanded = old * (1.0 + self.p.dt * c.trace())
-        smoothing = self.p.jacobian_relaxation * (smooth - old)
-        coupling = self.p.density_coupling * (1.0 / density - smooth)
-        self.j[p] = expanded + smoothing + coupling
 
 
 def start(grid: int):
