@@ -395,37 +395,6 @@ def make_entry(
     if place % 2 == 0:
         seeds = [0, 1, 2]
     hashes = [f"{number}f" * 32 for number in range(len(seeds))]
-    flags = {
-        4: EntryFlag(name="physics", reasons=("14 times the truth's kinetic energy",)),
-        6: EntryFlag(
-            name="copy_suspect", reasons=("the error drops within one frame",)
-        ),
-    }
-    outside_box = EntryFlag(
-        name="in_domain", reasons=("41 positions lie outside the box",), share=0.059
-    )
-    predictions = []
-    files = []
-    for number, (seed, sha256) in enumerate(zip(seeds, hashes, strict=True)):
-        prediction = Prediction(
-            seed=seed,
-            sha256=sha256,
-            url=f"https://example.org/{number}.nc",
-            bytes=21_500_000,
-        )
-        predictions.append(prediction)
-        diverged_at = {}
-        if place == 5 and number == 0:
-            diverged_at = {54: 7, 55: 9}
-        file = ScoredFile(
-            sha256=sha256,
-            predictions_sha256=sha256,
-            flags=(flags[place],) if place in flags else (),
-            warnings=(outside_box,) if place == 3 else (),
-            diverged_at=diverged_at,
-        )
-        files.append(file)
-
     method = name.lower().replace("+", "-").replace(" ", "-")
     all_authors = ("Ada Byron", "Émilie du Châtelet", "Osborne Reynolds")
     author_count = 1 + len(name) % 3
@@ -439,13 +408,6 @@ def make_entry(
         windows=40_000 * (place + 1),
         epochs=1.5,
         cpu_hours=0.25,
-    )
-    score = ScoreBlock(
-        lagbench="0.1.0",
-        dataset_sha256="ab12" * 16,
-        ranking_metric="vorticity_rmse",
-        files=tuple(files),
-        metrics={},
     )
     return Entry(
         format=2,
@@ -467,9 +429,58 @@ def make_entry(
         hardware="NVIDIA H200, 1.2 h",
         command=command,
         dataset=DataSet(version="1.0.0", sha256="ab12" * 16),
-        predictions=tuple(predictions),
+        predictions=_predictions(seeds, hashes),
         cost=cost,
-        score=score,
+        score=_score_block(hashes, place),
+    )
+
+
+def _predictions(
+    seeds: Sequence[int | None], hashes: Sequence[str]
+) -> tuple[Prediction, ...]:
+    """Return the predictions of the seeds."""
+    predictions = []
+    for number, (seed, sha256) in enumerate(zip(seeds, hashes, strict=True)):
+        prediction = Prediction(
+            seed=seed,
+            sha256=sha256,
+            url=f"https://example.org/{number}.nc",
+            bytes=21_500_000,
+        )
+        predictions.append(prediction)
+    return tuple(predictions)
+
+
+def _score_block(hashes: Sequence[str], place: int) -> ScoreBlock:
+    """Return the scored files, with the flags and the divergence of a place."""
+    flags = {
+        4: EntryFlag(name="physics", reasons=("14 times the truth's kinetic energy",)),
+        6: EntryFlag(
+            name="copy_suspect", reasons=("the error drops within one frame",)
+        ),
+    }
+    outside_box = EntryFlag(
+        name="in_domain", reasons=("41 positions lie outside the box",), share=0.059
+    )
+    files = []
+    for number, sha256 in enumerate(hashes):
+        diverged_at = {}
+        if place == 5 and number == 0:
+            diverged_at = {54: 7, 55: 9}
+        file = ScoredFile(
+            sha256=sha256,
+            predictions_sha256=sha256,
+            flags=(flags[place],) if place in flags else (),
+            warnings=(outside_box,) if place == 3 else (),
+            diverged_at=diverged_at,
+        )
+        files.append(file)
+    return ScoreBlock(
+        lagbench="0.1.0",
+        dataset_sha256="ab12" * 16,
+        ranking_metric="vorticity_rmse",
+        files=tuple(files),
+        metrics={},
     )
 
 

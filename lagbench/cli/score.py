@@ -79,20 +79,11 @@ def score_command(
     It shows the skill and the first metrics beside those of the best reference
     predictor.
     """
-    if len(predictions) > 1 and report is None:
-        raise UsageError(
-            "several files are scored for one report only",
-            where="FILE",
-            expected="one file",
-            got=f"{len(predictions)} files",
-            fix="add --report FOLDER",
-        )
+    _check_file_count(predictions, report)
     folders = _score_folders(predictions, output)
     if split is not None:
         root = locate_split(split, root=root).root
-    validations: Sequence[ValidationResult | None] = [None]
-    if len(predictions) > 1:
-        validations = _validate_together(predictions, root)
+    validations = _validate_together(predictions, root)
     if report is not None:
         check_folder(report)
 
@@ -126,6 +117,22 @@ def score_command(
             _print_cards(cards, every=every, all_references=all_references)
     if page is not None:
         print_line(f"report: {page}", quiet=quiet or as_json)
+
+
+def _check_file_count(predictions: Sequence[Path], report: Path | None) -> None:
+    """Refuse several files that are to be scored without a report.
+
+    Raises:
+        UsageError: there are several files and no folder of a report.
+    """
+    if len(predictions) > 1 and report is None:
+        raise UsageError(
+            "several files are scored for one report only",
+            where="FILE",
+            expected="one file",
+            got=f"{len(predictions)} files",
+            fix="add --report FOLDER",
+        )
 
 
 def _print_cards_as_json(cards: Sequence[ScoreCard]) -> None:
@@ -184,13 +191,17 @@ def _score_folders(
 
 def _validate_together(
     predictions: Sequence[Path], root: Path | None
-) -> list[ValidationResult]:
-    """Return the validation of every file, before the first is scored.
+) -> Sequence[ValidationResult | None]:
+    """Return the validation of each of several files, before the first is scored.
+
+    A single file has None: it is validated as it is scored.
 
     Raises:
         UsageError: the files are for different data sets.
         LagbenchError: a file is invalid.
     """
+    if len(predictions) == 1:
+        return [None]
     results: list[ValidationResult] = []
     for path in predictions:
         result = validate(path, root=root, require_truth=True)

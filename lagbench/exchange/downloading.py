@@ -23,7 +23,7 @@ from lagbench.data.manifest import (
     record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry, Size, Split
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
@@ -41,7 +41,7 @@ from lagbench.store.archive import (
 from lagbench.store.copy import object_address, parse_manifest, refuse_foreign_hashes
 from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios, fetch_text
 from lagbench.store.objects import NotInStoreError, StoreUnreachableError
-from lagbench.store.publication import publish
+from lagbench.store.publication import Publication, publish
 from lagbench.work.progress import Meter, Progress
 
 HINT = "try again; if it stays so, name another store: --from"
@@ -117,15 +117,11 @@ def download(
             answers or is fast enough and nothing may be simulated.
     """
     started = time.monotonic()
-    if connections < 1:
-        raise UsageError(
-            "no file comes without a connection", where="--connections", expected=">= 1"
-        )
+    _check_connections(connections)
     entry, folder, splits = locate_new(split, size, root=root, registry=registry)
     selected = select(entry, subset=subset, scenarios=scenarios)
-    urls = [mirror] if mirror else [*splits.split(entry.split).mirrors]
-    if not mirror:
-        urls += list_releases(entry)
+    description = splits.split(entry.split)
+    urls = _list_stores(mirror, description, entry)
     with (
         dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait),
         publish(entry, folder) as store,
@@ -147,11 +143,7 @@ def download(
         if not job.missing:
             verdict = compare_hashes(entry, manifest)
             if job.downloaded and entry.simulated:
-                if store:
-                    store.fetch(sorted(published))
-                cards = write_cards(folder, entry, splits.split(entry.split), manifest)
-                if store:
-                    store.finish(manifest, cards)
+                _describe_data(job, description, manifest, store, sorted(published))
 
     if job.missing:
         if not or_generate:
@@ -184,6 +176,43 @@ def download(
         dataset_sha256=manifest.dataset_sha256,
         verdict=verdict,
     )
+
+
+def _check_connections(count: int) -> None:
+    if count < 1:
+        raise UsageError(
+            "no file comes without a connection", where="--connections", expected=">= 1"
+        )
+
+
+def _list_stores(mirror: str | None, split: Split, size: Size) -> list[str]:
+    """Return the URLs of stores in the order in which they are asked."""
+    if mirror:
+        return [mirror]
+    return [*split.mirrors, *list_releases(size)]
+
+
+def _describe_data(
+    job: DownloadJob,
+    split: Split,
+    manifest: Manifest,
+    store: Publication | None,
+    published: Sequence[int],
+) -> None:
+    """Write the card of the data that were fetched, also into their own store.
+
+    Args:
+        job: what was fetched.
+        split: description of the split.
+        manifest: manifest of the data.
+        store: where the root folder itself is kept, if in a store.
+        published: ids of the scenarios that this store has; a card needs them here.
+    """
+    if store:
+        store.fetch(published)
+    cards = write_cards(job.root, job.size, split, manifest)
+    if store:
+        store.finish(manifest, cards)
 
 
 def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:

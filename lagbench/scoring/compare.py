@@ -279,11 +279,9 @@ def compare(
         second = _find_entry(second, entries)
 
     # before anything is scored
-    for path in _seed_files(Path(first)):
-        check_regular(path)
+    _check_files(first)
     if not is_bare:
-        for path in _seed_files(Path(second)):
-            check_regular(path)
+        _check_files(second)
 
     def require_second(split: str, size: str) -> None:
         if is_bare and str(second) not in REFERENCES:
@@ -301,10 +299,7 @@ def compare(
     if is_reference:
         two = _reference_beside(one, str(second))
     elif is_bare:
-        place = (one.identity["split"], one.identity["size"], str(second))
-        if place not in entries:
-            raise _no_such_name(one, first, str(second), entries)
-        two = _load_contestant(entries[place], scoring)
+        two = _load_entry(str(second), one, first, entries=entries, scoring=scoring)
     else:
         two = _load_contestant(second, scoring)
 
@@ -312,17 +307,34 @@ def compare(
     _check_same(between, one.identity, two.identity)
     if not is_reference:
         _check_overlap(between, one, two)
+    comparisons = _compare_metrics(one, two, metrics)
+    return _describe(one, two, comparisons, is_reference=is_reference)
 
+
+def _compare_metrics(
+    one: Contestant, two: Contestant, metrics: Collection[str]
+) -> dict[str, MetricComparison]:
+    """Compare the ranking metric, then others that judge and are asked for, by name."""
     judging = _judging_metrics(one, two)
     chosen = _choose_metrics(metrics, judging)
-    order = [one.ranking]
+    names = [one.ranking]
     for name in judging:
         if name in chosen and name != one.ranking:
-            order.append(name)
+            names.append(name)
     comparisons = {}
-    for name in order:
+    for name in names:
         comparisons[name] = _compare_metric(one.scores[name], two.scores[name])
+    return comparisons
 
+
+def _describe(
+    one: Contestant,
+    two: Contestant,
+    comparisons: Mapping[str, MetricComparison],
+    *,
+    is_reference: bool,
+) -> ComparisonResult:
+    """Return the comparison of two methods with what a reader must know of them."""
     first_name, second_name = _names(one, two, is_reference=is_reference)
     has_one_name = one.identity["method"] == two.identity["method"]
     return ComparisonResult(
@@ -408,6 +420,12 @@ def _find_entry(source: str | Path, entries: Mapping[Place, Path]) -> str | Path
             fix=f"name one of {', '.join(data_sets)}",
         )
     return source
+
+
+def _check_files(source: str | Path) -> None:
+    """Refuse a method of which some file is no regular one."""
+    for path in _seed_files(Path(source)):
+        check_regular(path)
 
 
 def _require_entry(
@@ -677,6 +695,32 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
         ) from error
     # through JSON, so that its digits are those of a scores.json
     return parse_scores(card.as_json())
+
+
+def _load_entry(
+    name: str,
+    one: Contestant,
+    first: str | Path,
+    *,
+    entries: Mapping[Place, Path],
+    scoring: _ScoringOptions,
+) -> Contestant:
+    """Return the entry of a name for the data set of the first method.
+
+    Args:
+        name: name of the entry.
+        one: the first method.
+        first: where it came from, for the message.
+        entries: entries of the leaderboard.
+        scoring: options with which predictions are scored.
+
+    Raises:
+        UsageError: neither an entry nor a reference has the name.
+    """
+    place = (one.identity["split"], one.identity["size"], name)
+    if place not in entries:
+        raise _no_such_name(one, first, name, entries)
+    return _load_contestant(entries[place], scoring)
 
 
 def _reference_beside(contestant: Contestant, name: str) -> Contestant:
