@@ -151,10 +151,11 @@ def main() -> int:
         for name in MODELS:
             slope, _ = np.polyfit(np.log(counts), np.log(times[name]), 1)
             exponents.append(f"{slope:.2f}")
-        lines.append(["", "exponent of the time in particles", *exponents])
+        lines.append(["", "exponent", *exponents])
     caption = (
-        "Processor time of a frame [ms] on one core; untrained models, recipes of "
-        f"{SPLIT} {SIZE}."
+        "Processor time of a predicted frame [ms] on one core. The models are "
+        f"untrained and have the recipes of {SPLIT} {SIZE}. There are 2,000 q^2 "
+        "particles; the time grows as their number to the power in the last row."
     )
     text = f"{caption}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
     print(text)

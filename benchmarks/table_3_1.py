@@ -204,7 +204,8 @@ def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
 def markdown(measurements: Sequence[TimedRow], device: str) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
+        f"Times in milliseconds. Ours were measured on {device}, those of the thesis on "
+        "its GPU. The number of particles grows as q^2.",
         "",
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",
@@ -221,8 +222,8 @@ def markdown(measurements: Sequence[TimedRow], device: str) -> str:
         )
     lines += [
         "",
-        "Exponents of least-squares lines through the logarithms: a time grows as the "
-        "given number to this power.",
+        "A time grows as the named number to the power of the exponent. The exponents "
+        "are slopes of least-squares lines through the logarithms.",
         "",
         "| exponent of | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
