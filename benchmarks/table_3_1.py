@@ -204,8 +204,8 @@ def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
 def markdown(measurements: Sequence[TimedRow], device: str) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        f"Times in milliseconds. Ours were measured on {device}, those of the thesis on "
-        "its GPU. The number of particles grows as q^2.",
+        f"Times in milliseconds. Ours were measured on {device}, those of the thesis "
+        "on its GPU. The number of particles grows as q^2.",
         "",
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",

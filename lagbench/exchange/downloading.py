@@ -347,7 +347,7 @@ class DownloadJob:
             claim = claims.get(scenario)
             if claim and not claim.has_hash(self._recorded_hashes[scenario]):
                 strangers.append(scenario)
-        refuse_foreign_hashes(manifest, strangers, where=place, hint=HINT)
+        refuse_foreign_hashes(self.size, manifest, strangers, where=place, hint=HINT)
         return claims
 
     def _list_requests(

@@ -207,7 +207,7 @@ def _fetch_manifest(size: Size, stream: _Stream, address: str, hint: str) -> Man
             foreign_scenarios.append(entry.scenario)
     if sorted(scenarios) != list(size.scenarios):
         foreign_scenarios = scenarios
-    refuse_foreign_hashes(manifest, foreign_scenarios, where=address, hint=hint)
+    refuse_foreign_hashes(size, manifest, foreign_scenarios, where=address, hint=hint)
     return manifest
 
 

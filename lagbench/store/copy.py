@@ -108,14 +108,19 @@ def parse_manifest(size: Size, text: bytes, *, where: str, hint: str) -> Manifes
 
 
 def refuse_foreign_hashes(
-    manifest: Manifest, foreign_scenarios: Collection[int], *, where: str, hint: str
+    size: Size,
+    manifest: Manifest,
+    foreign_scenarios: Collection[int],
+    *,
+    where: str,
+    hint: str,
 ) -> None:
-    """Refuse a store whose manifest has other content hashes than datasets.yaml."""
+    """Refuse a store whose manifest has other content hashes than the record."""
     if foreign_scenarios:
         raise WrongContentError(
             "the store holds another data set",
             where=f"{where}, scenarios {format_ids(foreign_scenarios)}",
-            expected="the content hashes that are recorded",
+            expected=f"the content hashes in {size.record_name}",
             got=f"version {manifest.version}, data set hash {manifest.dataset_sha256}",
             fix=hint,
         )
@@ -203,6 +208,7 @@ def update_working_copy(
             if not matches_registry(entry, size, manifest):
                 foreign_scenarios.append(scenario)
     refuse_foreign_hashes(
+        size,
         manifest,
         foreign_scenarios,
         where=object_address(size, url, MANIFEST_NAME),

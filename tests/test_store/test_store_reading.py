@@ -19,7 +19,7 @@ import lagbench
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.data.layout import as_url, url_of
 from lagbench.data.local import resolve_root
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, load
 from lagbench.errors import DataError
 from lagbench.exchange import export
 from lagbench.make.generate import GenerationResult
@@ -298,7 +298,7 @@ def test_a_wrong_manifest_is_refused(
 ) -> None:
     """Other hashes than those of datasets.yaml, endless files, names that lead away.
 
-    No file comes.
+    No file comes. Of other hashes the error names the record.
     """
     manifest = json.loads(folder.read(MANIFEST))
     if key in ("content_sha256", "bytes"):
@@ -309,8 +309,11 @@ def test_a_wrong_manifest_is_refused(
     text = json.dumps(manifest)
     folder.put(MANIFEST, text.encode())
     before = set(tmp_path.rglob("manifest.json"))
-    with pytest.raises(error):
+    with pytest.raises(error) as caught:
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    if error is WrongContentError:
+        record_name = load().size(SPLIT, SIZE).record_name
+        assert record_name in str(caught.value.expected)
     assert list_copy(folder.url) == []
     assert set(tmp_path.rglob("manifest.json")) == before
 
