@@ -10,11 +10,8 @@ from __future__ import annotations
 import numpy as np
 import taichi as ti
 
-from lagbench.generators.split import (
-    ClosedBoxParameters,
-    FullBoxParameters,
-    InitialState,
-)
+from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
 @ti.data_oriented

@@ -31,8 +31,9 @@ from conventional_fluid import ConventionalFluid
 
 from lagbench.generators import curl_noise_3d
 from lagbench.generators.draws import generator
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.solver import build
-from lagbench.generators.split import FullBoxParameters, InitialState
+from lagbench.generators.split import InitialState
 from validation.full_box import Box, constants, lattice
 
 TARGET = 3.0

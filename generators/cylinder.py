@@ -29,11 +29,10 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 
 from .constants import constants, interval
-from .draws import RandomSource, choice, log_uniform, quantise, uniform
+from .draws import RandomSource, choice, draw_integer, log_uniform, quantise, uniform
 from .full_box_parameters import FullBoxParameters
 from .obstacle import Obstacle, is_inside
 from .periodic_noise import fill_box
-from .programs import draw_integer
 from .split import InitialState, Material
 
 if TYPE_CHECKING:
