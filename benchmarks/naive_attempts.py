@@ -503,7 +503,7 @@ class Predictors:
         first_states = []
         rows = []
         for row, state in enumerate(states.states):
-            if state.frame == 1:
+            if state.frame == 1:  # frame 0 has no velocity yet
                 first_states.append(state)
                 rows.append(row)
         starts = States(tuple(first_states), states.features[rows])

@@ -190,7 +190,7 @@ def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
 
 
 def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
-    """Return the exponents of our times."""
+    """Return how our times grow with particles: a power law, fitted in logarithms."""
     rows = []
     substep_ms = []
     frame_ms = []

@@ -42,7 +42,7 @@ SCENARIOS = 12
 FEW = 7
 """So do these."""
 
-OTHERS = 3
+TRAJECTORIES = 3
 """Scenarios for the other readers, whose speed does not depend on the number."""
 
 HISTORY = 6
@@ -274,16 +274,16 @@ def test_npz_in_memory(tmp_path: Path) -> None:
     """How geoelements/gns reads: whole trajectories in memory, a window is a view of
     them.
     """
-    write_gns_npz(tmp_path / "train.npz", OTHERS)
+    write_gns_npz(tmp_path / "train.npz", TRAJECTORIES)
     start = time.process_time()
     with np.load(tmp_path / "train.npz") as arrays:
         trajectories = [arrays[name] for name in arrays.files]
     loading = time.process_time() - start
-    per = FRAMES - HISTORY
+    windows_in_each = FRAMES - HISTORY
 
     def read(index: int) -> tuple[NDArray[np.float32], ...]:
-        frames = trajectories[index // per]
-        stop = index % per + HISTORY
+        frames = trajectories[index // windows_in_each]
+        stop = index % windows_in_each + HISTORY
         position = np.transpose(frames[stop - HISTORY : stop], (1, 0, 2))
         # Their collate stacks the windows: that copy is where the bytes are touched.
         return (
@@ -293,7 +293,9 @@ def test_npz_in_memory(tmp_path: Path) -> None:
         )
 
     windows_per_second = rate(
-        read, np.random.default_rng(SEED).integers(OTHERS * per, size=1000), 1000
+        read,
+        np.random.default_rng(SEED).integers(TRAJECTORIES * windows_in_each, size=1000),
+        1000,
     )
     size = sum(frames.nbytes for frames in trajectories)
     print(
@@ -304,19 +306,23 @@ def test_npz_in_memory(tmp_path: Path) -> None:
 
 def test_hdf5_of_trajectories(tmp_path: Path) -> None:
     """How LagrangeBench reads: seven frames of a group of an HDF5 file."""
-    write_lagrangebench_h5(tmp_path / "train.h5", OTHERS)
-    per = FRAMES - HISTORY - 1
+    write_lagrangebench_h5(tmp_path / "train.h5", TRAJECTORIES)
+    windows_in_each = FRAMES - HISTORY - 1
     with h5py.File(tmp_path / "train.h5") as file:
 
         def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-            group = file[f"{index // per:05d}"]
-            first = index % per
+            group = file[f"{index // windows_in_each:05d}"]
+            first = index % windows_in_each
             position = group["position"][first : first + HISTORY + 1].transpose(
                 (1, 0, 2)
             )
             return position, group["particle_type"][:]
 
         windows_per_second = rate(
-            read, np.random.default_rng(SEED).integers(OTHERS * per, size=200), 200
+            read,
+            np.random.default_rng(SEED).integers(
+                TRAJECTORIES * windows_in_each, size=200
+            ),
+            200,
         )
     print(f"\nHDF5 of trajectories: {windows_per_second:.0f} windows/s")

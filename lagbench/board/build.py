@@ -794,14 +794,14 @@ def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
 
 
 def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
+    maps = spaced(len(preview.map_frames), MAP_FRAMES)
     histograms = []
     ranges = preview.histogram_range.astype(np.float64).tolist()
     shares = preview.histogram[side].astype(np.float64)
-    for i in spaced(len(preview.map_frames), MAP_FRAMES):
+    for i in maps:
         low, high = ranges[i]
         frame_shares = shares[i]
         histograms.append(Histogram(low=low, high=high, shares=frame_shares))
-    maps = spaced(len(preview.map_frames), MAP_FRAMES)
     vorticity = coarsen(preview.vorticity[side][maps], MAP_NODES)
     return Pictures(
         scenario=preview.scenario,

@@ -378,6 +378,9 @@ class _Reproduction:
     def _change(
         self, entry: Entry, change: Callable[[Verification], Verification]
     ) -> None:
+        """Change the verification of an entry: in verified.yaml, or without recording
+        only in memory.
+        """
         if self.recording:
             record(self.folder, entry, change)
             return
