@@ -35,6 +35,7 @@ from lagbench.make.generate import generate
 from lagbench.make.verify import verify
 
 SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
+LARGE_RELATIVES = ("decaying-vortices",)
 
 
 @pytest.mark.parametrize(
@@ -44,6 +45,7 @@ SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
         ("multimaterial", 1 / 60, (2500, 64, 108, 43_200, 48, 8, 16)),
         ("cavity", 0.1, (8192, 40, 50, 45_600, 48, 8, 20)),
         ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
+        ("decaying-vortices", 0.1, (16_384, 64, 48, 14_400, 48, 8, 16)),
     ],
 )
 def test_full_sizes_are_those_of_the_documentation(
@@ -149,6 +151,28 @@ def test_mini_and_tiny_are_small_relatives(split: str) -> None:
     assert 256 <= tiny.particles <= 640
     assert len(mini.subsets["train"]) == 24
     assert mini.scenarios == run_of_ids(0, len(mini.scenarios) - 1)
+
+
+@pytest.mark.parametrize("split", LARGE_RELATIVES)
+def test_full_is_a_large_relative_of_mini(split: str) -> None:
+    """Particles per cell, substeps per cell and the task are those of mini."""
+    registry = load()
+    full = registry.size(split, "full")
+    mini = registry.size(split, "mini")
+    dimension = full.box.dimension
+    assert full.particles / full.grid**dimension == pytest.approx(
+        mini.particles / mini.grid**dimension, rel=0.06
+    )
+    substeps_per_cell = full.substeps_per_frame / full.grid
+    assert substeps_per_cell == mini.substeps_per_frame / mini.grid
+    assert full.task.radius * full.grid == pytest.approx(
+        mini.task.radius * mini.grid, rel=0.02
+    )
+    changes = {"score_grid": mini.task.score_grid, "radius": mini.task.radius}
+    assert full.task.model_copy(update=changes) == mini.task
+    assert full.task.score_grid.cells == full.grid
+    assert full.frame_interval == mini.frame_interval
+    assert full.subsets["test"] == run_of_ids(56, 71)
 
 
 Change = Callable[[dict[str, Any]], object]
