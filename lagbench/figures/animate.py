@@ -18,14 +18,14 @@ from rich.console import Console
 from rich.progress import track
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UsageError, suggest_name
+from lagbench.errors import UsageError, format_count, suggest_name
 from lagbench.work.progress import watched
 
 from .canvas import DPI, figure, pixels_of, renamed, shrink
 from .colours import INK, MUTED
 from .encoders import encode_gif, encode_mp4
 from .painter import Painter, unpack
-from .panels import Panel, colour_bar, limit_of, material_key, name_slice
+from .panels import FEW_NODES, Panel, colour_bar, limit_of, material_key, name_slice
 from .plot import SEPARATOR, describe
 from .recording import Recording, open_recording
 
@@ -292,15 +292,19 @@ def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
 
 
 def _check_vorticity(recording: Recording, frames: Sequence[int]) -> None:
-    """Refuse a film of a vorticity that no frame has."""
+    """Refuse a film of a vorticity that hardly a node has in any frame."""
+    most = 0
     for frame in frames:
-        if np.isfinite(recording.scene(frame).vorticity).any():
-            return
+        count = int(np.isfinite(recording.scene(frame).vorticity).sum())
+        most = max(most, count)
+    if most >= FEW_NODES:
+        return
     raise UsageError(
         "there is no vorticity to show: material is too thin for the grid",
         where="--kind",
-        expected="speed or material",
-        got=str(Panel.VORTICITY),
+        expected=f"{FEW_NODES} nodes of the grid with a vorticity; or speed or "
+        "material, which need no grid",
+        got=f"vorticity, which at most {format_count(most, 'node')} of a frame has",
         fix="leave --kind out",
     )
 

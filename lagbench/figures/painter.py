@@ -20,7 +20,7 @@ from .canvas import (
 )
 from .colours import MATERIAL_COLOURS, PAPER, parse_rgb
 from .panels import Panel, box_of, draw_cube, draw_walls
-from .particles import DOT_DIAMETER, paint_particles
+from .particles import DOT_DIAMETER, DOT_DIAMETER_SOLID, paint_particles
 from .recording import Recording, Scene
 from .solid import View, shade
 
@@ -92,8 +92,9 @@ class Painter:
         if recording.is_solid and panel is not Panel.VORTICITY:
             self._view = View(recording.size.box)
             scale = self._view.scale
+        dot_diameter = DOT_DIAMETER_SOLID if recording.is_solid else DOT_DIAMETER
         spacing = recording.spacing * scale
-        self._diameter = DOT_DIAMETER * spacing * self._side  # [pixel]
+        self._diameter = dot_diameter * spacing * self._side  # [pixel]
         self._walls_by_direction: dict[bytes, Packed] = {}
 
         material_colours = [parse_rgb(colour) for colour in MATERIAL_COLOURS]

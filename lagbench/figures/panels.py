@@ -17,7 +17,7 @@ from lagbench.data import MATERIALS
 
 from .canvas import build_speed_map, build_vorticity_map
 from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL
-from .particles import DOT_DIAMETER
+from .particles import DOT_DIAMETER, DOT_DIAMETER_SOLID
 from .recording import Recording, Scene
 from .solid import SLICE, View, shade
 
@@ -90,7 +90,8 @@ def name_slice(scene: Scene) -> str:
 MOST_DOTS = 1 << 16
 POINTS_PER_INCH = 72.0
 
-# nodes with neighbours to differentiate over, below which no streamline is drawn
+# nodes with neighbours to differentiate over, below which no field is drawn: a node or
+# two say nothing of a flow
 FEW_NODES = 4
 
 # places of the arrowheads on a moving wall, as shares of its length from its middle
@@ -289,18 +290,23 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) ->
     position = scene.position[::step]
     colours = colours[::step]
     scale = 1.0
+    dot_diameter = DOT_DIAMETER
     if recording.is_solid:
+        dot_diameter = DOT_DIAMETER_SOLID
         place, depth, scale = _project(recording, position, panel)
         order = np.argsort(-depth, kind="stable")
         rgb = to_rgba_array(colours)[order, :3]
         colours = shade(rgb, depth[order], np.ones(3))
         position = place[order]
     x, y = position.T
-    length = DOT_DIAMETER * recording.spacing * scale
+    length = dot_diameter * recording.spacing * scale
     diameter = length * POINTS_PER_INCH * _side_of(axes)  # [point]
     area = step * float(diameter**2)  # [point^2]
     dots = axes.scatter(x, y, area, colours, linewidths=0, zorder=2)
-    if not recording.is_solid:
+    if panel in VIEWS:
+        plane = (0, 2) if panel is Panel.ABOVE else (0, 1)
+        dots.set_clip_path(_box_patch(axes, recording, plane))
+    elif not recording.is_solid:
         dots.set_clip_path(_box_patch(axes, recording))
 
 
@@ -334,9 +340,11 @@ def _project(
     return place, depth, 1.0
 
 
-def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
+def _box_patch(
+    axes: Axes, recording: Recording, plane: tuple[int, int] = (0, 1)
+) -> Rectangle:
     """Return the inside of the box, to cut drawings off at the walls."""
-    left, right, bottom, top = box_of(recording)
+    left, right, bottom, top = box_of(recording, plane)
     place = (left, bottom, right - left, top - bottom)
     rectangle = _rectangle(place)
     rectangle.set_transform(axes.transData)
@@ -346,8 +354,13 @@ def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
 def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) -> None:
     """Draw a square for the value at each node, cut off at the walls.
 
-    NaN stays paper.
+    NaN stays paper. Where few nodes have a value, the panel says so instead.
     """
+    if np.isfinite(field).sum() < FEW_NODES:
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        size = POINTS_PER_INCH * _side_of(axes) / 24.0  # a line has about 24 letters
+        axes.text(0.5, 0.5, TOO_THIN, color=MUTED, fontsize=min(9.0, size), ha="center")
+        return
     grid = scene.fields.grid
     half_spacing = grid.spacing / 2
     extent = []
@@ -365,9 +378,6 @@ def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) 
     )
     image.set_clip_path(_box_patch(axes, scene.recording))
     axes.set(xlim=(0, 1), ylim=(0, 1))
-    if not np.isfinite(field).any():
-        size = POINTS_PER_INCH * _side_of(axes) / 24.0  # a line has about 24 letters
-        axes.text(0.5, 0.5, TOO_THIN, color=MUTED, fontsize=min(9.0, size), ha="center")
 
 
 def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 # diameter of a drawn particle in particle spacings: neighbours overlap a little
 DOT_DIAMETER = 1.25
+# the same of a cube: smaller dots leave what is behind them visible
+DOT_DIAMETER_SOLID = 0.75
 
 Pixel = TypeVar("Pixel", bound=np.generic)
 

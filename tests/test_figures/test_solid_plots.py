@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from rotating_disc import write_swirl
 
 from lagbench.errors import UsageError
 from lagbench.figures.animate import Film
-from lagbench.figures.panels import Panel, limit_of
+from lagbench.figures.panels import FEW_NODES, Panel, limit_of
 from lagbench.figures.plot import KINDS, choose_moments, plot_frame
 from lagbench.figures.recording import Recording, open_recording
 
@@ -65,6 +66,8 @@ BEHIND = fill((0.2, 0.2, 0.6), (0.5, 0.5, 0.85))  # the middle of the box
 BLOCK = liquid(BEHIND)
 ON_THE_FLOOR = fill((0.2, BOTTOM, 0.2), (0.8, BOTTOM + 0.03, 0.8))
 FILM = liquid(ON_THE_FLOOR)
+DROP = liquid(fill((0.4, 0.4, 0.4), (0.58, 0.58, 0.58)))
+"""So small that one node of the grid has a vorticity."""
 
 
 @pytest.fixture
@@ -125,6 +128,39 @@ def test_a_film_without_any_vorticity_is_refused() -> None:
     with open_recording(FILM) as recording, pytest.raises(UsageError) as caught:
         Film([recording], Panel.VORTICITY)
     assert caught.value.where == "--kind"
+
+
+def test_one_node_is_no_slice(texts: list[Text]) -> None:
+    """A picture says so, and a film is refused, though a node has a vorticity."""
+    with open_recording(DROP) as recording:
+        scene = recording.scene(2)
+        node_count = np.isfinite(scene.vorticity).sum()
+        assert 1 <= node_count < FEW_NODES
+        with pytest.raises(UsageError) as caught:
+            Film([recording], Panel.VORTICITY)
+    assert caught.value.where == "--kind"
+    plot_frame(DROP, 2, "drop.png", kind=Panel.VORTICITY)
+    assert is_told("too thin", texts)
+
+
+def dots_of(drawn: Figure) -> list[PathCollection]:
+    return [dots for dots in drawn.findobj(PathCollection) if len(dots.get_offsets())]
+
+
+def test_dots_of_a_cube_leave_what_is_behind_them_visible(texts: list[Text]) -> None:
+    """Dots are smaller than the spacing of particles, and end at the walls."""
+    plot_frame(BLOCK, 2, "dots.png")
+    drawn = texts[0].get_figure()
+    panels = dots_of(drawn)
+    assert len(panels) == 3
+    with open_recording(BLOCK) as recording:
+        spacing = recording.spacing
+    for number, dots in enumerate(panels):
+        side = dots.axes.get_position().width * drawn.get_figwidth()  # [inch]
+        diameter = np.sqrt(dots.get_sizes()[0]) / (72.0 * side)  # [length]
+        assert 0.3 * spacing < diameter < spacing
+        ends_at_walls = dots.get_clip_box().width < dots.axes.bbox.width
+        assert ends_at_walls == (number > 0)
 
 
 def layers_of(recording: Recording) -> set[int | None]:
