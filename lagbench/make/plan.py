@@ -41,13 +41,30 @@ COUNT = Limit(low=1, high=1 << 60, whole=True)  # particle substeps, and frames
 # time over that of the reference machine, one core of an EPYC server
 RATIO = Limit(low=1e-3, high=1e4)
 
-# Of the reference machine [s]: one particle's substep
-# (benchmarks/test_solver_throughput.py); starting the kernels, reading out, checking
-# and writing one frame of mini; starting a worker, which imports Taichi and compiles
-# the solver, about half the next time.
-SECONDS_PER_PARTICLE_SUBSTEP = 45e-9
+# starting the kernels, reading out, checking and writing one frame of mini on the
+# reference machine [s]
 SECONDS_PER_FRAME = 2.3e-3
-SECONDS_TO_START = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverCost:
+    """What a kind of solver takes on the reference machine."""
+
+    # a worker that starts: it imports Taichi and compiles the solver, which takes a
+    # third of that the next time [s]
+    start: float
+    particle_substep: float  # one particle's substep [s]
+
+
+# benchmarks/test_solver_throughput.py and periodic_cube.py measure the substeps
+SOLVER_COSTS = {
+    "closed_box": SolverCost(start=8.0, particle_substep=45e-9),
+    "free_surface": SolverCost(start=5.0, particle_substep=45e-9),
+    "free_surface_3d": SolverCost(start=15.0, particle_substep=95e-9),
+    "full_box_2d": SolverCost(start=5.0, particle_substep=45e-9),
+    "full_box_3d": SolverCost(start=10.0, particle_substep=95e-9),
+}
+"""Kinds of solvers, whose pace a machine notes."""
 
 Selection = str | Sequence[str] | None
 Scenarios = str | Iterable[int] | None
@@ -127,6 +144,8 @@ class Estimate:
     bytes: int
     # time on one core, perturbed runs of test scenarios included [s], for orientation
     core_seconds: float
+    # time in which a worker starts and compiles the solver [s]
+    start_seconds: float
     measured: bool  # whether at a rate that this machine has measured
 
     def seconds(self, workers: int) -> float:
@@ -136,7 +155,7 @@ class Estimate:
         if not self.substeps:
             return 0.0
         longest = self.core_seconds * max(self.substeps) / sum(self.substeps)
-        return SECONDS_TO_START + max(self.core_seconds / workers, longest)
+        return self.start_seconds + max(self.core_seconds / workers, longest)
 
 
 def estimate(
@@ -175,13 +194,17 @@ def estimate(
     ratio = None
     if on_cores:
         ratio = measured_ratio(size)
-    seconds = reference_seconds(total_substeps * size.particles, total_frames)
+    kind = _solver_kind(size)
+    seconds = reference_seconds(
+        total_substeps * size.particles, total_frames, kind=kind
+    )
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
         bytes=sum(map(size.file_bytes, scenarios)),
         core_seconds=(ratio or 1.0) * seconds,
+        start_seconds=SOLVER_COSTS[kind].start,
         measured=ratio is not None,
     )
 
@@ -223,16 +246,18 @@ def check_disk(root: Path, needed: int) -> None:
         )
 
 
-def reference_seconds(particle_substeps: int, frames: int) -> float:
-    """Return about what one core of the reference machine takes [s]."""
-    return particle_substeps * SECONDS_PER_PARTICLE_SUBSTEP + frames * SECONDS_PER_FRAME
+def reference_seconds(particle_substeps: int, frames: int, *, kind: str) -> float:
+    """Return about what one core of the reference machine takes with a solver [s]."""
+    substep = SOLVER_COSTS[kind].particle_substep
+    return particle_substeps * substep + frames * SECONDS_PER_FRAME
 
 
 def measured_ratio(size: Size) -> float | None:
     """Return what this machine took over the reference machine; None where it never
     timed that solver.
     """
-    rows = _read_rates().get(_solver_kind(size))
+    kind = _solver_kind(size)
+    rows = _read_rates().get(kind)
     if not rows:
         return None
 
@@ -241,7 +266,7 @@ def measured_ratio(size: Size) -> float | None:
         return abs(math.log(particles / size.particles))
 
     seconds, particle_substeps, frames = rows[min(rows, key=distance)]
-    return seconds / reference_seconds(particle_substeps, frames)
+    return seconds / reference_seconds(particle_substeps, frames, kind=kind)
 
 
 def note_pace(size: Size, paces: Sequence[SimulationPace]) -> None:
@@ -275,10 +300,6 @@ def _rates_path() -> Path:
     return cache_folder("rates") / "rates.json"
 
 
-SOLVER_KINDS = ("closed_box", "free_surface", "full_box_2d", "full_box_3d")
-"""Solvers whose pace a machine notes."""
-
-
 def _solver_kind(size: Size) -> str:
     """Return which of the solvers a size is simulated with."""
     constants = solver_constants(size)
@@ -286,6 +307,8 @@ def _solver_kind(size: Size) -> str:
         return f"full_box_{constants.box.dimension}d"
     if isinstance(constants, ClosedBoxParameters):
         return "closed_box"
+    if size.dimension == 3:
+        return "free_surface_3d"
     return "free_surface"
 
 
@@ -302,12 +325,15 @@ def _read_rates() -> dict[str, dict[int, RateRow]]:
         document = json.loads(data)
         if document["machine"] != platform.node():
             return {}
-        return {kind: _parse_rows(document.get(kind, {})) for kind in SOLVER_KINDS}
+        rates = {}
+        for kind in SOLVER_COSTS:
+            rates[kind] = _parse_rows(document.get(kind, {}), kind=kind)
+        return rates
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
 
 
-def _parse_rows(rows: Mapping[str, Any]) -> dict[int, RateRow]:
+def _parse_rows(rows: Mapping[str, Any], *, kind: str) -> dict[int, RateRow]:
     """Return the rows of one kind of solver; a rate that no machine has is a
     ValueError.
     """
@@ -318,8 +344,10 @@ def _parse_rows(rows: Mapping[str, Any]) -> dict[int, RateRow]:
             and COUNT.holds(particle_substeps)
             and COUNT.holds(frames)
             and SECONDS.holds(seconds)
-            and RATIO.holds(seconds / reference_seconds(particle_substeps, frames))
         )
+        if is_possible:
+            expected = reference_seconds(particle_substeps, frames, kind=kind)
+            is_possible = RATIO.holds(seconds / expected)
         if not is_possible:
             msg = f"no possible rate: {seconds} s, {particle_substeps}, {frames}"
             raise ValueError(msg)

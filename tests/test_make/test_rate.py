@@ -45,7 +45,7 @@ def noted(cache: Path, **kinds: Any) -> None:
 
 
 WORK = (1_000_000, 100)
-PLAIN = reference_seconds(*WORK)
+PLAIN = reference_seconds(*WORK, kind="free_surface")
 GOOD = {"256": [2 * PLAIN, *WORK]}
 
 
@@ -97,7 +97,7 @@ def test_perturbed_runs_of_test_scenarios_are_counted() -> None:
         frames += size.task.input_frames + size.task.horizon
     assert perturbed < plain
     particle_substeps = (plain + perturbed) * size.particles
-    expected = reference_seconds(particle_substeps, frames)
+    expected = reference_seconds(particle_substeps, frames, kind="closed_box")
     seconds = estimate(size, test).core_seconds
     assert seconds == pytest.approx(expected)
 
