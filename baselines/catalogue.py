@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning, list_entry_points
+from lagbench.data.registry import PluginWarning, list_entry_points, package_of
 from lagbench.errors import (
     LagbenchError,
     UsageError,
@@ -70,7 +70,7 @@ def find(name: str) -> CatalogueEntry:
     except Exception as error:  # importing a stranger's module may raise anything
         raise UsageError(
             f"the baseline {name!r} cannot be loaded",
-            where=_package_name(points[name]),
+            where=package_of(points[name]),
             got=_describe_error(error),
             fix="mend or uninstall that package",
         ) from error
@@ -106,7 +106,7 @@ def _is_foreign(point: EntryPoint) -> bool:
 
 
 def _warn_of_point(point: EntryPoint, reason: str) -> None:
-    package = _package_name(point)
+    package = package_of(point)
     message = f"package {package} adds no baseline {point.name!r}: {reason}"
     warnings.warn(message, PluginWarning, stacklevel=4)
 
@@ -159,12 +159,6 @@ def _find_recipes(model: type, name: str) -> Path | None:
         return path
     owner = next(base for base in model.__mro__ if "recipes" in vars(base))
     return Path(inspect.getfile(owner)).parent / path
-
-
-def _package_name(point: EntryPoint) -> str:
-    if point.dist:
-        return point.dist.name
-    return point.value.partition(".")[0]
 
 
 def _describe_error(error: Exception) -> str:

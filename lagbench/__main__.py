@@ -322,7 +322,8 @@ def _short_warnings() -> Iterator[None]:
             **more: Any,  # noqa: ANN401
         ) -> None:
             if category.__module__.startswith("lagbench."):
-                typer.echo(f"warning: {message}", err=True)
+                text = escape_unprintable(str(message))
+                typer.echo(f"warning: {text}", err=True)
             else:
                 show_in_full(message, category, *place, **more)
 

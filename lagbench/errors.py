@@ -15,8 +15,11 @@ import difflib
 import importlib
 import importlib.util
 import stat
+import sys
+import threading
 import traceback
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
 
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
+
+PATIENCE = 20.0
+"""Time that the import of a package's module may take before a line names it [s]."""
 
 
 class LagbenchError(Exception):
@@ -268,16 +274,35 @@ def find_place_in_extension(error: BaseException) -> str | None:
     return place
 
 
-def load_entry_point(point: EntryPoint) -> Any:  # noqa: ANN401 (any object)
+def load_entry_point(
+    point: EntryPoint,
+    *,
+    patience: float = PATIENCE,
+) -> Any:  # noqa: ANN401 (any object)
     """Import the object that an entry point of another package names.
+
+    A line on stderr names the module where that takes longer than ``patience`` [s].
 
     Raises:
         ImportError: its module would end the program. Others raise what they like.
     """
+    note = f"lagbench: still waiting for {point.value}, which another package adds\n"
+    timer = threading.Timer(patience, _write_note, (note,))
+    timer.daemon = True
+    timer.start()
     try:
         return point.load()
     except SystemExit as error:
         raise ImportError(f"its module would end the program: {error!r}") from error
+    finally:
+        timer.cancel()
+
+
+def _write_note(note: str) -> None:
+    """Write a line on stderr, where there is one."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            sys.stderr.write(note)
 
 
 def require(module: str, *, extra: str) -> ModuleType:

@@ -63,7 +63,15 @@ GROUP = "lagbench.generators"
 
 
 class PluginWarning(UserWarning):
-    """A package cannot add its split; all other splits are there."""
+    """A package cannot add its split, baseline or metric; all others are there."""
+
+
+def package_of(point: EntryPoint) -> str:
+    """Return the name of the package that an entry point belongs to."""
+    if point.dist:
+        return point.dist.name
+    module = point.value.partition(":")[0]
+    return module.partition(".")[0]
 
 
 def list_entry_points(group: str) -> tuple[EntryPoint, ...]:
@@ -600,9 +608,7 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
 
 
 def _describe_plugin_error(point: EntryPoint, error: Exception) -> str:
-    package = point.value.partition(".")[0]
-    if point.dist:
-        package = point.dist.name
+    package = package_of(point)
     reason = str(error)
     if not isinstance(error, LagbenchError):
         reason = f"{type(error).__name__}: {error}"

@@ -6,12 +6,18 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
 from lagbench.data.grid import Placement
-from lagbench.data.registry import Size, list_entry_points
+from lagbench.data.registry import (
+    PluginWarning,
+    Size,
+    list_entry_points,
+    package_of,
+)
 from lagbench.errors import (
     LagbenchError,
     UsageError,
@@ -90,65 +96,62 @@ def ranking_metric(size: Size) -> str:
 def available() -> dict[str, Metric]:
     """Return all metrics by name, those of other installed packages last.
 
-    Raises:
-        UsageError: a package's metrics cannot be loaded, have the name of another
-            metric, or follow from statistics that no metric measures.
+    A package whose metrics cannot be loaded, have the name of another metric, or follow
+    from statistics that no metric measures costs these metrics, and a
+    :class:`~lagbench.data.registry.PluginWarning` that names it.
     """
     metrics = dict(METRICS)
+    point_of: dict[str, EntryPoint] = {}  # of metrics of other packages, by name
     for point in sorted(list_entry_points(GROUP), key=lambda point: point.name):
         if point.value.startswith(f"{__package__}."):
             continue  # METRICS holds ours, whatever version of lagbench is installed
-        for metric in _load(point):
-            if metrics.setdefault(metric.name, metric) is not metric:
-                raise UsageError(
-                    f"two metrics are named {metric.name!r}",
-                    where=f"entry point {point.name} = {point.value}",
-                    fix="rename one, or uninstall its package",
-                )
+        try:
+            loaded_metrics = _load(point)
+        except Exception as error:  # importing a stranger's module may raise anything
+            _warn_of_package(point, _describe(error))
+            continue
+        for metric in loaded_metrics:
+            if metrics.setdefault(metric.name, metric) is metric:
+                point_of[metric.name] = point
+            else:
+                _warn_of_package(point, f"the name {metric.name!r} is taken")
 
     statistics = set()
     for name, metric in metrics.items():
         if metric.statistic is not None:
             statistics.add(name)
-    for metric in metrics.values():
-        missing = sorted(set(metric.of) - statistics)
+    for name, point in point_of.items():
+        missing = sorted(set(metrics[name].of) - statistics)
         if missing:
-            raise UsageError(
-                f"metric {metric.name!r} follows from statistics that no metric "
-                f"measures",
-                expected="names of metrics that have a statistic",
-                got=", ".join(missing),
-                fix="mend or uninstall the package that adds it",
+            reason = (
+                f"{name!r} follows from {', '.join(missing)}, which no metric measures"
             )
+            _warn_of_package(point, reason)
+            del metrics[name]
     return metrics
+
+
+def _warn_of_package(point: EntryPoint, reason: str) -> None:
+    message = (
+        f"package {package_of(point)} adds no metric {point.name!r} ({point.value}): "
+        f"{reason}"
+    )
+    warnings.warn(message, PluginWarning, stacklevel=3)
 
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
     """Return the metrics of an entry point of another package."""
-    where = f"entry point {point.name} = {point.value}"
-    metrics: tuple[object, ...]
-    try:
-        value = load_entry_point(point)
-        if isinstance(value, Iterable):
-            metrics = tuple(value)
-        else:
-            metrics = (value,)
-    except Exception as error:  # importing another package's module may raise anything
-        raise UsageError(
-            "a package's metrics cannot be loaded",
-            where=where,
-            got=_describe(error),
-            fix="mend or uninstall that package",
-        ) from error
+    value = load_entry_point(point)
+    metrics: tuple[object, ...] = (value,)
+    if isinstance(value, Iterable):
+        metrics = tuple(value)
 
     checked = []
     for metric in metrics:
         if not isinstance(metric, Metric):
             raise UsageError(
-                "an entry point has something that is no metric",
-                where=where,
+                f"it has a {type(metric).__name__}, which is no metric",
                 expected="a lagbench.metrics.Metric or a sequence of them",
-                got=type(metric).__name__,
             )
         checked.append(metric)
     return checked

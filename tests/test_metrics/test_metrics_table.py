@@ -22,7 +22,8 @@ from metric_flows import CONFIG, Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from lagbench.data.grid import Grid, Placement
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.data.registry import PluginWarning
+from lagbench.errors import UsageError, WorkFailedError, load_entry_point
 from lagbench.metrics import (
     FAMILIES,
     METRICS,
@@ -451,11 +452,11 @@ def test_our_metrics_are_registered_as_those_of_others_are(
         "leaving:METRICS",
     ],
 )
-def test_a_bad_entry_point_is_named(
+def test_a_bad_entry_point_is_left_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
 ) -> None:
-    """A taken name, no metric, or one of statistics that nothing measures: refused, and
-    said where it is.
+    """A taken name, no metric, or one of statistics that nothing measures: one warning
+    names the package, and the other metrics are there.
 
     A module that would end the program, with exit code 0 and nothing done, is told
     likewise.
@@ -464,10 +465,24 @@ def test_a_bad_entry_point_is_named(
     monkeypatch.syspath_prepend(tmp_path)
     value = name if ":" in name else f"{__name__}:{name}"
     with_entry_point(monkeypatch, value)
-    with pytest.raises(UsageError) as caught:
-        available()
-    if ":" in name:
-        assert caught.value.where == f"entry point others = {name}"
+    package = value.partition(":")[0].split(".")[0]
+    with pytest.warns(PluginWarning, match=f"package {package} ") as warnings:
+        metrics = available()
+    assert len(warnings) == 1
+    assert value in str(warnings[0].message)
+    assert metrics == dict(METRICS)
+
+
+def test_a_module_that_sleeps_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sleeping.py").write_text("import time\ntime.sleep(0.5)\nVALUE = 3\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    point = EntryPoint(name="slow", value="sleeping:VALUE", group=table_module.GROUP)
+    assert load_entry_point(point, patience=0.05) == 3
+    assert "sleeping:VALUE" in capsys.readouterr().err
+    assert load_entry_point(point) == 3
+    assert capsys.readouterr().err == ""
 
 
 def test_selection_brings_what_a_metric_follows_from() -> None:
