@@ -42,6 +42,9 @@ HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")
 
+LONGEST_SHOWN = 200  # of an address in a message
+
+STORE_HINT = "name a store: --from URL, --root URL, or LAGBENCH_RELEASES=URL"
 ADDRESS_HINT = (
     "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: "
     "it goes on"
@@ -144,10 +147,10 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
         raise UsageError(
             "not the address of a store",
-            where=url,
+            where=_short_address(url),
             expected="http://host/path",
             got=str(error),
-            fix="name a store: --from URL or --root URL",
+            fix=STORE_HINT,
         ) from error
     except (OSError, http.client.HTTPException) as error:
         unreachable = StoreUnreachableError(
@@ -181,9 +184,21 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
     )
 
 
+def _short_address(url: str) -> str:
+    """Return an address for a message: its beginning, without user and password."""
+    scheme, mark, rest = url.partition("://")
+    host, slash, path = rest.partition("/")
+    shown = f"{scheme}{mark}{host.rpartition('@')[2]}{slash}{path}"
+    return shown[:LONGEST_SHOWN]
+
+
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
     parts = urllib.parse.urlsplit(url)
+    if "@" in parts.netloc:
+        # the message and the manifest would show it
+        msg = "a user or a password before its host"
+        raise ValueError(msg)
     _check_host(parts.hostname)
     path = urllib.parse.quote(parts.path, safe=string.punctuation)
     query = urllib.parse.quote(parts.query, safe=string.punctuation)
@@ -425,10 +440,11 @@ def _file_system(url: str) -> tuple[Any, str]:
     if scheme not in fsspec.available_protocols():
         raise UsageError(
             "no such kind of address",
-            where=url,
+            where=_short_address(url),
             expected="s3://bucket/prefix, or another that fsspec knows; "
             "file:///path for a folder",
-            got=scheme,
+            got=ascii(scheme[:LONGEST_SHOWN]),
+            fix=STORE_HINT,
         )
     # Another endpoint or other credentials are another system, also within one process.
     settings = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import shutil
@@ -210,6 +211,47 @@ def test_without_a_release_no_server_is_asked(
     assert caught.value.where == f"{SPLIT} {SIZE}"
     assert addresses.SETTINGS in str(caught.value.got)
     assert archive.RELEASES_VARIABLE in str(caught.value.fix)
+
+
+@pytest.mark.parametrize(
+    "releases",
+    [
+        " ",
+        "nonsense",
+        "/etc",
+        "http://",
+        "http://0x7f.1/",
+        "http://user:secret@localhost/",
+        "javascript:alert(1)",
+        "data:,hello",
+        "zip::http://localhost/a.zip",
+        "simplecache::file:///etc",
+        "x" * 5000,
+    ],
+)
+def test_an_address_of_releases_that_is_none_is_told(
+    releases: str, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message has all parts, no password, and no megabyte of what was set."""
+    monkeypatch.setenv(archive.RELEASES_VARIABLE, releases)
+    with pytest.raises(UsageError) as caught:
+        download(SPLIT, SIZE, root=here, or_generate=False)
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+    assert "secret" not in str(error)
+    assert len(str(error)) < 1000
+    assert not list(here.rglob("*.nc"))
+
+
+def test_a_compressed_archive_is_not_unpacked(
+    server: Mirror, packed: Path, here: Path
+) -> None:
+    """A bomb of zeros has no header where the first member must stand."""
+    bomb = gzip.compress(bytes(100_000_000))
+    (server.folder / packed.name).write_bytes(bomb)
+    with pytest.raises(objects.NotDataError):
+        fetch_own(server.url, here)
+    assert not list(here.rglob("*.nc"))
 
 
 def test_no_server_is_asked_for_a_local_split(
