@@ -20,9 +20,9 @@ def compare_command(
         str,
         typer.Argument(
             metavar="A",
-            help="scores.json, scores.nc, predictions.nc, or a folder of a method's "
-            "scores, of one or of several seeds; or an entry of the leaderboard, as in "
-            "cavity/mini/gns.",
+            help="A predictions.nc, scores.json or scores.nc; or a folder of the "
+            "scores of one method, with one or several seeds; or an entry of the "
+            "leaderboard, as in cavity/mini/gns.",
         ),
     ],
     second: Annotated[

@@ -43,7 +43,7 @@ def download_command(
         bool,
         option(
             "--or-generate/--no-generate",
-            "Simulate the scenarios that no store has, or stop there.",
+            "Simulate the scenarios that no store has, or end with an error instead.",
         ),
     ] = True,
     workers: WorkersOption = None,

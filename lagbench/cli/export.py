@@ -39,8 +39,8 @@ def export_command(
         bool | None,
         option(
             "--from-walls/--unit-box",
-            "lagrangebench-h5: measure positions from the lower walls, as is the "
-            "default for full boxes.",
+            "For lagrangebench-h5: measure positions from the lower walls; the default "
+            "for full boxes.",
         ),
     ] = None,
     wall_particles: Annotated[

@@ -274,8 +274,12 @@ def reproduce_command(
 ) -> None:
     """Run the models of entries again, compare scores, measure costs.
 
-    Exit code 0: all scores agree; 1: some differ; 2: no such entry, or one without a
-    model; 3: a model cannot be read; 4: data are missing; 5: out of memory or disk.
+    Exit code 0: all scores agree
+    1: some differ
+    2: no such entry, or one without a model
+    3: a model cannot be read
+    4: data are missing
+    5: out of memory or disk
     """
     if bool(entries) == every:
         raise UsageError(
@@ -381,8 +385,11 @@ def shift_command(
 
     The subset is predicted anew; the result is written to shift.yaml.
 
-    Exit code 0: all models ran; 2: no such entry, or one without a model; 3: a model
-    cannot be read; 4: data are missing; 5: out of memory or disk.
+    Exit code 0: all models ran
+    2: no such entry, or one without a model
+    3: a model cannot be read
+    4: data are missing
+    5: out of memory or disk
     """
     if bool(entries) == every:
         raise UsageError(

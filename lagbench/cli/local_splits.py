@@ -41,7 +41,11 @@ IntervalOption = Annotated[
     float | None, option("--frame-interval SECONDS", "Time between two frames.")
 ]
 BoundsOption = Annotated[
-    str | None, option("--bounds X0,X1,Y0,Y1[,Z0,Z1]", "Ends of the box.")
+    str | None,
+    option(
+        "--bounds X0,X1,Y0,Y1[,Z0,Z1]",
+        "Lowest and highest position of the box along each axis.",
+    ),
 ]
 PeriodicOption = Annotated[
     str | None,
@@ -56,11 +60,15 @@ InputFramesOption = Annotated[
     option("--input-frames N", "Frames that a model is given; 6 by default."),
 ]
 HorizonOption = Annotated[
-    int | None, option("--horizon N", "Frames to predict; all others by default.")
+    int | None,
+    option("--horizon N", "Frames to predict; by default all after the given ones."),
 ]
 InterestOption = Annotated[
     str | None,
-    option("--frames-of-interest FRAMES", "As in 15,25; the last one by default."),
+    option(
+        "--frames-of-interest FRAMES",
+        "Frames whose scores are shown, as in 15,25; by default the last one.",
+    ),
 ]
 CellsOption = Annotated[
     int | None, option("--cells N", "Cells of the score grid along an axis.")
@@ -125,7 +133,7 @@ def adopt_command(
     sources: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them."
+            metavar="FILE", help=".npy, .npz or .nc files, or a folder of them."
         ),
     ],
     output: AdoptedOutputOption = None,
@@ -138,7 +146,8 @@ def adopt_command(
     test: Annotated[
         int | None,
         option(
-            "--test N", "Trajectories of test; a tenth, but six of many, by default."
+            "--test N",
+            "Trajectories of test; by default a tenth, but six where there are many.",
         ),
     ] = None,
     bounds: BoundsOption = None,

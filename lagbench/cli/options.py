@@ -48,7 +48,8 @@ PresentSizeOption = Annotated[
     str | None,
     option(
         "--size NAME",
-        "tiny, mini or full; by default the only one with data here, of several mini.",
+        "tiny, mini or full; by default the only size with data here, or mini if "
+        "there are several.",
     ),
 ]
 SubsetOption = Annotated[

@@ -33,7 +33,11 @@ WeightsArgument = Annotated[
 ]
 PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]
 OnnxSplitOption = Annotated[
-    str | None, option("--split NAME", "Split to predict: of an ONNX file only.")
+    str | None,
+    option(
+        "--split NAME",
+        "Split to predict; only for an ONNX file, which does not state it.",
+    ),
 ]
 PredictedSizeOption = Annotated[
     str | None,

@@ -38,9 +38,7 @@ from .validate import ExpectedSplitOption
 def score_command(
     predictions: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="FILE...", help="A predictions.nc; several with --report."
-        ),
+        typer.Argument(metavar="FILE", help="A predictions.nc; several with --report."),
     ],
     split: ExpectedSplitOption = None,
     root: RootOption = None,

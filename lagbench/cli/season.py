@@ -85,8 +85,9 @@ def close_command(
 ) -> None:
     """Freeze the models of a leaderboard; the blind seeds follow from them.
 
-    Exit code 0: closed; 1: a model is not the one that its entry names; 2: the season
-    is closed already, or there is no model to freeze.
+    Exit code 0: closed
+    1: a model is not the one that its entry names
+    2: the season is closed already, or there is no model to freeze
     """
     if value is not None and source:
         raise UsageError(
@@ -152,9 +153,14 @@ def run_command(
 ) -> None:
     """Score the frozen models of a season on its blind scenarios.
 
-    An interrupted run goes on where it stopped. Exit code 0: done, or the same scores;
-    1: other scores, or a model is not the frozen one; 2: no such season; 3: a model
-    cannot be read; 4: blind scenarios are missing or others; 5: out of memory or disk.
+    An interrupted run goes on where it stopped.
+
+    Exit code 0: done, or the same scores
+    1: other scores, or a model is not the frozen one
+    2: no such season
+    3: a model cannot be read
+    4: blind scenarios are missing or others
+    5: out of memory or disk
     """
     with progress_bar(quiet=quiet or as_json) as progress:
         result = run_season(

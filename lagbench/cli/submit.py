@@ -30,7 +30,7 @@ from .progress import progress_bar
 def submit_command(
     predictions: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="A predictions.nc for each seed."),
+        typer.Argument(metavar="FILE", help="A predictions.nc for each seed."),
     ],
     source: Annotated[
         Path | None,
