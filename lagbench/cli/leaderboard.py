@@ -238,7 +238,7 @@ def reproduce_command(
     entries: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENTRY]...", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
+            metavar="ENTRY", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
         ),
     ] = None,
     every: Annotated[
@@ -358,7 +358,7 @@ def shift_command(
     entries: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENTRY]...", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
+            metavar="ENTRY", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
         ),
     ] = None,
     every: Annotated[
