@@ -247,12 +247,18 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     force = batch.body_force
     if force is not None:
         force = _mirror_force(force, matrix)
+    obstacle = batch.obstacle
+    if obstacle is not None:
+        from_centre = obstacle[:, :-1] - centre
+        place = _multiply(matrix, from_centre) + centre
+        obstacle = torch.cat([place, obstacle[:, -1:]], dim=1)
     return replace(
         batch,
         position=position,
         wall_velocity=walls,
         origin=origin,
         body_force=force,
+        obstacle=obstacle,
     )
 
 
@@ -309,7 +315,11 @@ def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Bat
     if origin is not None:
         moved = origin + by_particle
         origin = box.wrap(moved)
-    return replace(batch, position=position, origin=origin)
+    obstacle = batch.obstacle
+    if obstacle is not None:
+        place = box.wrap(obstacle[:, :-1] + shift)
+        obstacle = torch.cat([place, obstacle[:, -1:]], dim=1)
+    return replace(batch, position=position, origin=origin, obstacle=obstacle)
 
 
 def wall_permutation(matrix: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from lagbench.data.local import locate
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
@@ -109,6 +110,9 @@ def select_window(batch: Batch, window: int) -> Batch:
     viscosity = batch.viscosity
     if viscosity is not None:
         viscosity = viscosity[row]
+    obstacle = batch.obstacle
+    if obstacle is not None:
+        obstacle = obstacle[row]
     sample = batch.sample[is_inside]
     return Batch(
         position=batch.position[is_inside],
@@ -120,6 +124,7 @@ def select_window(batch: Batch, window: int) -> Batch:
         origin=origin,
         viscosity=viscosity,
         body_force=force,
+        obstacle=obstacle,
     )
 
 
@@ -247,11 +252,15 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
         if "body_force" in file.variables:
             force = file.read("body_force", later_frames)
         scenario = file.header.key.scenario
-        stated = file.header.viscosity
+        header = file.header
+        stated = header.viscosity
+        obstacle = parse_obstacle(
+            header.parameters, position.shape[2], where=f"{header.key}"
+        )
     if stated is not None:
         viscosity = stated
     window = copy_window(list(position), material, walls, scenario, first)
-    window = window._replace(viscosity=viscosity, body_force=force)
+    window = window._replace(viscosity=viscosity, body_force=force, obstacle=obstacle)
     return tensors(window)
 
 

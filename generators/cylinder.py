@@ -173,8 +173,10 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     _check_counts(size, int(is_solid.sum()), len(places))
 
     speed = float(size.value("speed"))
-    way = np.array([uniform(rng, 1.0, 2.0), uniform(rng, -0.5, 0.5)])
-    eddy_radius = uniform(rng, 1.0, 1.5) * diameter
+    # The eddy ends before the disc and the walls: they would stop it at once, and that
+    # compresses the fluid.
+    way = np.array([uniform(rng, 2.0, 2.5), uniform(rng, -0.5, 0.5)])
+    eddy_radius = uniform(rng, 0.75, 1.0) * diameter
     eddy_speed = uniform(rng, 0.5, 1.0) * speed
     if choice(rng, 2):
         eddy_speed = -eddy_speed

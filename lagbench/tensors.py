@@ -106,6 +106,9 @@ class TensorWindow(NamedTuple):
     # first, float32, shape [frame, layer, axis], of these frames and perhaps of later
     # ones; None where no force drives the flow
     body_force: Tensor | None = None
+    # centre and radius of a fixed obstacle [length], float32, shape [axis + 1]; None
+    # without one
+    obstacle: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +135,9 @@ class Batch:
     # first, shape [window, frame, layer, axis]: the forcing as wall_velocity is; None
     # where no force drives the flow
     body_force: Tensor | None = None
+    # centre and radius of each window's fixed obstacle [length], shape [window, axis +
+    # 1]; None without one
+    obstacle: Tensor | None = None
 
     @property
     def windows(self) -> int:
@@ -217,6 +223,7 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
     body_forces = []
     origins = []
     viscosities = []
+    obstacles = []
     lengths = set()
     for window in windows:
         lengths.add(window.position.shape[1])
@@ -228,10 +235,12 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             origins.append(window.origin)
         if window.viscosity is not None:
             viscosities.append(window.viscosity)
+        if window.obstacle is not None:
+            obstacles.append(window.obstacle)
 
     all_or_none = {0, len(windows)}
-    counts = {len(wall_velocities), len(body_forces), len(origins), len(viscosities)}
-    is_uniform = counts <= all_or_none
+    given = (wall_velocities, body_forces, origins, viscosities, obstacles)
+    is_uniform = {len(values) for values in given} <= all_or_none
     if len(lengths) != 1 or not is_uniform:
         raise UsageError(
             "windows do not fit side by side",
@@ -240,7 +249,7 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
             f"with moving walls, {len(body_forces)} with a body force, "
             f"{len(origins)} with their first frame, "
-            f"{len(viscosities)} with a viscosity",
+            f"{len(viscosities)} with a viscosity, {len(obstacles)} with an obstacle",
         )
 
     particle_counts = torch.tensor([len(window.material) for window in windows])
@@ -254,6 +263,7 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         origin=torch.cat(origins) if origins else None,
         viscosity=torch.tensor(viscosities) if viscosities else None,
         body_force=_stack_forcing(body_forces),
+        obstacle=torch.stack(obstacles) if obstacles else None,
     )
 
 

@@ -59,6 +59,9 @@ def tensors(window: ArrayWindow) -> Window:
     body_force = None
     if window.body_force is not None:
         body_force = torch.from_numpy(window.body_force)
+    obstacle = None
+    if window.obstacle is not None:
+        obstacle = torch.from_numpy(window.obstacle)
     origin = None
     if window.origin is not None:
         origin = torch.from_numpy(window.origin)
@@ -71,6 +74,7 @@ def tensors(window: ArrayWindow) -> Window:
         origin=origin,
         viscosity=window.viscosity,
         body_force=body_force,
+        obstacle=obstacle,
     )
 
 

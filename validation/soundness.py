@@ -34,6 +34,7 @@ FULL_BOXES = (
     "poiseuille",
     "curl-noise-3d",
     "cavity-3d",
+    "cylinder",
 )
 SIZES = ("tiny", "mini", "full")
 

@@ -65,6 +65,7 @@ NOT_IN_DEMO = (
     "cavity-3d",
     "fluid-3d",
     "multimaterial-3d",
+    "cylinder",
 )
 """Splits whose kernels the demo would have to compile besides."""
 

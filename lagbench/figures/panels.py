@@ -216,6 +216,8 @@ def draw_walls(
     height = top - bottom
     _fill_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
     _fill_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
+    if recording.obstacle is not None:
+        _draw_disc(axes, recording.obstacle)
 
     # x, y, width and height of the walls at both ends of both axes
     horizontal, vertical = plane
@@ -229,6 +231,16 @@ def draw_walls(
         along_plane = velocity[list(plane)]
         if wall in bands and along_plane.any():
             _draw_moving_wall(axes, bands[wall], along_plane)
+
+
+def _draw_disc(axes: Axes, obstacle: NDArray[np.float32]) -> None:
+    """Draw a fixed disc, given its centre and radius, over fields and under dots."""
+    from matplotlib.patches import Circle
+
+    x, y, radius = obstacle.tolist()
+    disc = Circle((x, y), radius)
+    disc.set(color=MUTED, linewidth=0, zorder=1.5)
+    axes.add_patch(disc)
 
 
 def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:

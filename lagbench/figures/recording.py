@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
 from lagbench.data.local import load_rooted_registry
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
@@ -156,8 +157,19 @@ class Recording:
         self.wall_velocity = np.zeros((frames, 2 * dimension, dimension))
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
+        # centre and radius of a fixed obstacle [length]; None without one
+        self.obstacle = self._obstacle(read, variables)
         self._has_velocity = "velocity" in variables
         self._particle_mass = float(read("particle_mass", slice(None)))
+
+    def _obstacle(self, read: Read, variables: set[str]) -> NDArray[np.float32] | None:
+        """Return centre and radius of the obstacle that a file or data set states."""
+        if "obstacle" in variables:
+            stated = read("obstacle", slice(None))
+            return np.asarray(stated, np.float32)
+        size = self.size
+        where = f"{size.split} {size.name}, scenario {self.scenario}"
+        return parse_obstacle(self.parameters, size.dimension, where=where)
 
     @property
     def particles(self) -> int:

@@ -53,6 +53,12 @@ NOTES: Mapping[str, str] = {
         "given. `body_force` at frame f is what acts from frame f-1 to f: first on the "
         "lower half, then on the upper one."
     ),
+    "cylinder": (
+        "The disc stands at (`obstacle_x`, `obstacle_y`) and has the diameter "
+        "`obstacle_diameter`: attributes of each file, part of what is given, as are "
+        "the speed of the stream and the fringe. Files hold the particles of the fluid "
+        "only; none of them enters the disc."
+    ),
     "curl-noise": (
         "Energy only decays: the higher the frequency, the faster. The equations have "
         "no viscosity, the grid "

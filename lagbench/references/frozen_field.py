@@ -4,9 +4,9 @@ With u the field of that frame, known at the middle of each particle's last step
 
     x(f+1) = x(f) + a^k u(x(f) + a^k u(x(f)) / 2),    k = f - n + 2 with n given frames,
 
-a midpoint step. a is 1 where walls or a force drive the flow; elsewhere ``ln a`` is the
-slope of a line through the logarithms of the RMS speed of the given frames, at most 0.
-What is nearly steady needs no model: this predictor shows it.
+a midpoint step. a is 1 where walls, a force or a stream drive the flow; elsewhere ``ln
+a`` is the slope of a line through the logarithms of the RMS speed of the given frames,
+at most 0. What is nearly steady needs no model: this predictor shows it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def predict(given: Given) -> Prediction:
     wall = given.walls[given.size.task.input_frames - 1]
     field = velocity_field(*with_wall_images(given, given.middle, given.step, wall))
     factor = 1.0
-    if given.driven or given.body_force is not None:
+    has_stream = given.obstacle is not None
+    if given.driven or given.body_force is not None or has_stream:
         rate = 1.0
     else:
         rate = decay(given.position, given.box)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
+from lagbench.data.obstacle import keep_outside, parse_obstacle
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 
@@ -129,9 +130,24 @@ class Given:
         """Whether a wall ever moves; such walls hold the fluid, others let it slide."""
         return bool(self.walls.any())
 
+    @cached_property
+    def obstacle(self) -> NDArray[np.float32] | None:
+        """Centre and radius of the fixed obstacle [length]; None without one.
+
+        The shape is [axis + 1].
+        """
+        where = f"{self.size.split} {self.size.name}"
+        return parse_obstacle(self.parameters, self.box.dimension, where=where)
+
     def inside(self, position: Floats) -> Floats:
-        """Return positions, those beyond a wall put on it, shape [particle, axis]."""
-        return self.box.inside(position)
+        """Return positions, those beyond a wall or in the obstacle put on it.
+
+        The shape is [particle, axis].
+        """
+        inside = self.box.inside(position)
+        if self.obstacle is None:
+            return inside
+        return keep_outside(inside, self.obstacle)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from .predictor import (
     Floats,
     Given,
@@ -22,7 +24,7 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
 )
-from .staggered import StaggeredGrid
+from .staggered import Forcing, StaggeredGrid
 
 RESOLUTIONS = {"projection": 1, "projection-2x": 2, "projection-3x": 3}
 """Cells of each solver over those of the score grid, along each axis."""
@@ -32,6 +34,21 @@ def cell_counts(given: Given, resolution: float) -> tuple[int, ...]:
     """Return the cells along each axis of the box, shape [axis]."""
     density = resolution * given.size.task.score_grid.cells
     return tuple(max(4, round(density * length)) for length in given.box.lengths)
+
+
+def forcing_of(given: Given) -> Forcing | None:
+    """Return the fixed body and the fringe that the scenario's file states, if any."""
+    size = given.size
+    if given.obstacle is None or "fringe_rate" not in size.parameters:
+        return None
+    stream = np.zeros(given.box.dimension)
+    stream[0] = float(size.value("speed"))
+    return Forcing(
+        obstacle=given.obstacle,
+        fringe_length=float(size.value("fringe_length")),
+        fringe_rate=float(size.value("fringe_rate")),
+        stream=stream,
+    )
 
 
 def predict(given: Given, resolution: float) -> Prediction:
@@ -48,6 +65,7 @@ def predict(given: Given, resolution: float) -> Prediction:
         given.box,
         cells=cell_counts(given, resolution),
         no_slip=given.driven,
+        forcing=forcing_of(given),
     )
     first = given.predicted_frames[0]
     forces: Sequence[Floats | None] = [None] * len(walls)
@@ -79,6 +97,8 @@ def predict(given: Given, resolution: float) -> Prediction:
             duration=interval,
             wall_velocity=walls[frame],
         )
+        if given.obstacle is not None:
+            position = given.inside(position)
         field = later
         yield position.astype("float32")
 

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import xarray as xr
 
 from lagbench.data import registry
+from lagbench.data.box import AXES
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.scenario import damage_error, parse_viscosity
 from lagbench.errors import DataError
 
@@ -83,8 +85,10 @@ def open_split(
         a full box with walls ``wall_velocity`` (scenario, frame, wall, space), and
         ``frame_count`` and ``particle_count`` (scenario). Coordinate ``scenario`` holds
         the ids, ``viscosity`` (scenario) the kinematic viscosity that a model is given
-        [length^2/s], NaN where none is known. Scenarios with fewer frames or particles
-        than the largest are padded with NaN, material with -1.
+        [length^2/s], NaN where none is known; where there is a fixed obstacle,
+        ``obstacle`` (scenario, disc) holds its centre and radius [length]. Scenarios
+        with fewer frames or particles than the largest are padded with NaN, material
+        with -1.
 
     Raises:
         UsageError: unknown split, size or subset.
@@ -98,15 +102,25 @@ def open_split(
     with ExitStack() as open_files:
         scenarios = []
         viscosities = []
+        obstacles = []
         for scenario, path in paths.items():
             file = _open_scenario(path, tier.key(scenario), hint)
             scenarios.append(open_files.enter_context(file))
             viscosities.append(_read_viscosity(file, tier, path))
+            obstacle = parse_obstacle(file.attrs, tier.dimension, where=str(path))
+            if obstacle is not None:
+                obstacles.append(obstacle)
         joined = _join_scenarios(scenarios, list(paths))
         # Lengths have no unit, as in scenario files.
         attributes = {"long_name": "given kinematic viscosity", "units": "s-1"}
         coordinate = ("scenario", viscosities, attributes)
         joined = joined.assign_coords(viscosity=coordinate)
+        if obstacles:
+            attributes = {"long_name": "centre and radius of the fixed obstacle"}
+            numbers = [*AXES[: tier.dimension], "radius"]
+            joined = joined.assign_coords(
+                disc=numbers, obstacle=(("scenario", "disc"), obstacles, attributes)
+            )
         # Local splits are recognised by it.
         first_path = next(iter(paths.values()))
         joined.encoding["source"] = str(first_path.absolute())

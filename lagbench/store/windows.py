@@ -22,6 +22,7 @@ from lagbench.data.contents import check_contents, registered_hash
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import damage_error, parse_viscosity
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
@@ -46,6 +47,7 @@ class _OpenScenario(NamedTuple):
     wall_velocity: Floats | None
     body_force: Floats | None
     viscosity: float | None
+    obstacle: Floats | None
 
 
 class _Identity(NamedTuple):
@@ -157,6 +159,14 @@ class FrameStore:
         self._reset_after_fork()
         return self._open(scenario).viscosity
 
+    def obstacle(self, scenario: int) -> Floats | None:
+        """Return centre and radius of the fixed obstacle [length], if there is one.
+
+        The shape is [axis + 1].
+        """
+        self._reset_after_fork()
+        return self._open(scenario).obstacle
+
     def _reset_after_fork(self) -> None:
         """Reopen files after a fork: HDF5 handles do not survive one."""
         if os.getpid() != self._process:
@@ -212,8 +222,9 @@ class FrameStore:
             body_force = variables["body_force"][...]
         stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
         viscosity = self._size.viscosity(stated)
+        obstacle = parse_obstacle(file.attrs, self._size.dimension, where=str(path))
         return _OpenScenario(
-            file, position, material, wall_velocity, body_force, viscosity
+            file, position, material, wall_velocity, body_force, viscosity, obstacle
         )
 
     def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:
@@ -313,6 +324,8 @@ class Window(NamedTuple):
     # first, on the way to each frame, those to predict included, shape [frame, layer,
     # axis]; None where no force drives the flow
     body_force: NDArray[np.float32] | None = None
+    # centre and radius of a fixed obstacle [length], shape [axis + 1]; None without one
+    obstacle: NDArray[np.float32] | None = None
 
 
 class WindowReader:
@@ -457,6 +470,9 @@ class WindowReader:
         if force is not None:
             shown_force = force[frame:end].copy()
             window = window._replace(body_force=shown_force)
+        obstacle = self.store.obstacle(scenario)
+        if obstacle is not None:
+            window = window._replace(obstacle=obstacle.copy())
         if not self.origin:
             return window
         (first_frame,) = self.store.frames(scenario, 0, 1)
@@ -490,7 +506,8 @@ def windows(
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
     [frame, wall, axis], or None; the ids ``scenario`` and ``frame``; ``viscosity``
     [length^2/s]; ``body_force`` [length/s^2], float32, shape [frame, layer, axis], or
-    None. ``data.size`` is the description of the data set.
+    None; ``obstacle``, centre and radius [length], float32, shape [axis + 1], or None.
+    ``data.size`` is the description of the data set.
     `lagbench.torch.WindowDataset` gives the same windows as tensors.
 
     Args:

@@ -23,6 +23,7 @@ OWN_KERNELS = (
     "cavity-3d",
     "fluid-3d",
     "multimaterial-3d",
+    "cylinder",
 )
 OF_THIS_TURN = (
     *(name for name in SPLITS if name not in OWN_KERNELS),
@@ -56,6 +57,8 @@ def test_tiny_is_made_to_the_bit(
 def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
     """One scenario, of mini or of full, another one after every commit."""
     names = [name for name in ("mini", "full") if name in load().split(split).sizes]
+    if not names:
+        pytest.skip(f"{split} has neither mini nor full")
     name = names[(turn() + SPLITS.index(split)) % len(names)]
     size = load().size(split, name)
     if size.measured is None:

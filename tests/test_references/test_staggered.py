@@ -9,6 +9,7 @@ from scipy.fft import dct, fft
 
 from lagbench.data.box import Box
 from lagbench.references.staggered import (
+    Forcing,
     StaggeredGrid,
     Velocity,
     fill_gaps,
@@ -403,3 +404,32 @@ def test_layers_are_driven_apart() -> None:
     assert_allclose(lower, 0.1, rtol=0, atol=1e-12)
     assert_allclose(upper, -0.1, rtol=0, atol=1e-12)
     assert_allclose(v, 0.0, rtol=0, atol=1e-12)
+
+
+def test_a_body_stops_the_stream_and_a_fringe_keeps_it() -> None:
+    """A disc in a channel: hardly any fluid goes through it, and as much goes past it
+    faster. Behind the fringe the stream is even again.
+    """
+    box = Box.from_bounds([(0.0, 1.0), (0.25, 0.75)], periodic=[True, False])
+    forcing = Forcing(
+        obstacle=np.float32([0.3, 0.5, 0.1]),
+        fringe_length=0.2,
+        fringe_rate=40.0,
+        stream=np.array([0.5, 0.0]),
+    )
+    grid = StaggeredGrid(box, cells=(48, 24), no_slip=False, forcing=forcing)
+    field = grid.rest()
+    field[0] += 0.5
+    field = grid.advance(field, duration=2.0, viscosity=2e-3, wall_velocity=NO_WALLS)
+    divergence = grid.divergence(field)
+    assert np.abs(divergence).max() < 1e-10
+    centre = np.array([[0.3, 0.5]])
+    beside = np.array([[0.3, 0.68]])
+    start = np.array([[0.02, 0.3], [0.02, 0.5], [0.02, 0.7]])
+    inside = grid.at_particles(field, centre, wall_velocity=NO_WALLS)
+    past = grid.at_particles(field, beside, wall_velocity=NO_WALLS)
+    even = grid.at_particles(field, start, wall_velocity=NO_WALLS)
+    assert np.abs(inside).max() < 0.02
+    assert past[0, 0] > 0.65
+    assert_allclose(even[:, 0], 0.5, atol=0.11)
+    assert np.abs(even[:, 1]).max() < 0.02

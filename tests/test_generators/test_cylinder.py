@@ -1,0 +1,177 @@
+"""Flow past a cylinder: its scenarios, and how the disc is told."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.patches import Circle
+from scenario_draws import draw
+
+import lagbench
+from lagbench.baselines.augmentation import mirror_batch
+from lagbench.data import registry
+from lagbench.data.manifest import read_manifest
+from lagbench.data.scenario import read_scenario
+from lagbench.figures.canvas import figure
+from lagbench.figures.panels import draw_walls
+from lagbench.figures.recording import open_recording
+from lagbench.generators import cylinder
+from lagbench.make.generate import GenerationResult
+from lagbench.references import given_in
+from lagbench.references.projection import forcing_of
+from lagbench.torch import WindowDataset, collate
+
+REGISTRY = registry.load()
+SIZES = {
+    name: REGISTRY.size("cylinder", name) for name in REGISTRY.split("cylinder").sizes
+}
+
+
+@pytest.mark.parametrize("name", sorted(SIZES))
+def test_drawn_discs_are_free_of_fluid(name: str) -> None:
+    """The disc stands off the middle by whole spacings and keeps its distance from the
+    walls; every particle of the lattice is fluid or disc.
+    """
+    size = SIZES[name]
+    radius = 0.5 * size.value("obstacle_diameter")
+    heights = set()
+    for scenario in size.scenarios[:8]:
+        state = draw(size, scenario)
+        assert state.obstacle is not None
+        x, y = state.obstacle.centre
+        heights.add(y)
+        assert x == size.value("obstacle_x")
+        assert y == state.parameters["obstacle_y"]
+        steps = (y - 0.5) * size.value("lattice")
+        assert steps == pytest.approx(round(steps), abs=1e-9)
+        low, high = size.bounds[1]
+        assert min(y - low, high - y) > 2.0 * radius
+        way = state.position - state.obstacle.centre
+        assert np.hypot(*way.T).min() > radius - 2e-6
+        inside = state.obstacle.position - state.obstacle.centre
+        assert np.hypot(*inside.T).max() < radius
+        lattice = size.value("lattice") ** 2 * size.box.volume
+        assert len(way) + len(inside) == round(lattice)
+        assert 80.0 <= float(state.parameters["reynolds"]) <= 200.0
+    assert len(heights) > 2
+
+
+CENTRE = np.array([0.4, 0.5])
+FLOWS = {
+    "eddy": functools.partial(cylinder.eddy, centre=CENTRE, radius=0.3, speed=0.2),
+    "potential flow": functools.partial(
+        cylinder.potential_flow, centre=CENTRE, radius=0.1, speed=0.2
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sorted(FLOWS))
+def test_a_flow_has_the_gradient_that_it_says(name: str) -> None:
+    """Against central differences; neither flow has a divergence."""
+    flow = FLOWS[name]
+    rng = np.random.default_rng(5)
+    points = rng.random((60, 2))
+    points = points[np.hypot(*(points - CENTRE).T) > 0.1]
+    _, gradient = flow(points)
+    step = 1e-6
+    for axis in range(2):
+        way = np.zeros(2)
+        way[axis] = step
+        rise = flow(points + way)[0] - flow(points - way)[0]
+        slope = rise / (2.0 * step)
+        np.testing.assert_allclose(gradient[:, :, axis], slope, atol=1e-8)
+    divergence = gradient[:, 0, 0] + gradient[:, 1, 1]
+    np.testing.assert_allclose(divergence, 0.0, atol=1e-14)
+
+
+def test_no_fluid_flows_through_the_disc_at_the_start() -> None:
+    """The normal component of the potential flow is 0 on the rim, and its speed there
+    is 2 U at most; far away it is the stream.
+    """
+    angle = np.linspace(0.0, 6.0, 25)
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    velocity, _ = FLOWS["potential flow"](CENTRE + 0.1 * normal)
+    through = np.sum(velocity * normal, axis=1)
+    np.testing.assert_allclose(through, 0.0, atol=1e-15)
+    assert np.hypot(*velocity.T).max() == pytest.approx(0.4, rel=0.01)
+    far, _ = FLOWS["potential flow"](np.array([[9.0, 0.5]]))
+    np.testing.assert_allclose(far[0], [0.2, 0.0], atol=1e-4)
+
+
+def test_the_disc_is_told_and_no_particle_enters_it(
+    tiny_split: Callable[..., GenerationResult],
+) -> None:
+    """Windows, `open_split` and the references get centre and radius; in all frames the
+    particles lie outside; J stays near 1.
+    """
+    root = tiny_split("cylinder").root
+    size = SIZES["tiny"]
+    radius = 0.5 * size.value("obstacle_diameter")
+    with lagbench.open_split("cylinder", size="tiny", root=root) as data:
+        told = data["obstacle"].values
+        position = data["position"].values.astype(np.float64)
+        np.testing.assert_array_equal(told[:, 0], np.float32(size.value("obstacle_x")))
+        np.testing.assert_array_equal(told[:, 2], np.float32(radius))
+        for row, frames in zip(told.astype(np.float64), position, strict=True):
+            distance = np.linalg.norm(frames - row[:2], axis=-1)
+            assert distance.min() > radius
+        assert data["position"].sizes["particle"] == size.particles
+
+    windows = lagbench.windows("cylinder", subset="test", size="tiny", root=root)
+    first = windows[0]
+    assert first.obstacle is not None
+    np.testing.assert_array_equal(first.obstacle, told[0])
+
+    with read_scenario(size.path(root, size.subsets["test"][0])) as file:
+        given = given_in(file, size, root)
+    assert given.obstacle is not None
+    np.testing.assert_array_equal(given.obstacle, told[0])
+    forcing = forcing_of(given)
+    assert forcing is not None
+    assert forcing.stream[0] == size.value("speed")
+
+    manifest = read_manifest(root, "cylinder", "tiny", size.major)
+    assert manifest is not None
+    for entry in manifest.files:
+        assert entry.facts["jacobian_min"] > 0.85
+        assert entry.facts["jacobian_max"] < 1.15
+
+
+def test_batches_carry_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
+    """A batch has one row for each window; in a mirror image the disc stands as far
+    from the other wall.
+    """
+    root = tiny_split("cylinder").root
+    size = SIZES["tiny"]
+    data = WindowDataset("cylinder", size="tiny", root=root, history=2)
+    batch = collate([data[0], data[1]])
+    assert batch.obstacle is not None
+    assert batch.obstacle.shape == (2, 3)
+    upside_down = torch.diag(torch.tensor([1.0, -1.0])).expand(2, 2, 2)
+    image = mirror_batch(batch, upside_down, size.bounds)
+    assert image.obstacle is not None
+    x, y, radius = batch.obstacle.unbind(1)
+    low, high = size.bounds[1]
+    expected = torch.stack([x, low + high - y, radius], dim=1)
+    torch.testing.assert_close(image.obstacle, expected)
+
+
+def test_pictures_show_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
+    """A circle of its radius at its place, from a file and from `open_split`."""
+    root = tiny_split("cylinder").root
+    size = SIZES["tiny"]
+    path = size.path(root, size.subsets["test"][0])
+    with lagbench.open_split("cylinder", size="tiny", root=root) as data:
+        for source in (path, data.isel(scenario=0)):
+            with open_recording(source) as recording, figure(2.0, 2.0) as drawn:
+                axes = drawn.add_axes((0, 0, 1, 1))
+                draw_walls(axes, recording, 0)
+                discs = [patch for patch in axes.patches if isinstance(patch, Circle)]
+                told = data["obstacle"].isel(scenario=0).values
+                assert len(discs) == 1
+                np.testing.assert_allclose(discs[0].center, told[:2])
+                assert discs[0].radius == pytest.approx(told[2])
