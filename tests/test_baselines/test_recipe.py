@@ -67,9 +67,10 @@ def test_every_recipe_is_right(name: str) -> None:
         size, _, variant = tail.partition("-")
         splits = [pattern]
         if pattern == "*":
-            splits = [
-                split for split in registry.splits if size in registry.split(split).sizes
-            ]
+            splits = []
+            for split, description in registry.splits.items():
+                if size in description.sizes:
+                    splits.append(split)
         for split in splits:
             registry.size(split, size)
             recipe = recipe_for(entry, split, size, variant=variant or None)
