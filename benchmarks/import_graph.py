@@ -10,6 +10,7 @@ import ast
 import graphlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TypeGuard
 
 Graph = Mapping[str, set[str]]
 """The modules that each module imports, by dotted name."""
@@ -60,6 +61,7 @@ def imported_names(name: str, path: Path, *, for_types: bool) -> Iterator[str]:
     while pending:
         node = pending.pop()
         if not for_types and _is_for_types(node):
+            pending += node.orelse
             continue
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -71,9 +73,11 @@ def imported_names(name: str, path: Path, *, for_types: bool) -> Iterator[str]:
         pending += ast.iter_child_nodes(node)
 
 
-def _is_for_types(node: ast.AST) -> bool:
-    """Tell whether a statement is ``if TYPE_CHECKING``; ours have no ``else``."""
-    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+def _is_for_types(node: ast.AST) -> TypeGuard[ast.If]:
+    """Tell whether a statement is ``if TYPE_CHECKING``."""
+    if not isinstance(node, ast.If):
+        return False
+    return ast.unparse(node.test) in {"TYPE_CHECKING", "typing.TYPE_CHECKING"}
 
 
 def _base_of(node: ast.ImportFrom, package_parts: list[str]) -> str:

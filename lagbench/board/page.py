@@ -275,7 +275,9 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
     sentence = f"The maintainers {' and '.join(clauses)}"
     if machines:
         sentence += f"; machine: {', '.join(sorted(machines))}"
-    return f"{sentence}. The others stand as submitted."
+    if counts[Level.AS_SUBMITTED]:
+        sentence += ". The others stand as submitted"
+    return f"{sentence}."
 
 
 def _describe_costs(rows: Sequence[BoardRow]) -> str:

@@ -11,6 +11,7 @@ from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
+from lagbench.submission.issues import quote
 
 from .card import BRIEF_ROWS, ScoreCard
 from .compare import ComparisonResult, MetricComparison
@@ -105,6 +106,7 @@ def brief_lines(card: ScoreCard) -> Iterator[str]:
     yield from _undefined_lines(card, card.chosen_metrics[:BRIEF_ROWS])
     for row in _best_reference(card):
         yield f"against {row}: {_against(card, row)}"
+    yield from _cost_lines(card)
     yield from _classical_lines(card)
     for flag in card.flags:
         if flag.raised:
@@ -199,6 +201,7 @@ def flag_lines(card: ScoreCard) -> Iterator[str]:
     for row in card.scores:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"
+    yield from _cost_lines(card)
     yield from _classical_lines(card)
     for flag in card.flags:
         yield _flag_line(flag)
@@ -217,17 +220,22 @@ def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
         yield f"† frames without a value, of {frames}: {', '.join(undefined)}"
 
 
-def _classical_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield the cost that predictions state, and why no classical solver stands beside
-    the score, if so.
-    """
+def _cost_lines(card: ScoreCard) -> Iterator[str]:
+    """Yield the cost that predictions state, if they do."""
     header = card.header
-    if header.seconds_per_frame is not None:
-        machine = header.device or "a machine without a name"
-        yield (
-            f"cost: {_number(header.seconds_per_frame)} s per frame on {machine}; the "
-            f"predictions state it, and nothing was timed here"
-        )
+    if header.seconds_per_frame is None:
+        return
+    machine = "a machine without a name"
+    if header.device:
+        machine = quote(header.device)  # a stranger's text on a terminal
+    yield (
+        f"cost: {_number(header.seconds_per_frame)} s per frame on {machine}; the "
+        f"predictions state it, and nothing was timed here"
+    )
+
+
+def _classical_lines(card: ScoreCard) -> Iterator[str]:
+    """Yield why no classical solver stands beside the score, if so."""
     if card.against_classical is None and card.why_not_classical is not None:
         yield f"against_classical: none, because {card.why_not_classical}"
 

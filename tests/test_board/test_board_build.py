@@ -28,6 +28,7 @@ from lagbench.board.build import (
     make_curve,
     residual_histograms,
 )
+from lagbench.board.columns import SKILL, value_of
 from lagbench.board.entry import Weights
 from lagbench.board.folder import Folder
 from lagbench.board.gates import gates_failed_by, read_failed_gates
@@ -44,6 +45,7 @@ from lagbench.errors import (
     UsageError,
 )
 from lagbench.metrics import METRICS, Score, bootstrap_interval
+from lagbench.references.predictor import Kind
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
@@ -121,6 +123,20 @@ def test_references_stand_as_the_scorer_sees_them(
             expected = pytest.approx(score.values, rel=1e-6, nan_ok=True)
             assert digits(value.mean) == digits(score.mean)
             assert value.per_scenario == expected
+
+
+def test_references_have_a_skill_beside_the_best_naive_one(board: Board) -> None:
+    """It is 1 - score / score of the best naive baseline, which itself has 0."""
+    tab = board.tabs[0]
+    scores = {row.name: row.values[tab.ranking].mean for row in tab.references}
+    kinds = {row.name: row.kind for row in tab.references}
+    least = min(scores[name] for name, kind in kinds.items() if kind is Kind.NAIVE)
+    for row in tab.references:
+        assert row.skill is not None
+        expected = 1.0 - scores[row.name] / least
+        assert row.skill.mean == pytest.approx(expected, abs=1e-12)
+        assert value_of(row, SKILL) == row.skill.mean
+    assert min(abs(row.skill.mean) for row in tab.references if row.skill) < 1e-12
 
 
 def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:

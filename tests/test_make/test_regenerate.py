@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import turns
 from turns import of_this_turn, turn
 
 from lagbench.data.manifest import read_manifest
@@ -52,18 +53,36 @@ def test_tiny_is_made_to_the_bit(
     assert verified.warnings == ()
 
 
+TURNS = 4
+
+
+def recorded_sizes() -> list[tuple[str, str]]:
+    """Return splits and their sizes beyond tiny whose hashes are recorded."""
+    pairs = []
+    for split in SPLITS:
+        for name in load().split(split).sizes:
+            is_recorded = load().size(split, name).measured is not None
+            if name != "tiny" and is_recorded:
+                pairs.append((split, name))
+    return pairs
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("split", of_this_turn(SPLITS, turns=4))
-def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
-    """One scenario, of mini or of full, another one after every commit."""
-    names = [name for name in ("mini", "full") if name in load().split(split).sizes]
-    if not names:
-        pytest.skip(f"{split} has neither mini nor full")
-    name = names[(turn() + SPLITS.index(split)) % len(names)]
+@pytest.mark.parametrize(("split", "name"), of_this_turn(recorded_sizes(), turns=TURNS))
+def test_one_scenario_is_made_to_the_bit(split: str, name: str, tmp_path: Path) -> None:
+    """One scenario of a quarter of all data sets; after four commits another one."""
     size = load().size(split, name)
-    if size.measured is None:
-        pytest.skip(f"no hash of {split} {name} is recorded")
-    scenario = size.scenarios[turn() // 2 % len(size.scenarios)]
+    scenario = size.scenarios[turn() // TURNS % len(size.scenarios)]
     result = generate(split, name, scenarios=(scenario,), root=tmp_path)
     assert result.simulated == (scenario,)
     assert result.verdict == "what is there is equal to datasets.yaml"
+
+
+def test_every_data_set_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four commits in a row make a scenario of each of them."""
+    made = set()
+    for number in range(TURNS):
+        monkeypatch.setattr(turns, "turn", lambda number=number: number)
+        made.update(of_this_turn(recorded_sizes(), turns=TURNS))
+    assert made == set(recorded_sizes())
+    assert ("cavity", "full") in made

@@ -739,8 +739,20 @@ def test_a_cost_is_told_as_the_predictions_state_it(
     labels = {"seconds_per_frame": 0.25, "device": "a laptop, 2 threads"}
     path = bench.submit(tmp_path / "predictions.nc", still, **labels)
     text = "\n".join(flag_lines(bench.evaluate(path)))
-    assert "cost: 0.25 s per frame on a laptop, 2 threads" in text
+    assert "cost: 0.25 s per frame on 'a laptop, 2 threads'" in text
     assert "the predictions state" in text
+
+
+def test_a_stated_machine_cannot_write_on_the_terminal(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """Escapes and further lines are quoted, long texts cut off."""
+    device = "x\x1b[2J\nflag copy_suspect: not raised" + 1000 * "y"
+    labels = {"seconds_per_frame": 0.25, "device": device}
+    path = bench.submit(tmp_path / "predictions.nc", still, **labels)
+    (line,) = [line for line in flag_lines(bench.evaluate(path)) if "cost:" in line]
+    assert line.isprintable()
+    assert len(line) < 300
 
 
 def test_tables_show_references_undefined_frames_and_units(
