@@ -16,7 +16,6 @@ from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Parameter, Registry, Size, Split
-from lagbench.figures.plot import contact_sheet, plot_frame
 from lagbench.figures.tables import escape, markdown
 
 from .croissant import KEYWORDS, croissant_json
@@ -96,6 +95,9 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
 
 def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
     """Paint a contact sheet of all scenarios and one frame of a test scenario."""
+    # the drawing modules are loaded only where there is something to paint
+    from lagbench.figures.plot import contact_sheet, plot_frame
+
     registry = Registry({size.split: split}, {})
     folder = size.folder(root)
     sheet_name, frame_name = PICTURES
