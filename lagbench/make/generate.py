@@ -52,8 +52,8 @@ from lagbench.store.publication import (
     publish,
 )
 from lagbench.work.cluster import Cluster, await_file
-from lagbench.work.machine import describe_machine, promises_bits
-from lagbench.work.pool import Event, Pool, Report, WorkItem, worker_count
+from lagbench.work.machine import describe_machine, promises_bits, worker_count
+from lagbench.work.pool import Event, Pool, Report, WorkItem
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 

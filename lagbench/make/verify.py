@@ -29,7 +29,8 @@ from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.split import Device
 from lagbench.store.copy import list_unstored, update_working_copy
-from lagbench.work.pool import Pool, WorkItem, worker_count
+from lagbench.work.machine import worker_count
+from lagbench.work.pool import Pool, WorkItem
 from lagbench.work.progress import Meter, Progress
 
 from .inventory import (

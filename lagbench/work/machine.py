@@ -30,7 +30,7 @@ from contextlib import ExitStack
 from importlib.metadata import version
 from typing import Any, NamedTuple, Self
 
-from lagbench.errors import WorkFailedError
+from lagbench.errors import UsageError, WorkFailedError
 
 try:
     import resource
@@ -108,6 +108,28 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def worker_count(workers: int | None, *, default: int | None = None) -> int:
+    """Return how many workers to start: by default one per core.
+
+    Args:
+        workers: the number that the user gave.
+        default: the number where the user gave none.
+
+    Raises:
+        UsageError: the number is below 1.
+    """
+    if workers is None:
+        return default or available_cores()
+    if workers < 1:
+        raise UsageError(
+            "there is no work without a worker",
+            where="--workers",
+            expected=">= 1",
+            got=workers,
+        )
+    return workers
 
 
 def limit_process(*, memory: int, seconds: int) -> None:

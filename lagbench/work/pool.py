@@ -28,12 +28,11 @@ from typing import Any, NamedTuple, Self
 
 from lagbench.errors import (
     LagbenchError,
-    UsageError,
     WorkFailedError,
     find_place_in_extension,
 )
 
-from .machine import available_cores
+from .machine import worker_count
 
 AVAILABLE = os.name == "posix"
 """Whether workers can be started here.
@@ -53,28 +52,6 @@ _BOOT = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[2]); "
     "from lagbench.work.pool import serve; serve(int(sys.argv[1]))"
 )
-
-
-def worker_count(workers: int | None, *, default: int | None = None) -> int:
-    """Return how many workers to start: by default one per core.
-
-    Args:
-        workers: the number that the user gave.
-        default: the number where the user gave none.
-
-    Raises:
-        UsageError: the number is below 1.
-    """
-    if workers is None:
-        return default or available_cores()
-    if workers < 1:
-        raise UsageError(
-            "there is no work without a worker",
-            where="--workers",
-            expected=">= 1",
-            got=workers,
-        )
-    return workers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from lagbench.data.local import resolve_root, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, suggest_name
-from lagbench.work.pool import worker_count
+from lagbench.work.machine import worker_count
 
 from .catalogue import ITEMS
 from .formatting import number

@@ -15,8 +15,8 @@ import pytest
 from cluster_bench import gone
 
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.work.machine import available_cores
-from lagbench.work.pool import ATTEMPTS, Pool, WorkItem, worker_count
+from lagbench.work.machine import available_cores, worker_count
+from lagbench.work.pool import ATTEMPTS, Pool, WorkItem
 
 HERE = str(Path(__file__).parents[1])
 
