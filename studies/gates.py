@@ -22,9 +22,10 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -230,11 +231,29 @@ def _mean(values: Sequence[float]) -> float | None:
     return round_digits(float(np.mean(values)), 4)
 
 
-def to_json(rows: Iterable[Gates]) -> str:
-    """Return gates.json: limits, and measures with the gates that failed."""
-    entries = [{**asdict(row), "failed": row.failed} for row in rows]
+def to_json(rows: Iterable[Gates], recorded: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Return gates.json: limits, and measures with the gates that failed.
+
+    Args:
+        rows: what was measured now.
+        recorded: lines of an older gates.json; those of other weights stay.
+    """
+    lines = {}
+    for line in recorded:
+        lines[line["split"], line["size"], line["method"]] = dict(line)
+    for row in rows:
+        lines[row.split, row.size, row.method] = {**asdict(row), "failed": row.failed}
+    entries = [lines[key] for key in sorted(lines)]
     content = {"format": FORMAT, "limits": LIMITS, "weights": entries}
     return json.dumps(content, indent=1) + "\n"
+
+
+def read_recorded(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a gates.json; none where there is no such file."""
+    if not path.exists():
+        return []
+    lines: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))["weights"]
+    return lines
 
 
 def to_markdown(rows: Iterable[Gates]) -> str:
@@ -303,7 +322,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         rows.append(row)
     if options.output is not None:
-        write_atomically(options.output / "gates.json", to_json(rows).encode())
+        path = options.output / "gates.json"
+        text = to_json(rows, recorded=read_recorded(path))
+        write_atomically(path, text.encode())
     sys.stdout.write(to_markdown(rows))
     return 0
 

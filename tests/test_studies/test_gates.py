@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from studies.gates import Gates, StepErrors, count_densest
+from studies.gates import Gates, StepErrors, count_densest, read_recorded, to_json
 
 GRAVITY = 2.5 / 3600
 
@@ -40,16 +43,30 @@ def test_the_fullest_cell_is_counted() -> None:
     assert count_densest(cloud, 8) == 20
 
 
+GATES = Gates(
+    split="fluid",
+    size="mini",
+    dataset_version="3.0.0",
+    method="gns_0",
+    weights_sha256="",
+    one_step=1.0,
+    free_flight=-0.4,
+    settled=None,
+    densest_cell=2.9,
+)
+
+
 def test_a_gate_fails_at_its_limit_and_one_without_meaning_never() -> None:
-    gates = Gates(
-        split="fluid",
-        size="mini",
-        dataset_version="3.0.0",
-        method="gns_0",
-        weights_sha256="",
-        one_step=1.0,
-        free_flight=-0.4,
-        settled=None,
-        densest_cell=2.9,
-    )
-    assert gates.failed == ["one_step", "free_flight"]
+    assert GATES.failed == ["one_step", "free_flight"]
+
+
+def test_what_is_recorded_of_other_weights_stays(tmp_path: Path) -> None:
+    """Measured again, weights have one line, the new one."""
+    path = tmp_path / "gates.json"
+    assert read_recorded(path) == []
+    path.write_text(to_json([GATES, replace(GATES, method="gns_1")]))
+    better = replace(GATES, one_step=0.5)
+    path.write_text(to_json([better], recorded=read_recorded(path)))
+    first, second = read_recorded(path)
+    assert first["one_step"] == 0.5
+    assert second["method"] == "gns_1"
