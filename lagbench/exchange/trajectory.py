@@ -202,6 +202,15 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
     for detail in details[:MOST_MISTAKES]:
         with mistakes:
             raise _option_error(detail, where=where)
+    untold = len(details) - MOST_MISTAKES
+    if untold > 0:
+        with mistakes:
+            raise UsageError(
+                "there are more mistakes",
+                where=where or "the options",
+                got=f"{untold} more",
+                fix="mend those that are told, then try again",
+            )
     mistakes.raise_errors()
     return plain
 

@@ -198,7 +198,8 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
 
     a = _table(first_losses, common)
     b = _table(second_losses, common)
-    if a.shape == b.shape:
+    is_row_by_row = len(a) == len(b) and (paired or len(a) == 1)
+    if is_row_by_row:
         # Sums in another order differ in their last digits: no method is better by it.
         is_equal = np.isclose(a, b, rtol=ROUNDING, atol=0.0)
         b = np.where(is_equal, a, b)

@@ -973,6 +973,22 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
     assert size.task.score_grid.placement == "nodes"
 
 
+def test_more_mistakes_than_a_message_holds_are_counted(
+    tmp_path: Path, run: Run
+) -> None:
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    description = tmp_path / "data.yaml"
+    lines = [f"colour_{number}: red" for number in range(13)]
+    description.write_text("\n".join(lines))
+    output = tmp_path / "mine"
+    done = run(
+        "adopt", *paths, "-o", output, "--describe", description, "--free-surface"
+    )
+    assert done.exit_code == 2
+    assert "colour_9" in done.output
+    assert "3 more" in done.output
+
+
 def drifting_runs(count: int) -> list[NDArray[np.float32]]:
     """Return trajectories through a periodic box of side 1, wrapped into it."""
     rng = np.random.default_rng(7)
