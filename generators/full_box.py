@@ -16,9 +16,12 @@ from .driver import Driver, Field
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import broken_jacobian_bounds
 from .nodal_stress_nd import NodalStressND
-from .obstacle import Obstacle
+from .obstacle import Obstacle, is_inside
 from .solver import Health
 from .split import InitialState
+
+LEAST_GAP = 1.0
+"""Cells of fluid, at least, between an obstacle and the faces of the box."""
 
 
 class FullBox(Driver[FullBoxParameters]):
@@ -210,6 +213,38 @@ class FullBox(Driver[FullBoxParameters]):
                 expected=f"{count} particles",
                 got=f"{got} particles",
             )
+        if state.obstacle is not None:
+            self._check_place(index, state.obstacle)
+
+    def _check_place(self, index: int, obstacle: Obstacle) -> None:
+        """Refuse an obstacle near a face of the box, or particles outside it.
+
+        Distances to the obstacle are not taken across periodic faces, and its particles
+        index nodes without a check.
+        """
+        box = self.parameters.box
+        gap = LEAST_GAP / self.parameters.grid
+        centre = np.asarray(obstacle.centre)
+        reach = obstacle.radius + gap
+        is_clear = (centre - reach >= box.low) & (centre + reach <= box.high)
+        is_finite = np.isfinite(obstacle.position).all()
+        if not is_clear.all():
+            expected = f"a centre {reach:g} or more from all faces of the box"
+            got = f"centre {obstacle.centre}"
+        elif not is_finite:
+            expected = "finite positions"
+            got = "NaN or infinity"
+        elif not is_inside(obstacle.position, obstacle.centre, obstacle.radius).all():
+            expected = f"particles less than {obstacle.radius:g} from the centre"
+            got = "some farther away"
+        else:
+            return
+        raise UsageError(
+            "the obstacle does not fit the box",
+            where=f"scenario {index}, obstacle",
+            expected=expected,
+            got=got,
+        )
 
     def _check_stream(self, index: int, state: InitialState) -> None:
         """Refuse a stream where no fringe is, a fringe without one, or a fast one."""

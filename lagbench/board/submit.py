@@ -187,8 +187,8 @@ def _require_keys(meta: Meta) -> None:
     if missing_options:
         raise UsageError(
             "the entry lacks what readers need",
-            where="the options",
-            expected=" and ".join(missing_options),
+            where=", ".join(missing_options),
+            expected="a text for each",
             got="nothing",
             fix="give them as options, or authors and command in a file: "
             "--from meta.yaml",
@@ -200,8 +200,10 @@ def _require_files(paths: Sequence[Path]) -> None:
         check_file(path, fix=WRITE)
     if not paths:
         what = "no predictions"
+        fix = "name the predictions: lagbench submit predictions.nc"
     elif len(paths) > MOST_SEEDS:
         what = "too many files"
+        fix = "leave some out: further seeds of a method can be added later, with --add"
     else:
         return
     raise UsageError(
@@ -209,7 +211,7 @@ def _require_files(paths: Sequence[Path]) -> None:
         where="FILE ...",
         expected=f"1 to {MOST_SEEDS}, one per seed",
         got=len(paths),
-        fix="name the predictions: lagbench submit predictions.nc",
+        fix=fix,
     )
 
 

@@ -206,3 +206,37 @@ def test_what_does_not_fit_the_solver_is_refused(
     with pytest.raises(UsageError) as caught:
         serial_solver().load([state])
     assert where in str(caught.value.where)
+
+
+def misplaced(**changes: object) -> InitialState:
+    """Return the channel with another obstacle of as many particles."""
+    state = channel_state()
+    assert state.obstacle is not None
+    obstacle = dataclasses.replace(state.obstacle, **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(state, obstacle=obstacle)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"centre": (0.05, 0.25)}, "from all faces"),
+        ({"radius": 0.3}, "from all faces"),
+        ({"radius": 0.01}, "less than 0.01 from the centre"),
+    ],
+)
+def test_an_obstacle_lies_within_the_box(
+    changes: dict[str, object], expected: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        serial_solver().load([misplaced(**changes)])
+    assert expected in str(caught.value.expected)
+
+
+def test_positions_of_an_obstacle_are_numbers() -> None:
+    state = channel_state()
+    assert state.obstacle is not None
+    position = state.obstacle.position.copy()
+    position[0] = np.nan
+    with pytest.raises(UsageError) as caught:
+        serial_solver().load([misplaced(position=position)])
+    assert "finite" in str(caught.value.expected)
