@@ -66,8 +66,10 @@ thesis, University of Leeds, 2025)."""
 
 SUMMARY_NOTE = """\
 Scores: less is better. The brackets after a score hold the processor time of a frame on
-one core. Learned models were timed on another machine: their times are multiplied by
-the ratio of our solver's times on the two machines.
+one core, on the machine that timed the reference predictors. Learned models were timed
+on another one: their times are multiplied by the ratio of our solver's times on the two
+machines. `against_classical` compares times of one run on one machine where there is
+such a run (`leaderboard/verified.yaml`), as the leaderboard does.
 `skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
 score of the best classical solver that costs no more per frame, with its 95 % interval:
 below 1 learning pays. A hybrid is a solver with a learned part."""

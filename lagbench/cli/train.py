@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lagbench.data.local import locate
+from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.scoring.scorability import check_scorability
 
@@ -201,6 +202,12 @@ def _errors_of_one_process(*, is_helper: bool) -> Iterator[None]:
         raise typer.Exit(error.exit_code) from error
 
 
+def _has_mini(split: str) -> bool:
+    """Tell whether a split of ours or of a package has the size mini."""
+    splits = load().splits
+    return split in splits and "mini" in splits[split].sizes
+
+
 def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
     yield (
         f"{result.baseline} on {result.recipe}: {result.state}, "
@@ -221,7 +228,10 @@ def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
     yield f"  budget     {_describe_budget(result)}"
     yield f"  weights    {result.weights}"
     if result.size == "tiny":
-        yield "hint: tiny is for tests: it is too small to learn from; try --size mini"
+        hint = "hint: tiny is for tests: it is too small to learn from"
+        if _has_mini(result.split):
+            hint += "; try --size mini"
+        yield hint
     weights = shlex.quote(str(result.weights))
     yield f"next: lagbench predict {weights}{root_option} -o predictions.nc"
 

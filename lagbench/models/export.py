@@ -83,12 +83,6 @@ def export_onnx(
             fix="hand in weights.pt or safetensors, see docs/submitting.md",
         )
     frames = window.frames
-    wrapped = _Exported(
-        step,
-        modules,
-        history=history or frames,
-        has_walls=window.wall_velocity is not None,
-    )
     inputs: dict[str, Tensor] = {
         "position": window.position.transpose(0, 1).contiguous(),
         "material": window.material,
@@ -96,6 +90,11 @@ def export_onnx(
     if window.wall_velocity is not None:
         walls = window.wall_velocity[0]
         inputs["wall_velocity"] = torch.cat([walls, walls[-1:]])[: frames + 1]
+    if window.viscosity is not None:
+        inputs["viscosity"] = window.viscosity[0]
+    wrapped = _Exported(
+        step, modules, history=history or frames, input_names=tuple(inputs)
+    )
 
     target = Path(path)
     temporary = target.with_name(f".{target.stem}.exporting.onnx")
@@ -124,11 +123,14 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
                 opset_version=LEAST_OPSET,
                 dynamo=False,
             )
-        except (RuntimeError, ValueError, TypeError) as error:
+        except (RuntimeError, ValueError, TypeError, AttributeError) as error:
             reason = str(error).split("\n")[0][:200]
+            names = ", ".join(inputs)
             raise UsageError(
                 "the model cannot be exported",
                 where="export_onnx",
+                expected=f"a step that reads {names} only: an ONNX model is given "
+                "neither body_force nor obstacle",
                 got=f"{type(error).__name__}: {reason}",
                 fix="name its networks: modules=[net]; use operations that ONNX has",
             ) from error
@@ -202,27 +204,37 @@ class _Exported(nn.Module):
     """A step with the signature of an ONNX entry."""
 
     def __init__(
-        self, step: Step, modules: Sequence[nn.Module], *, history: int, has_walls: bool
+        self,
+        step: Step,
+        modules: Sequence[nn.Module],
+        *,
+        history: int,
+        input_names: tuple[str, ...],
     ) -> None:
         super().__init__()
         # registered, so that the weights are found
         self.networks = nn.ModuleList(modules)
         self.step = step
         self.history = history
-        self.has_walls = has_walls
+        self.input_names = input_names
 
-    def forward(
-        self, position: Tensor, material: Tensor, wall_velocity: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:
         """Return the next frame, shape [1, particle, axis]."""
+        given = dict(zip(self.input_names, inputs, strict=True))
+        position = given["position"]
+        material = given["material"]
         walls = None
-        if self.has_walls and wall_velocity is not None:
-            walls = wall_velocity[-self.history - 1 :][None]
+        if "wall_velocity" in given:
+            walls = given["wall_velocity"][-self.history - 1 :][None]
+        viscosity = None
+        if "viscosity" in given:
+            viscosity = given["viscosity"][None]
         values: dict[str, Any] = {
             "position": position[-self.history :].transpose(0, 1),
             "sample": torch.zeros_like(material),
             "material": material,
             "wall_velocity": walls,
+            "viscosity": viscosity,
             "scenario": torch.zeros(1, dtype=torch.int64),
             "frame": torch.zeros(1, dtype=torch.int64),
         }

@@ -139,7 +139,7 @@ class FrameStore:
         """Return material, shape [particle], and wall velocity [length/s].
 
         Material is 0, liquid, in files without it. Wall velocity has the shape [frame,
-        wall, axis]; it is None where no wall moves.
+        wall, axis]; it is None where the files hold none.
         """
         self._reset_after_fork()
         opened = self._open(scenario)

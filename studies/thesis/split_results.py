@@ -20,8 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from lagbench.board.entry import Entry, EntryCost, Prediction
+from lagbench.board.entry import (
+    Entry,
+    EntryCost,
+    MeasuredCost,
+    Prediction,
+    Verification,
+)
 from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import Folder
+from lagbench.board.verified import read_verified, verification_of
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, mean_over_seeds
@@ -84,8 +92,10 @@ class Method:
 
     name: str  # as in gns or gns-novorticity
     trainings: tuple[ScoredTraining, ...]  # one per seed
-    # of a predicted frame; None where it was not measured
+    # of a predicted frame, as the entry states it; None where it states none
     cost: EntryCost | None = None
+    # of a frame, measured by us beside the solvers in one run
+    measured: MeasuredCost | None = None
     parameters: int | None = None  # trained numbers; None where unknown
     kind: Kind = Kind.LEARNED
 
@@ -199,6 +209,13 @@ class Sources:
         registry = self.registry or load()
         return split in registry.splits and size in registry.splits[split].sizes
 
+    @cached_property
+    def verified(self) -> Mapping[str, Verification]:
+        """What the maintainers found out about entries, by path of the entry."""
+        if self.board is None:
+            return {}
+        return read_verified(Folder(self.board))
+
     def entries(self, split: str, size: str) -> dict[str, Path]:
         """Return the entries of the board by name."""
         if self.board is None:
@@ -259,6 +276,8 @@ class SplitResults:
         size = self.size.name
         for name, path in self._sources.entries(split, size).items():
             entry = read_entry(path)
+            verification = verification_of(entry, self._sources.verified)
+            measured = None if verification is None else verification.cost
             # <board>/submissions/<split>/<size>/<name>.yaml
             board = path.parents[3]
             for prediction, score_path in zip(
@@ -274,6 +293,7 @@ class SplitResults:
                     path=board / score_path,
                     record=record,
                     cost=entry.cost,
+                    measured=measured,
                     parameters=entry.parameters,
                     kind=entry.kind,
                 )
@@ -321,13 +341,14 @@ class SplitResults:
         path: Path,
         record: Mapping[str, Any],
         cost: EntryCost | None,
+        measured: MeasuredCost | None = None,
         parameters: int | None = None,
         kind: Kind = Kind.LEARNED,
     ) -> None:
         """Add one training to a method, unless its scores are of other data."""
         stored = read_statistics(path)
-        measured = self.size.measured
-        if measured and stored.identity["dataset_sha256"] != measured.dataset_sha256:
+        recorded = self.size.measured
+        if recorded and stored.identity["dataset_sha256"] != recorded.dataset_sha256:
             self.stale.append(path)
             return
 
@@ -339,6 +360,7 @@ class SplitResults:
             name=name,
             trainings=(*earlier.trainings, training),
             cost=earlier.cost or cost,
+            measured=earlier.measured or measured,
             parameters=earlier.parameters or record.get("parameters") or parameters,
             kind=kind,
         )
@@ -413,13 +435,21 @@ class SplitResults:
     def seconds_per_frame(self, name: str) -> float | None:
         """Return what a frame costs a method where the references were timed [s].
 
-        Entries state the time of our solver on their machine: theirs is scaled by it.
+        The time that we measured counts before the one that an entry states. The time
+        of our solver on the same machine scales it.
         """
         if name in REFERENCES:
             references = shipped(self.size) or {}
             if name in references:
                 return references[name].seconds_per_frame
             return None
+        measured = self.methods[name].measured
+        if measured is not None:
+            return seconds_where_measured(
+                seconds_per_frame=measured.seconds_per_frame,
+                solver_seconds=measured.solver,
+                solver_seconds_here=solver_seconds(self.size),
+            )
         cost = self.methods[name].cost
         if cost is None:
             return None
@@ -432,15 +462,22 @@ class SplitResults:
     def against_classical(self, name: str) -> AgainstClassical | None:
         """Return the score over that of the best classical solver of no greater cost.
 
-        None where a cost is not known, or every classical solver costs more.
+        Costs that we measured in one run are compared as they are, as the leaderboard
+        does. None where a cost is not known, or every classical solver costs more.
         """
+        measured = self.methods[name].measured
         seconds = self.seconds_per_frame(name)
+        if measured is not None and measured.classical:
+            seconds = measured.seconds_per_frame
         if seconds is None:
             return None
         solvers = {}
         costs = {}
         for solver in CLASSICAL.intersection(self.methods):
-            cost = self.seconds_per_frame(solver)
+            if measured is not None and measured.classical:
+                cost = measured.classical.get(solver)
+            else:
+                cost = self.seconds_per_frame(solver)
             is_scored = self.ranking in self.methods[solver].scores
             if cost is not None and is_scored:
                 solvers[solver] = self.methods[solver].scores[self.ranking]

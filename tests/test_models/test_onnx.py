@@ -23,7 +23,12 @@ from lagbench.board.reproduce import reproduce
 from lagbench.board.submit import submit
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.errors import LagbenchError, UnreadableFileError, WorkFailedError
+from lagbench.errors import (
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.make.generate import GenerationResult
 from lagbench.models.export import export_onnx
 from lagbench.models.onnx_checks import examine
@@ -197,6 +202,51 @@ def test_an_exported_step_predicts_what_it_did(
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_an_exported_step_sees_the_viscosity(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """It stands in the window, so it is an input of the file."""
+
+    def step(window: Batch) -> torch.Tensor:
+        before, now = window.position.unbind(1)
+        assert window.viscosity is not None
+        decay = torch.exp(-1e3 * window.viscosity)[window.sample]
+        return now + decay[:, None] * (now - before)
+
+    path = export_onnx(
+        step,
+        tmp_path / "model.onnx",
+        split=SIZE.split,
+        size=SIZE.name,
+        history=2,
+        root=generated.root,
+    )
+    model = open_onnx(path, size=SIZE, root=generated.root)
+    scenario, expected = first_prediction(step, generated.root)
+    position = model.predict(SIZE.path(generated.root, scenario))
+    assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_what_an_onnx_model_is_not_given_is_told(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    def step(window: Batch) -> torch.Tensor:
+        assert window.obstacle is None
+        radius: torch.Tensor = window.obstacle[:, -1]
+        return window.position[:, -1] * radius.sum()
+
+    with pytest.raises(UsageError) as caught:
+        export_onnx(
+            step,
+            tmp_path / "model.onnx",
+            split=SIZE.split,
+            size=SIZE.name,
+            root=generated.root,
+        )
+    assert "obstacle" in str(caught.value.expected)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_step_over_a_grid_of_particles_is_exported(
