@@ -235,6 +235,7 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
     until(page, f"{label} === 'Pause'")
 
 
+@pytest.mark.slow
 def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:
     """After three ends one picture is asked for per picture of the screen, not four."""
     slider = "document.querySelector('#hero input')"

@@ -197,6 +197,7 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
     assert caught.value.where == "curl-noise tiny, scenario 2, substeps 0 to 12"
 
 
+@pytest.mark.slow
 def test_a_failed_scenario_leaves_what_was_there(
     copied: Callable[[], Path],
     stiff_registry: Registry,

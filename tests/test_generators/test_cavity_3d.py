@@ -49,6 +49,7 @@ def test_walls_slide_along_both_of_their_axes() -> None:
             assert not speed[:, ~expected].any()
 
 
+@pytest.mark.slow
 def test_the_fluid_is_nearly_incompressible(
     tiny_split: Callable[..., GenerationResult],
 ) -> None:

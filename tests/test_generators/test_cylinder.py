@@ -102,6 +102,7 @@ def test_no_fluid_flows_through_the_disc_at_the_start() -> None:
     np.testing.assert_allclose(far[0], [0.2, 0.0], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_disc_is_told_and_no_particle_enters_it(
     tiny_split: Callable[..., GenerationResult],
 ) -> None:

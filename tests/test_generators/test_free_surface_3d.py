@@ -398,6 +398,7 @@ def compiled_in_the_plane(particle_count: int, **constants: float) -> FreeSurfac
     return solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", Material)
 def test_a_flow_that_is_even_along_z_is_that_of_two_dimensions(
     material: Material,
@@ -469,6 +470,7 @@ def test_a_flow_that_is_even_along_z_is_that_of_two_dimensions(
     assert solid_ratio == pytest.approx(ratio, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_splash_is_sound() -> None:
     """The energy never rises by more than 2 % of what is dissipated, particles stay in
     the box, no J reaches its bound.

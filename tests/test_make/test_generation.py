@@ -460,6 +460,7 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert set(select(size)) == everything
 
 
+@pytest.mark.slow
 def test_files_in_three_dimensions_are_estimated_without_velocities(
     unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
 ) -> None:
@@ -642,6 +643,7 @@ def test_a_root_that_is_a_file_is_refused_dry_or_not(
         assert str(tmp_path / "file") in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_registry_of_ones_own_is_all_that_counts(
     tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -526,6 +526,7 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
         np.testing.assert_array_equal(position, solver.position()[0])
 
 
+@pytest.mark.slow
 def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     """It goes the way of a solver that is told each frame's walls, to the bit."""
     size = load().size("cavity", "tiny")
