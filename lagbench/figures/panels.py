@@ -55,6 +55,9 @@ VIEWS = (Panel.FRONT, Panel.ABOVE)
 VIEW_FADE = 0.5
 """Depth of the farthest particle of a view: it is less pale than in the cube."""
 
+CORNERS = 73
+"""Corners of the polygon that shows a disc, one every five degrees."""
+
 OF_PARTICLES = (Panel.SPEED, Panel.MATERIAL, *VIEWS)
 """Panels that show particles, not fields on the grid."""
 
@@ -235,12 +238,11 @@ def draw_walls(
 
 def _draw_disc(axes: Axes, obstacle: NDArray[np.float32]) -> None:
     """Draw a fixed disc, given its centre and radius, over fields and under dots."""
-    from matplotlib.patches import Circle
-
     x, y, radius = obstacle.tolist()
-    disc = Circle((x, y), radius)
-    disc.set(color=MUTED, linewidth=0, zorder=1.5)
-    axes.add_patch(disc)
+    angle = np.linspace(0.0, 2.0 * math.pi, CORNERS)
+    edge_x = x + radius * np.cos(angle)
+    edge_y = y + radius * np.sin(angle)
+    axes.fill(edge_x, edge_y, color=MUTED, linewidth=0, zorder=1.5)
 
 
 def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
