@@ -471,20 +471,14 @@ def _make_tab(
         if any(name in row.curves for row in rows):
             curves.append(name)
     scenarios = tuple(sorted(size.subsets["test"]))
-    reference_rows = []
-    baselines = _naive_scores(references, ranking)
-    for reference in references:
-        reference_row = _make_reference(
-            reference, size, ranking, scope, solver_time=solver_time
-        )
-        if ranking in reference.scores:
-            skill = compute_skill([reference.scores[ranking]], baselines)
-            reference_row = replace(reference_row, skill=_value_of_ratio(skill))
-        shift_score = shift_references.get(reference.name)
-        if shift_score is not None:
-            on_shift = _on_shift([shift_score], shift_references)
-            reference_row = replace(reference_row, on_shift=on_shift)
-        reference_rows.append(reference_row)
+    reference_rows = _reference_rows(
+        references,
+        size,
+        ranking,
+        scope,
+        shift_references=shift_references,
+        solver_time=solver_time,
+    )
     return Tab(
         size=size,
         title=title,
@@ -498,9 +492,33 @@ def _make_tab(
         energy=truth.energy,
         truth=truth.pictures,
         rows=tuple(rows),
-        references=tuple(reference_rows),
+        references=reference_rows,
         solver_seconds=solver_time,
     )
+
+
+def _reference_rows(
+    references: Sequence[ReferenceScores],
+    size: Size,
+    ranking: str,
+    scope: Scope,
+    *,
+    shift_references: Mapping[str, Score],
+    solver_time: float | None,
+) -> tuple[ReferenceRow, ...]:
+    """Return the rows of the reference predictors, with skill and score on shift."""
+    baselines = _naive_scores(references, ranking)
+    rows = []
+    for reference in references:
+        row = _make_reference(reference, size, ranking, scope, solver_time=solver_time)
+        if ranking in reference.scores:
+            skill = compute_skill([reference.scores[ranking]], baselines)
+            row = replace(row, skill=_value_of_ratio(skill))
+        shift_score = shift_references.get(reference.name)
+        if shift_score is not None:
+            row = replace(row, on_shift=_on_shift([shift_score], shift_references))
+        rows.append(row)
+    return tuple(rows)
 
 
 def _find_variants(methods: Sequence[ScoredMethod]) -> Mapping[str, str]:

@@ -168,7 +168,7 @@ def test_no_particle_enters_the_disc() -> None:
 
 def test_the_fringe_damps_the_wake_and_keeps_the_stream() -> None:
     """Behind the fringe the velocity across the stream is small, and the speed is that
-    of the stream to a few per cent.
+    of the stream within 10 %.
     """
     solver = serial_solver()
     solver.load([channel_state()])
