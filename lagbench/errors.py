@@ -286,7 +286,7 @@ def load_entry_point(
     Raises:
         ImportError: its module would end the program. Others raise what they like.
     """
-    note = f"lagbench: still waiting for {point.value}, which another package adds\n"
+    note = f"lagbench: still importing {point.value}, which an entry point names\n"
     timer = threading.Timer(patience, _write_note, (note,))
     timer.daemon = True
     timer.start()

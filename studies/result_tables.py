@@ -26,44 +26,37 @@ from .thesis.split_results import (
 
 
 def summary_table(all_results: Sequence[SplitResults]) -> str:
-    """Return the best predictor of each kind, data set by data set."""
+    """Return the best predictors of each data set: a row per learned or hybrid model."""
     heads = (
         "data set",
         "metric",
         "best naive",
         "best classical",
-        "best learned",
-        "skill",
-        "against_classical",
-        "best hybrid",
+        "kind of model",
+        "best model of this kind",
         "skill",
         "against_classical",
     )
     rows = []
     for results in all_results:
         solver = results.best(Kind.CLASSICAL)
-        rows.append(
-            (
-                results.where,
-                results.ranking,
-                _name_and_score(results, results.best_naive),
-                _name_score_and_cost(results, solver),
-                *_model_cells(results, results.best(Kind.LEARNED)),
-                *_model_cells(results, results.best(Kind.HYBRID)),
+        for kind in (Kind.LEARNED, Kind.HYBRID):
+            model = results.best(kind)
+            if model is None:
+                continue
+            rows.append(
+                (
+                    results.where,
+                    results.ranking,
+                    _name_and_score(results, results.best_naive),
+                    _name_score_and_cost(results, solver),
+                    str(kind),
+                    _name_score_and_cost(results, model),
+                    number(results.skill(model)),
+                    _format_against(results, model),
+                )
             )
-        )
     return markdown(heads, rows)
-
-
-def _model_cells(results: SplitResults, model: str | None) -> tuple[str, str, str]:
-    """Return name with score and cost, skill, and ``against_classical`` of a model."""
-    if model is None:
-        return "-", "-", "-"
-    return (
-        _name_score_and_cost(results, model),
-        number(results.skill(model)),
-        _format_against(results, model),
-    )
 
 
 def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:

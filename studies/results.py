@@ -65,14 +65,19 @@ chapter per data set with all models beside the numbers of the thesis (D. Dharma
 thesis, University of Leeds, 2025)."""
 
 SUMMARY_NOTE = """\
-Scores: less is better. The brackets after a score hold the processor time of a frame on
-one core, on the machine that timed the reference predictors. Learned models were timed
-on another one: their times are multiplied by the ratio of our solver's times on the two
-machines. `against_classical` compares times of one run on one machine where there is
-such a run (`leaderboard/verified.yaml`), as the leaderboard does.
-`skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
-score of the best classical solver that costs no more per frame, with its 95 % interval:
-below 1 learning pays. A hybrid is a solver with a learned part."""
+A row compares the best learned model, or the best hybrid, of a data set with the best
+predictors that are not trained. A hybrid is a solver with a learned part. A lower score
+is better.
+
+- The time in brackets after a score is the processor time of one frame on one core, on
+  the machine that timed the reference predictors. Learned models were timed on another
+  machine. Their times are therefore multiplied by the ratio of our solver's times on the
+  two machines.
+- `skill` is 1 - score / score of the best naive baseline.
+- `against_classical` is score / score of the best classical solver that costs no more
+  per frame. Below 1, learning pays. The brackets hold the 95 % interval, and the name of
+  the solver follows. Which solver costs no more follows from times of one run on one
+  machine, if there is such a run (`leaderboard/verified.yaml`), as on the leaderboard."""
 
 HOW_TO_READ = """\
 ## How to read this page
