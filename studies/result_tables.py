@@ -26,7 +26,7 @@ from .thesis.split_results import (
 
 
 def summary_table(all_results: Sequence[SplitResults]) -> str:
-    """Return the best predictors of each data set: a row per learned or hybrid model."""
+    """Return a row for the best learned and for the best hybrid model of a data set."""
     heads = (
         "data set",
         "metric",

@@ -71,13 +71,13 @@ is better.
 
 - The time in brackets after a score is the processor time of one frame on one core, on
   the machine that timed the reference predictors. Learned models were timed on another
-  machine. Their times are therefore multiplied by the ratio of our solver's times on the
-  two machines.
+  machine. Their times are therefore multiplied by the ratio of our solver's times on
+  the two machines.
 - `skill` is 1 - score / score of the best naive baseline.
 - `against_classical` is score / score of the best classical solver that costs no more
-  per frame. Below 1, learning pays. The brackets hold the 95 % interval, and the name of
-  the solver follows. Which solver costs no more follows from times of one run on one
-  machine, if there is such a run (`leaderboard/verified.yaml`), as on the leaderboard."""
+  per frame. Below 1, learning pays. The brackets hold the 95 % interval, and the name
+  of the solver follows. The costs come from one run on one machine, if there is such a
+  run (`leaderboard/verified.yaml`), as on the leaderboard."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -87,51 +87,52 @@ HOW_TO_READ = """\
   ([references](references.md) says on which grid).
 - **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
   as that baseline, and below 0 is worse.
-- **Cells** are means over test scenarios with 95 % bootstrap intervals over scenarios.
-  After ± stands the standard deviation over seeds, where there are several. The
-  leaderboard resamples seeds too, so its intervals are wider where there are few seeds.
-- **Tests** are two-sided. Where both models have one seed, the test is the exact
-  sign-flip test over scenarios. Else it is the two-way bootstrap over scenarios and
-  seeds. If the two models are one training used in two ways (such as with and without
-  mirror averaging), the differences are tested seed by seed. The p-values are corrected
-  for the number of rivals (Holm). With fewer than six scenarios nothing is claimed.
+- **Cells** hold the mean over the test scenarios, with a 95 % bootstrap interval over
+  scenarios. If a model has several seeds, the number after ± is the standard deviation
+  over the seeds. The leaderboard resamples the seeds too, so its intervals are wider
+  for a model with few seeds.
+- **Tests** are two-sided. If both models have one seed, the test is the exact
+  sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
+  and seeds. One training can be used in two ways, such as with and without mirror
+  averaging; then the two ways are compared seed by seed. The p-values are corrected for
+  the number of rivals (Holm). With fewer than six scenarios nothing is claimed.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
   GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
-  orientation. At size `mini` (about a quarter of the particles, about half the grid)
-  compare only in which order the models come.
+  orientation. Size `mini` has about a quarter of the particles and about half the cells
+  along an axis, so compare only the order of the models there.
 - **Metrics** are defined in [scoring](scoring.md). In the heads ↓ means that less is
   better, ↑ that more is better, and ◎ that the value behind it is best.
-- **Comparisons** have two models. `means` and `seeds` give both, the first one first.
-  `lead` is how much better the first mean is, in the units of the metric; a negative
-  lead means that the second is better. `won` counts the scenarios where the first one
+- **Comparisons** have two models. `means` and `seeds` have a number for each, that of
+  the first model first. `lead` is the amount by which the first mean is better, in the
+  units of the metric; a negative lead means that the second mean is better. `won` counts the scenarios where the first one
   is better.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
 
 CLAIMS_NOTE = """\
-The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means: a
-better mean than three of five models. "Yes" or "better" means significantly better at
-5 %, "no" or "worse" significantly worse, and "open" neither. Two
-models are compared over the seeds that both have, or over all seeds if they share none.
-A dash stands where an entry is missing. All weights of GNS and SuperGAT on cavity mini
+The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means that the
+mean is better than those of three of five models. "Yes" and "better" mean significantly
+better at 5 %. "No" and "worse" mean significantly worse. "Open" means that the test
+finds no difference. Two models are compared over the seeds that both have, or over all
+seeds if they share none. A dash means that an entry is missing. All weights of GNS and SuperGAT on cavity mini
 and curl-noise mini fail a [gate](baselines.md#gates): answers about them speak of
 under-trained weights, not of the methods."""
 
 TRAINING_NOTE = """\
-The three validation columns have the least validation error up to a quarter, half and
-all of the steps, of the first seed; `validated` names its metric. The last column says
-by how much the second half of the steps lowered that error. A model that gained more
-than 2 % has not converged. Hours are without validations, as in the entries; the first
-trainings of NeuralMPM did not time their validations apart."""
+The three validation columns belong to the first seed. They hold the lowest validation
+error up to a quarter, a half and all of the steps. `validated` names the metric of this
+error. The last column says by how much the second half of the steps lowered it. A model
+that gained more than 2 % has not converged. Hours do not include validations, as in the
+entries. Only the hours of the first trainings of NeuralMPM include them."""
 
 COST_NOTE = """\
 Cost. `changed` lists the options of the training or of the prediction that differ from
-the recipe (`none`: no option). Where the seeds differ, the different values stand with
-a slash between them, each once, in the order of the seeds. Without a record of the
-training, both columns have what the entry says. The
-speed-up is our solver's time for a frame, on one core, over that of the model on the
-same machine. Hours are without validations."""
+the recipe; `none` means that no option differs. If the seeds have different values, a
+slash separates the values, in the order of the seeds. If there is no record of the
+training, the columns hold what the entry says. The speed-up is our solver's time for a
+frame, on one core, divided by the time of the model on the same machine. Hours do not
+include validations."""
 
 COMMANDS = """\
 ## How to make these results again
