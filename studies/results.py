@@ -104,8 +104,8 @@ HOW_TO_READ = """\
   better, ↑ that more is better, and ◎ that the value behind it is best.
 - **Comparisons** have two models. `means` and `seeds` have a number for each, that of
   the first model first. `lead` is the amount by which the first mean is better, in the
-  units of the metric; a negative lead means that the second mean is better. `won` counts the scenarios where the first one
-  is better.
+  units of the metric; a negative lead means that the second mean is better.
+  `won` counts the scenarios where the first model is better.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
@@ -115,9 +115,9 @@ The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means tha
 mean is better than those of three of five models. "Yes" and "better" mean significantly
 better at 5 %. "No" and "worse" mean significantly worse. "Open" means that the test
 finds no difference. Two models are compared over the seeds that both have, or over all
-seeds if they share none. A dash means that an entry is missing. All weights of GNS and SuperGAT on cavity mini
-and curl-noise mini fail a [gate](baselines.md#gates): answers about them speak of
-under-trained weights, not of the methods."""
+seeds if they share none. A dash means that an entry is missing. All weights of GNS and
+SuperGAT on cavity mini and curl-noise mini fail a [gate](baselines.md#gates). So the
+answers about them are about under-trained weights, not about the methods."""
 
 TRAINING_NOTE = """\
 The three validation columns belong to the first seed. They hold the lowest validation
@@ -130,9 +130,9 @@ COST_NOTE = """\
 Cost. `changed` lists the options of the training or of the prediction that differ from
 the recipe; `none` means that no option differs. If the seeds have different values, a
 slash separates the values, in the order of the seeds. If there is no record of the
-training, the columns hold what the entry says. The speed-up is our solver's time for a
-frame, on one core, divided by the time of the model on the same machine. Hours do not
-include validations."""
+training, `recipe` and `changed` hold what the entry says. The speed-up is our solver's
+time for a frame, on one core, divided by the time of the model on the same machine.
+Hours do not include validations."""
 
 COMMANDS = """\
 ## How to make these results again
