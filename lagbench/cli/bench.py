@@ -22,7 +22,9 @@ from .solver_bench import bench_solver
 
 
 def bench_command(
-    subject: Annotated[str, typer.Argument(metavar="WHAT", help="solver.")],
+    subject: Annotated[
+        str, typer.Argument(metavar="WHAT", help="What to measure: solver.")
+    ],
     split: SplitOption = None,
     size: NewSizeOption = None,
     frames: Annotated[

@@ -30,9 +30,7 @@ RELEASE_YEAR = 2026
 def cite_command(
     split_argument: SplitArgument = None,
     split_option: SplitOption = None,
-    bibtex: Annotated[
-        bool, option("--bibtex", "Print BibTeX; without a split, of lagbench itself.")
-    ] = False,
+    bibtex: Annotated[bool, option("--bibtex", "Print the BibTeX entry only.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:

@@ -17,7 +17,7 @@ from .output import format_bytes, print_result
 
 RemovedSizeOption = Annotated[
     str | None,
-    option("--size NAME", "tiny, mini or full; needed where several have data here."),
+    option("--size NAME", "tiny, mini or full; needed if several have data here."),
 ]
 
 

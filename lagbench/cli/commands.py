@@ -62,7 +62,7 @@ COMMANDS = (
     CommandEntry(
         name="template",
         target="template:template_command",
-        summary="Write a valid predictions.nc, the persistence prediction, to fill in.",
+        summary="Write a valid predictions.nc for you to fill in; in it nothing moves.",
         example="template cavity --size tiny -o predictions.nc",
     ),
     CommandEntry(
@@ -143,7 +143,7 @@ SEASON_COMMANDS = (
     CommandEntry(
         name="close",
         target="season:close_command",
-        summary="Freeze the models of a leaderboard; the blind seeds follow from them.",
+        summary="Freeze the models of a leaderboard; this fixes the blind scenarios.",
         example="season close spring-2027 --size mini",
     ),
     CommandEntry(
@@ -176,7 +176,7 @@ LEADERBOARD_COMMANDS = (
     CommandEntry(
         name="picture",
         target="leaderboard:picture_command",
-        summary="Draw accuracy against cost of a data set as an SVG file.",
+        summary="Draw the accuracy of models against their cost as an SVG file.",
         example="leaderboard picture cavity --size mini -o cost.svg",
     ),
     CommandEntry(

@@ -41,7 +41,8 @@ def compare_command(
         Path | None,
         option(
             "--board FOLDER",
-            "Folder of the leaderboard; by default leaderboard, or that of the clone.",
+            "Folder of the leaderboard; by default leaderboard here, or else in the "
+            "clone.",
         ),
     ] = None,
     root: RootOption = None,

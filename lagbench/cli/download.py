@@ -30,7 +30,7 @@ def download_command(
         str | None,
         option(
             "--from URL",
-            "Store, or folder of archives; by default the mirrors of the split.",
+            "Address of a store or of archives; by default the mirrors of the split.",
         ),
     ] = None,
     subset: SubsetOption = None,
@@ -43,7 +43,8 @@ def download_command(
         bool,
         option(
             "--or-generate/--no-generate",
-            "Simulate the scenarios that no store has, or end with an error instead.",
+            "Simulate scenarios that no store has; with --no-generate end with an "
+            "error instead.",
         ),
     ] = True,
     workers: WorkersOption = None,

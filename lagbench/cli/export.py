@@ -39,16 +39,16 @@ def export_command(
         bool | None,
         option(
             "--from-walls/--unit-box",
-            "For lagrangebench-h5: measure positions from the lower walls; the default "
-            "for full boxes.",
+            "For lagrangebench-h5: measure positions from the lower walls (the default "
+            "for full boxes), or from the corner of the unit box.",
         ),
     ] = None,
     wall_particles: Annotated[
         bool,
         option(
             "--wall-particles",
-            "Full boxes of two dimensions with four walls: add particles that move "
-            "along with the walls.",
+            "Add particles that move with the walls; only for splits with four walls "
+            "in two dimensions that fluid fills.",
         ),
     ] = False,
     force: Annotated[bool, option("--force", "Replace an earlier export.")] = False,

@@ -48,7 +48,7 @@ def generate_command(
         list[Path] | None,
         option(
             "--gather FOLDER",
-            "Take finished scenarios from another root; repeatable.",
+            "Take finished scenarios from another root folder; repeatable.",
         ),
     ] = None,
     force: Annotated[
@@ -61,8 +61,8 @@ def generate_command(
         str | None,
         option(
             "--season NAME",
-            "Simulate the blind scenarios of this season; of all its data sets by "
-            "default.",
+            "Simulate the blind scenarios of this season, for all its data sets or "
+            "for those of --split and --size.",
         ),
     ] = None,
     board: BoardOption = DEFAULT_BOARD,

@@ -38,8 +38,9 @@ COLUMNS = (
 """Columns of a table of sizes."""
 
 LEGEND = (
-    "scenarios: of train/valid/test, then of extra; particles: of one scenario",
-    "frames: of all scenarios; disk <=: space that they need at most",
+    "scenarios: of train/valid/test, then of extra and shift",
+    "particles: of one scenario; frames: of all scenarios",
+    "disk <=: space that the scenarios need at most",
     "here: whether the scenarios are on this machine",
 )
 """Lines that say what the columns mean."""
@@ -61,7 +62,7 @@ def list_command(
 ) -> None:
     """List all splits and sizes, their cost, and the data on this machine.
 
-    Of one split it also shows the references.
+    For one split it also shows the scores of the reference predictors.
     """
     if split_argument is not None or split_option is not None:
         split = choose_split(split_argument, split_option)

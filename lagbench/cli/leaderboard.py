@@ -83,14 +83,18 @@ def check_command(
     board: BoardOption = DEFAULT_BOARD,
     base: Annotated[
         str | None,
-        option("--base REF", "Find changes to entries that this commit already has."),
+        option("--base REF", "Report changes to entries that this git commit has."),
     ] = None,
     own: Annotated[
         list[str] | None,
         option("--own METHOD", "With --base: an entry that is yours; repeatable."),
     ] = None,
     page: Annotated[
-        bool, option("--page", "Compare index.html and schema.json too.")
+        bool,
+        option(
+            "--page",
+            "Also check that the files index.html and schema.json are up to date.",
+        ),
     ] = False,
     predictions: Annotated[
         list[Path] | None,
@@ -219,7 +223,7 @@ def picture_command(
     board: BoardOption = DEFAULT_BOARD,
     quiet: QuietFlag = False,
 ) -> None:
-    """Draw accuracy against cost of a data set as an SVG file."""
+    """Draw the accuracy of models against their cost as an SVG file."""
     tier = locate_new(split, size).size
     if output.suffix.lower() != ".svg":
         raise UsageError(
@@ -245,10 +249,10 @@ def reproduce_command(
         bool, option("--all", "Reproduce every entry that has a model.")
     ] = False,
     split: Annotated[
-        str | None, option("--split NAME", "With --all: of this split only.")
+        str | None, option("--split NAME", "With --all: entries of this split only.")
     ] = None,
     size: Annotated[
-        str | None, option("--size NAME", "With --all: of this size only.")
+        str | None, option("--size NAME", "With --all: entries of this size only.")
     ] = None,
     scenarios: Annotated[
         int | None,
@@ -259,7 +263,7 @@ def reproduce_command(
     ] = False,
     no_costs: Annotated[bool, option("--no-costs", "Measure no costs.")] = False,
     again: Annotated[
-        bool, option("--again", "Run again what is recorded already.")
+        bool, option("--again", "Run models again that have a recorded result.")
     ] = False,
     recording: Annotated[
         bool, option("--record/--no-record", "Write the result to verified.yaml.")
@@ -365,13 +369,13 @@ def shift_command(
         bool, option("--all", "Score every entry that has a model.")
     ] = False,
     split: Annotated[
-        str | None, option("--split NAME", "With --all: of this split only.")
+        str | None, option("--split NAME", "With --all: entries of this split only.")
     ] = None,
     size: Annotated[
-        str | None, option("--size NAME", "With --all: of this size only.")
+        str | None, option("--size NAME", "With --all: entries of this size only.")
     ] = None,
     again: Annotated[
-        bool, option("--again", "Predict again what is recorded already.")
+        bool, option("--again", "Run models again that have a recorded result.")
     ] = False,
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
@@ -383,7 +387,7 @@ def shift_command(
 ) -> None:
     """Score the models of entries on shift, which lies outside train.
 
-    The subset is predicted anew; the result is written to shift.yaml.
+    The models predict the subset, and the scores go to shift.yaml.
 
     Exit code 0: all models ran
     2: no such entry, or one without a model

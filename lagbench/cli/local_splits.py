@@ -31,7 +31,8 @@ DescribeOption = Annotated[
     Path | None,
     option(
         "--describe FILE",
-        "YAML file that describes the data, see docs/exchange.md; other options win.",
+        "YAML file that describes the data (docs/exchange.md); options replace its "
+        "values.",
     ),
 ]
 RadiusOption = Annotated[
@@ -49,11 +50,15 @@ BoundsOption = Annotated[
 ]
 PeriodicOption = Annotated[
     str | None,
-    option("--periodic AXES", "Axes of the box without walls, as in x,y; or none."),
+    option(
+        "--periodic AXES", "Axes along which the box is periodic, as in x,y; or none."
+    ),
 ]
 RescaleFlag = Annotated[
     bool,
-    option("--rescale", "Scale the bounds into the unit box, by a power of two."),
+    option(
+        "--rescale", "Scale positions by a power of two so that they fit the unit box."
+    ),
 ]
 InputFramesOption = Annotated[
     int | None,
@@ -77,7 +82,8 @@ FullBoxFlag = Annotated[
     bool | None,
     option(
         "--full-box/--free-surface",
-        "Whether material fills the box; then a metric of vorticity ranks.",
+        "Whether material fills the box. Then the error of the vorticity ranks, else "
+        "the distance of particle clouds.",
     ),
 ]
 
@@ -96,7 +102,10 @@ def import_command(
     output: OutputOption,
     kinds: Annotated[
         str | None,
-        option("--kinds LIST", "Materials of particle kinds, as in 3=jelly,0=drop."),
+        option(
+            "--kinds LIST",
+            "Material of each particle kind, as in 3=jelly; 0=drop leaves out kind 0.",
+        ),
     ] = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
@@ -114,7 +123,7 @@ def import_command(
 ) -> None:
     """Make a local split from the data of another code base.
 
-    Models train and are scored on a local split as on any other.
+    You train and score models on a local split as on any other split.
     """
     with progress_bar(quiet=quiet) as progress:
         local_split = import_split(
@@ -141,13 +150,15 @@ def adopt_command(
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     valid: Annotated[
-        int | None, option("--valid N", "Trajectories of valid; a tenth by default.")
+        int | None,
+        option("--valid N", "Number of trajectories for valid; a tenth by default."),
     ] = None,
     test: Annotated[
         int | None,
         option(
             "--test N",
-            "Trajectories of test; by default a tenth, but six where there are many.",
+            "Number of trajectories for test; by default a tenth, and six or more if "
+            "there are enough.",
         ),
     ] = None,
     bounds: BoundsOption = None,

@@ -35,11 +35,11 @@ def option(names_and_value: str, help_text: str, **settings: Any) -> Any:  # noq
 
 
 SplitArgument = Annotated[
-    str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")
+    str | None, typer.Argument(metavar="SPLIT", help="The split, as with --split.")
 ]
 SplitOption = Annotated[
     str | None,
-    option("--split NAME", "Name of the data set; `lagbench list` shows all names."),
+    option("--split NAME", "Name of the split; `lagbench list` shows all names."),
 ]
 NewSizeOption = Annotated[
     str | None, option("--size NAME", "tiny, mini or full; mini by default.")

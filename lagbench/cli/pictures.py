@@ -53,8 +53,8 @@ def plot_command(
         str,
         option(
             "--kind NAME",
-            "all, speed, material, vorticity, streamlines; of boxes of three "
-            "dimensions also front or above.",
+            "all, speed, material, vorticity, streamlines; for three-dimensional "
+            "boxes also front or above.",
         ),
     ] = "all",
     sheet: Annotated[

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
 
 WeightsArgument = Annotated[
-    Path, typer.Argument(metavar="FILE", help="weights.pt, safetensors, or ONNX.")
+    Path,
+    typer.Argument(
+        metavar="FILE", help="A trained model: weights.pt, safetensors or ONNX."
+    ),
 ]
 PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]
 OnnxSplitOption = Annotated[

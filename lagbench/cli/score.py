@@ -46,8 +46,8 @@ def score_command(
         Path | None,
         option(
             "--output -o FOLDER",
-            "Folder of the scores; by default gns/ beside gns.nc. Each of several "
-            "files gets a folder of its own name in it.",
+            "Folder of the scores; by default gns/ beside gns.nc. With several files, "
+            "each gets a folder in it, named after the file.",
         ),
     ] = None,
     report: Annotated[
@@ -58,7 +58,10 @@ def score_command(
     scheduler: SchedulerOption = None,
     extras: Annotated[
         str,
-        option("--extras NAMES", "Extras whose metrics are added, as in transport."),
+        option(
+            "--extras NAMES",
+            "Also compute the metrics of these extras, as in transport.",
+        ),
     ] = "",
     every: Annotated[
         bool, option("--all", "Show every metric, frame of interest and scenario.")

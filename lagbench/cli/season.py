@@ -61,8 +61,8 @@ def close_command(
         float | None,
         option(
             "--budget SECONDS",
-            "Most processor time of a model in a data set, by the cost that its entry "
-            "states. Dearer models predict the first scenarios only, four at least.",
+            "Limit of the processor time of one model on one data set, estimated from "
+            "its entry. Dearer models predict fewer scenarios, but at least four.",
             min=0.0,
         ),
     ] = None,
@@ -83,7 +83,7 @@ def close_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Freeze the models of a leaderboard; the blind seeds follow from them.
+    """Freeze the models of a leaderboard; this fixes the blind scenarios.
 
     Exit code 0: closed
     1: a model is not the one that its entry names
@@ -137,7 +137,7 @@ def _describe_season(season: Season, path: Path) -> Iterator[str]:
 def run_command(
     name: SeasonArgument,
     again: Annotated[
-        bool, option("--again", "Predict again what an earlier run has scored.")
+        bool, option("--again", "Run models again that an earlier run has scored.")
     ] = False,
     check: Annotated[
         bool,
@@ -155,11 +155,11 @@ def run_command(
 
     An interrupted run goes on where it stopped.
 
-    Exit code 0: done, or the same scores
-    1: other scores, or a model is not the frozen one
+    Exit code 0: done; with --check, the scores agree
+    1: with --check, the scores differ; or a model is not the frozen one
     2: no such season
     3: a model cannot be read
-    4: blind scenarios are missing or others
+    4: blind scenarios are missing, or not those of the season
     5: out of memory or disk
     """
     with progress_bar(quiet=quiet or as_json) as progress:

@@ -51,7 +51,7 @@ def submit_command(
     ] = None,
     urls: Annotated[
         list[str] | None,
-        option("--url URL", "Address of a FILE; one for each FILE."),
+        option("--url URL", "Public address of a FILE; one for each FILE."),
     ] = None,
     weights: Annotated[
         list[Path] | None,
@@ -66,7 +66,7 @@ def submit_command(
     ] = False,
     add: Annotated[
         bool,
-        option("--add", "Add seeds to the entry of that name and keep its others."),
+        option("--add", "Add seeds to the entry of that name; keep its other seeds."),
     ] = False,
     new_board: Annotated[
         bool, option("--new-board", "Begin a leaderboard in the folder of --board.")

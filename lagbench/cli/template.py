@@ -33,7 +33,7 @@ def template_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Write a valid predictions.nc, the persistence prediction, to fill in."""
+    """Write a valid predictions.nc for you to fill in; in it nothing moves."""
     result = template(split, size, output=output, overwrite=overwrite, root=root)
     first, last = result.frames
     scenarios = format_count(len(result.scenarios), "scenario")

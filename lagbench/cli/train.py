@@ -77,7 +77,10 @@ FreshFlag = Annotated[
     bool, option("--fresh", "Start anew and replace an earlier training.")
 ]
 ProcessesOption = Annotated[
-    int, option("--processes N", "Processes, each with a device (DDP).", min=1)
+    int,
+    option(
+        "--processes N", "Processes of the training, each with its own device.", min=1
+    ),
 ]
 
 
