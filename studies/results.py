@@ -115,9 +115,10 @@ The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means tha
 mean is better than those of three of five models. "Yes" and "better" mean significantly
 better at 5 %. "No" and "worse" mean significantly worse. "Open" means that the test
 finds no difference. Two models are compared over the seeds that both have, or over all
-seeds if they share none. A dash means that an entry is missing. All weights of GNS and
-SuperGAT on cavity mini and curl-noise mini fail a [gate](baselines.md#gates). So the
-answers about them are about under-trained weights, not about the methods."""
+seeds if they share none. A dash means that an entry is missing. On cavity mini and
+curl-noise mini all weights of the entries `gns` and `supergat` fail a
+[gate](baselines.md#gates). So the answers about these two are about under-trained
+weights, not about the methods."""
 
 TRAINING_NOTE = """\
 The three validation columns belong to the first seed. They hold the lowest validation
