@@ -196,8 +196,8 @@ Both sides are seeds of one method, so the test may tell them apart in at most 5
 of the draws (give or take 1.4 percentage points, the error of so many draws). With one
 seed a side the test is the sign-flip test over scenarios. Its answer is right for those
 weights. As an answer about the method it is wrong as often as the first column says. So
-the leaderboard then speaks of "these weights". It says so too if one side has one seed and the
-other side several: nothing is known about the scatter of the side with one seed.
+the leaderboard then speaks of "these weights". It says so too if one side has one seed
+and the other side several: the scatter of the side with one seed is unknown.
 
 | case | 1 seed a side | 1 against {seeds} seeds | 2 a side | 3 a side | 5 a side |
 |---|---|---|---|---|---|
