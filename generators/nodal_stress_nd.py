@@ -601,12 +601,14 @@ class NodalStressND:
                 divergence = divergence + slope[axis]
         v = v + carry
 
-        x = ti.Vector([0.0, 0.0, 0.0])
+        place = ti.Vector([0.0, 0.0, 0.0])
         for axis in ti.static(range(self.dimension)):
             target = self.x[s, p][axis] + (self.dt * grid_v[axis] + shift[axis])
-            x[axis] = self.kept_inside(target, axis)
+            place[axis] = self.kept_inside(target, axis)
+        x = place
         if ti.static(self.has_obstacle):
-            x = self.kept_outside(s, x)
+            # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
+            x = self.kept_outside(s, place)
         jacobian = carried[3]
         jacobian = (
             jacobian

@@ -35,7 +35,7 @@ from lagbench.make.generate import generate
 from lagbench.make.verify import verify
 
 SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
-LARGE_RELATIVES = ("decaying-vortices",)
+LARGE_RELATIVES = ("decaying-vortices", "poiseuille", "curl-noise-3d", "fluid-3d")
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,9 @@ LARGE_RELATIVES = ("decaying-vortices",)
         ("cavity", 0.1, (8192, 40, 50, 45_600, 48, 8, 20)),
         ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
         ("decaying-vortices", 0.1, (16_384, 64, 48, 14_400, 48, 8, 16)),
+        ("poiseuille", 0.1, (16_384, 64, 48, 8_640, 48, 8, 16)),
+        ("curl-noise-3d", 0.1, (54_872, 24, 18, 6_912, 48, 8, 16)),
+        ("fluid-3d", 1 / 60, (20_736, 48, 24, 10_800, 48, 8, 16)),
     ],
 )
 def test_full_sizes_are_those_of_the_documentation(
