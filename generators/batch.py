@@ -81,6 +81,12 @@ def substep_count(size: Size, scenario: int) -> int:
     return last_frame * size.substeps_per_frame
 
 
+def perturbed_substep_count(size: Size, scenario: int) -> int:
+    """Return how many substeps a perturbed run takes: it ends with the horizon."""
+    omitted = size.frames_behind(scenario) * size.substeps_per_frame
+    return substep_count(size, scenario) - omitted
+
+
 def draw_initial_state(size: Size, scenario: int) -> InitialState:
     """Draw a scenario before its first substep.
 

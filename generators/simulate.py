@@ -38,7 +38,6 @@ from .batch import (
     ScenarioBatch,
     SimulationJob,
     SimulationPace,
-    substep_count,
 )
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
@@ -292,12 +291,6 @@ def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
     shape = (size.particles, size.box.dimension)
     signs = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
     return (QUANTUM * signs).astype(np.float32)
-
-
-def perturbed_substep_count(size: Size, scenario: int) -> int:
-    """Return how many substeps a perturbed run takes: it ends with the horizon."""
-    omitted = size.frames_behind(scenario) * size.substeps_per_frame
-    return substep_count(size, scenario) - omitted
 
 
 def measure_predictability(

@@ -22,10 +22,11 @@ class PageData:
     tabs: list[dict[str, Any]]
     hero: dict[str, Any] | None
     levels: NDArray[np.int16]
+    starts: dict[str, int]  # place of the first number by kind of array
 
     def array(self, reference: dict[str, Any]) -> NDArray[np.float64]:
         """Return an array, shape [row, column], NaN where missing."""
-        return read_array(self.levels, reference)
+        return read_array(self.levels, self.starts, reference)
 
 
 def read_page_data(page: str) -> PageData:
@@ -35,7 +36,9 @@ def read_page_data(page: str) -> PageData:
     levels = read_levels(arrays)
     for tab in data["tabs"]:
         tab["columns"] = [data["columns"][place] for place in tab["columns"]]
-    return PageData(tabs=data["tabs"], hero=data["hero"], levels=levels)
+    return PageData(
+        tabs=data["tabs"], hero=data["hero"], levels=levels, starts=data["starts"]
+    )
 
 
 def read_levels(data: bytes) -> NDArray[np.int16]:
@@ -56,16 +59,17 @@ def element_text(page: str, name: str) -> str:
 
 
 def read_array(
-    levels: NDArray[np.int16], reference: dict[str, Any]
+    levels: NDArray[np.int16], starts: dict[str, int], reference: dict[str, Any]
 ) -> NDArray[np.float64]:
     """Return an array from all levels and the reference to it, number by number."""
     rows = reference["rows"]
     columns = reference["columns"]
+    start = starts[reference["kind"]] + reference["start"]
     values = np.empty((rows, columns))
     for column in range(columns):
         level = 0
         for row in range(rows):
-            place = reference["start"] + row * columns + column
+            place = start + row * columns + column
             # differences wrap around at 16 bits
             level = (level + int(levels[place]) + 2**15) % 2**16 - 2**15
             value = reference["zero"] + reference["step"] * level

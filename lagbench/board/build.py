@@ -132,6 +132,11 @@ MAP_FRAMES = 4  # most frames of vorticity maps and histograms
 MAP_NODES = 20  # most nodes of a map, a side
 RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
 
+PICTURED_METHODS = 80
+"""Most methods on all tabs together that have maps, histograms and a film: two thirds
+of a page of 150 entries would be theirs.
+"""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScoredMethod:
@@ -274,6 +279,7 @@ def collect(
                 tabs.append(tab)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
                 empty.append(data_set)
+    tabs = picture_first(tabs, PICTURED_METHODS)
 
     shown: set[str] = set()
     for tab in tabs:
@@ -495,6 +501,45 @@ def _make_tab(
         references=reference_rows,
         solver_seconds=solver_time,
     )
+
+
+def picture_first(tabs: Sequence[Tab], most: int) -> list[Tab]:
+    """Return tabs with pictures of the first methods alone, where there are too many.
+
+    Each tab keeps those of equally many methods, one at least, and those of their
+    variants.
+
+    Args:
+        tabs: all tabs of a board.
+        most: most methods with pictures on all tabs together.
+    """
+    methods_of_tabs = []
+    for tab in tabs:
+        methods_of_tabs.append([row.id for row in tab.rows if row.variant_of is None])
+    counts = [len(methods) for methods in methods_of_tabs]
+    pictured_count = max(counts, default=0)
+    while pictured_count > 1 and _sum_up_to(pictured_count, counts) > most:
+        pictured_count -= 1
+
+    pictured_tabs = []
+    for tab, methods in zip(tabs, methods_of_tabs, strict=True):
+        if len(methods) <= pictured_count:
+            pictured_tabs.append(tab)
+            continue
+        pictured = methods[:pictured_count]
+        rows = []
+        for row in tab.rows:
+            if row.id in pictured or row.variant_of in pictured:
+                rows.append(row)
+            else:
+                rows.append(replace(row, pictures=None, residuals=()))
+        pictured_tabs.append(replace(tab, rows=tuple(rows), pictured=pictured_count))
+    return pictured_tabs
+
+
+def _sum_up_to(highest: int, counts: Sequence[int]) -> int:
+    """Return the sum of some counts, those above a highest one cut down to it."""
+    return sum(min(count, highest) for count in counts)
 
 
 def _reference_rows(
@@ -804,10 +849,11 @@ def make_curve(score: Score) -> Curve:
 def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
     """Return where particles stand in the picture, shape [film frame, particle, 2].
 
-    Those of two dimensions stand where they are.
+    Those of two dimensions stand where they are, in memory of their own: a view would
+    keep the film of the other side.
     """
     if box.dimension == 2:
-        return film
+        return film.copy()
     return np.asarray(View(box).place(film), np.float32)
 
 

@@ -201,6 +201,8 @@ class Tab:
     references: tuple[ReferenceRow, ...]
     # processor time of a frame of the solver itself [s]
     solver_seconds: float | None = None
+    # methods from the first on that have pictures; None where all rows have them
+    pictured: int | None = None
 
     @property
     def id(self) -> str:

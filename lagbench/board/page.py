@@ -19,7 +19,6 @@ from itertools import groupby
 from lagbench.addresses import DOCUMENTATION
 from lagbench.figures.colours import DARK, LIGHT, format_variables
 from lagbench.figures.html import (
-    MISSING,
     Markup,
     clipped,
     escaped,
@@ -475,7 +474,7 @@ def _lowest_level(method: MethodOverview) -> str:
 
 def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row is None:
-        return tag("td", MISSING, class_="missing")
+        return tag("td")  # the style sheet writes a dash
     remarks = []
     if row.rank is not None:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
@@ -652,6 +651,13 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "Click a row for curves, maps, a film, every number and the command that makes "
         "it again. Ranks follow the ranking metric."
     )
+    if tab.pictured is not None:
+        count = _count(tab.pictured, "method", "methods")
+        yield escaped(
+            f"Maps, distributions and films are those of the first {count} of each "
+            "data set: with those of all the page would be too long. lagbench score "
+            "PREDICTIONS --report FOLDER draws them for any predictions."
+        )
     claim = (
         "There are too few test scenarios to tell entries apart: the intervals speak "
         "alone."

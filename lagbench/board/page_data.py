@@ -14,13 +14,14 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
 from lagbench.figures.html import MISSING, text, words
 
 from .columns import describe_check, format_ranks
-from .encoding import ArrayStore
+from .encoding import ArrayStore, Reference
 from .entry import Entry
 from .model import (
     BoardRow,
@@ -60,6 +61,7 @@ COLOURS = {
 """Colours of films and maps; those of charts stand in the style sheet."""
 
 Plain = dict[str, Any]
+Floats32 = NDArray[np.float32]
 
 
 def page_data(
@@ -76,9 +78,16 @@ def page_data(
     tabs = []
     for view in views:
         tabs.append(_TabWriter(view, arrays, columns).tab())
-    data = {"colours": COLOURS, "hero": None, "columns": columns, "tabs": tabs}
+    first_film = None
     if hero is not None:
-        data["hero"] = _hero(*hero, arrays)
+        first_film = _hero(*hero, arrays)
+    data = {
+        "colours": COLOURS,
+        "hero": first_film,
+        "columns": columns,
+        "tabs": tabs,
+        "starts": arrays.starts(),
+    }
     encoded = json.dumps(
         data, ensure_ascii=True, allow_nan=False, separators=(",", ":")
     )
@@ -91,8 +100,7 @@ def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
         return None
     films = []
     for pictures in (tab.truth, row.pictures):
-        film = pictures.film.reshape(len(pictures.film), -1)
-        films.append(arrays.add(film, levels=FILM_LEVELS))
+        films.append(_add_film(pictures.film, arrays))
     materials = row.pictures.material.tolist()
     return {
         "tab": tab.id,
@@ -102,6 +110,12 @@ def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
         "films": films,
         "key": [[i, MATERIAL_NAMES[i]] for i in sorted(set(materials))],
     }
+
+
+def _add_film(film: Floats32, arrays: ArrayStore) -> Reference:
+    """Add positions of shape [film frame, particle, 2]."""
+    frames = film.reshape(len(film), -1)
+    return arrays.add(frames, kind="film", levels=FILM_LEVELS)
 
 
 class _TabWriter:
@@ -144,6 +158,7 @@ class _TabWriter:
             "columns": self._columns(),
             "presets": self._view.presets,
             "curves": curves,
+            "pictured": tab.pictured,
             "energy": self._mean_curve(tab.energy),
             "truth": self._pictures(tab.truth),
             "references": references,
@@ -261,7 +276,9 @@ class _TabWriter:
         spread = {}
         for name in self._tab.columns[:MOST_SPREADS]:
             if name in values:
-                spread[name] = self._arrays.add(np.array(values[name].per_scenario))
+                # one row: neighbouring scenarios have nothing in common
+                row = np.array([values[name].per_scenario])
+                spread[name] = self._arrays.add(row, kind="spread")
         return spread
 
     def _at_marked_frames(self, values: Mapping[str, Value]) -> Plain:
@@ -290,9 +307,9 @@ class _TabWriter:
     def _points(self, curve: Curve, values: Floats) -> Plain:
         """Return frames and values of shape [frame, 1 or 3]."""
         return {
-            "frames": self._arrays.add_whole(curve.frames),
+            "frames": self._arrays.add_whole(curve.frames, kind="frames"),
             "values": self._arrays.add(
-                values, prefer_logarithmic=True, levels=CURVE_LEVELS
+                values, kind="curve", prefer_logarithmic=True, levels=CURVE_LEVELS
             ),
         }
 
@@ -300,7 +317,9 @@ class _TabWriter:
         return {
             "low": round_digits(histogram.low, 6),
             "high": round_digits(histogram.high, 6),
-            "shares": self._arrays.add(histogram.shares, levels=HISTOGRAM_LEVELS),
+            "shares": self._arrays.add(
+                histogram.shares, kind="histogram", levels=HISTOGRAM_LEVELS
+            ),
         }
 
     def _pictures(self, pictures: Pictures | None) -> Plain | None:
@@ -314,7 +333,8 @@ class _TabWriter:
         film = pictures.film[frames][:, particles]  # shape [frame, particle, 2]
         maps_of_vorticity = []
         for field in fields:
-            maps_of_vorticity.append(self._arrays.add(field, levels=MAP_LEVELS))
+            vorticity_map = self._arrays.add(field, kind="map", levels=MAP_LEVELS)
+            maps_of_vorticity.append(vorticity_map)
         histograms = []
         for histogram in pictures.histograms:
             histograms.append(self._histogram(histogram))
@@ -329,7 +349,7 @@ class _TabWriter:
             "histograms": histograms,
             "filmFrames": film_frames,
             "material": pictures.material[particles].tolist(),
-            "film": self._arrays.add(film.reshape(len(frames), -1), levels=FILM_LEVELS),
+            "film": _add_film(film, self._arrays),
         }
 
 

@@ -399,7 +399,10 @@ class Plot:
 
 
 def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:
-    """Return a dot with its label; the element takes the keyboard's focus."""
+    """Return a dot with its label; the element takes the keyboard's focus.
+
+    Its title is what screen readers say.
+    """
     x, y = point
     place = {"cx": f"{x:.1f}", "cy": f"{y:.1f}"}
     parts = [
@@ -416,7 +419,7 @@ def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:
     else:
         element = "a"
         attributes = {"href": spot.href}
-    return tag(element, *parts, class_=kind, **attributes, aria_label=spot.description)
+    return tag(element, *parts, class_=kind, **attributes)
 
 
 # lengths of a chart of bars [pixel]

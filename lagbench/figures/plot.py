@@ -47,6 +47,7 @@ __all__ = [
     "check_kind",
     "contact_sheet",
     "describe",
+    "draw_contact_sheet",
     "plot_frame",
     "scenario_files",
 ]
@@ -291,24 +292,52 @@ def contact_sheet(
     """
     tier, folder, splits = locate(split, size, root=root, registry=registry)
     update_working_copy(tier, folder, tier.scenarios)
-    files = scenario_files(tier, folder)
-    if not files:
-        where = f"{tier.split} {size} under {folder}"
-        raise DataError(
-            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
-        )
     panel = None
     if kind is not None and kind != ALL:
         check_kind(kind)
         panel = Panel(kind)
         _check_view(panel, tier)
+    return draw_contact_sheet(
+        tier, folder, output, registry=splits, panel=panel, frame=frame, dpi=dpi
+    )
 
-    kinds = _first_of_each_kind(files, splits)
+
+def draw_contact_sheet(
+    tier: Size,
+    folder: Path,
+    output: str | Path,
+    *,
+    registry: Registry,
+    panel: Panel | None = None,
+    frame: int | None = None,
+    dpi: int = DPI,
+) -> Path:
+    """Draw the scenarios of a data set that lies in a root folder on one page.
+
+    Args:
+        tier: the data set.
+        folder: folder that holds all data sets.
+        output: file to write, ending in .png, .pdf or .svg.
+        registry: where splits are described.
+        panel: what each panel shows; the default suits the split.
+        frame: see ``contact_sheet``.
+        dpi: pixels per inch.
+
+    Raises:
+        DataError: no scenario is there, or a file is damaged.
+    """
+    files = scenario_files(tier, folder)
+    if not files:
+        where = f"{tier.split} {tier.name} under {folder}"
+        raise DataError(
+            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
+        )
+    kinds = _first_of_each_kind(files, registry)
     if kinds:
-        sheet = _arrange_over_time(kinds, panel, splits)
+        sheet = _arrange_over_time(kinds, panel, registry)
     else:
-        sheet = _arrange_table(files, panel, frame=frame, splits=splits)
-    title = f"{splits.split(tier.split).title} · {tier.split} {size}"
+        sheet = _arrange_table(files, panel, frame=frame, splits=registry)
+    title = f"{registry.split(tier.split).title} · {tier.split} {tier.name}"
     return _draw_sheet(sheet, title, output, dpi=dpi)
 
 

@@ -96,14 +96,12 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
 def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
     """Paint a contact sheet of all scenarios and one frame of a test scenario."""
     # the drawing modules are loaded only where there is something to paint
-    from lagbench.figures.plot import contact_sheet, plot_frame
+    from lagbench.figures.plot import draw_contact_sheet, plot_frame
 
     registry = Registry({size.split: split}, {})
     folder = size.folder(root)
     sheet_name, frame_name = PICTURES
-    contact_sheet(
-        size.split, size.name, folder / sheet_name, root=root, registry=registry
-    )
+    draw_contact_sheet(size, root, folder / sheet_name, registry=registry)
 
     entry = _first_test_entry(manifest)
     frame = min(size.task.frames_of_interest[-1], entry.frames - 1)

@@ -35,11 +35,14 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Registry, Size, Split
 from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, suggest_name
-from lagbench.generators.batch import SimulationJob, SimulationPace
+from lagbench.generators.batch import (
+    SimulationJob,
+    SimulationPace,
+    perturbed_substep_count,
+)
 from lagbench.generators.simulate import (
     SimulatedScenario,
     measure_predictability,
-    perturbed_substep_count,
     simulate,
 )
 from lagbench.generators.split import Device

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from page_reader import read_array, read_levels
 
-from lagbench.board.encoding import LEVELS, ArrayStore, decode, encode
+from lagbench.board.encoding import LEVELS, ArrayStore, Reference, decode, encode
 from lagbench.board.sampling import coarsen
 
 # Taichi, once started in this process, makes its thread round subnormals to zero.
@@ -20,10 +20,10 @@ NUMBERS = st.floats(-1e6, 1e6, allow_subnormal=False)
 GAP = st.just(float("nan"))
 
 
-def restore(store: ArrayStore, reference: dict[str, float | bool]) -> NDArray:
+def restore(store: ArrayStore, reference: Reference) -> NDArray:
     """Return an array as the page's script reads it."""
     levels = read_levels(store.to_bytes())
-    return read_array(levels, reference)
+    return read_array(levels, store.starts(), reference)
 
 
 @given(
@@ -37,7 +37,7 @@ def test_numbers_come_back_within_half_a_step(
     """Gaps stay gaps; on a logarithmic scale half a step of the logarithm."""
     array = np.array(values)
     store = ArrayStore()
-    reference = store.add(array, prefer_logarithmic=prefer_logarithmic)
+    reference = store.add(array, kind="a", prefer_logarithmic=prefer_logarithmic)
     restored = restore(store, reference)[:, 0]
 
     is_gap = np.isnan(array)
@@ -66,8 +66,9 @@ def test_rows_and_columns_keep_their_places(rows: int, columns: int, seed: int) 
     rng = np.random.default_rng(seed)
     values = rng.random((rows, columns))
     store = ArrayStore()
-    store.add([1.0, 2.0, 4.0])
-    reference = store.add(values)
+    store.add([1.0, 2.0, 4.0], kind="a")
+    reference = store.add(values, kind="b")
+    store.add([3.0, 5.0], kind="a")
     restored = restore(store, reference)
     assert_allclose(restored, values, atol=0.51 / LEVELS)
 
@@ -76,9 +77,9 @@ def test_whole_numbers_are_exact_and_stand_once() -> None:
     """Frames of many curves are the same: the second array takes no room."""
     store = ArrayStore()
     frames = [10, 11, 500, 7]
-    first = store.add_whole(frames)
+    first = store.add_whole(frames, kind="a")
     length = len(store.to_bytes())
-    second = store.add_whole(frames)
+    second = store.add_whole(frames, kind="a")
     assert first == second
     assert len(store.to_bytes()) == length
     restored = restore(store, first)

@@ -17,6 +17,7 @@ from numpy.testing import assert_allclose
 from page_reader import element_text, read_page_data
 from sample_boards import make_board, with_entry
 
+from lagbench.board.build import picture_first
 from lagbench.board.columns import columns_of
 from lagbench.board.encoding import HARMLESS, decode
 from lagbench.board.entry import EntryCost, EntryFlag, Weights
@@ -298,6 +299,36 @@ def test_variants_have_no_film(board: Board) -> None:
     assert head_data["pictures"] is not None
     assert variant_data["pictures"] is None
     assert variant_data["variantOf"] == head.id
+
+
+def test_many_methods_have_no_film(board: Board) -> None:
+    """The first of every tab have one, and their variants; the page says how many."""
+    methods = [len(tab.rows) for tab in board.tabs]
+    assert methods == [8, 8]
+    assert picture_first(board.tabs, most=16) == list(board.tabs)
+
+    head, variant, *others = board.tabs[0].rows
+    variant = replace(variant, variant_of=head.id, rank=None)
+    tabs = [first_tab(board, head, *others, variant), board.tabs[1]]
+    pictured = picture_first(tabs, most=7)
+    assert [tab.pictured for tab in pictured] == [3, 3]
+    for tab in pictured:
+        has_pictures = [row.pictures is not None for row in tab.rows[:7]]
+        assert has_pictures == 3 * [True] + 4 * [False]
+    assert pictured[0].rows[-1].pictures is not None  # the variant of the first
+
+    page = page_of(board, *pictured)
+    assert "those of the first 3 methods" in page
+    first = read_page_data(page).tabs[0]
+    assert first["pictured"] == 3
+    assert [row["pictures"] is not None for row in first["rows"][:4]].count(True) == 3
+
+
+def test_every_tab_has_a_film(board: Board) -> None:
+    """The first method has one, however few may have one on the whole page."""
+    pictured = picture_first(board.tabs, most=1)
+    assert [tab.pictured for tab in pictured] == [1, 1]
+    assert picture_first([], most=1) == []
 
 
 def test_the_first_film_is_of_several_materials(board: Board) -> None:

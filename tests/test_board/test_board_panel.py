@@ -27,6 +27,7 @@ from browser import (
 from numpy.testing import assert_allclose
 from sample_boards import make_board, with_entry
 
+from lagbench.board.build import picture_first
 from lagbench.board.cost import points_of
 from lagbench.board.entry import EntryFlag
 from lagbench.board.model import Board
@@ -146,6 +147,28 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
     run(page, f"{errors}.querySelector('select').value = 'vorticity_pearson'")
     run(page, f"{errors}.querySelector('select').dispatchEvent(new Event('change'))")
     assert "stable above 0.95" in page.value(f"{errors}.textContent")
+
+
+def test_panel_without_pictures_says_so(
+    running: Browser, board: Board, tmp_path: Path
+) -> None:
+    """An entry behind those with a film has curves; the panel says who has films."""
+    tabs = picture_first(board.tabs, most=2)
+    path = tmp_path / "index.html"
+    path.write_text(render(replace(board, tabs=tuple(tabs))), encoding="utf-8")
+    page = running.open(path, width=1280)
+    still(page)
+    last = tabs[0].rows[5]
+    restored(page, f"#tab=cavity-full&entry={last.id}")
+    drawn = page.value(
+        "[...document.querySelectorAll('#panel [data-figure]')].map(f => "
+        "f.dataset.figure)"
+    )
+    assert drawn == ["errors", "scenarios", "energy"]
+    panel = page.value("document.querySelector('#panel').textContent")
+    assert "films of the first 2 methods" in panel
+    assert page.messages == []
+    close(page)
 
 
 def test_map_shows_the_field(page: Page, board: Board) -> None:

@@ -16,11 +16,13 @@ from click.testing import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, Size, load
-from lagbench.generators.batch import SimulationJob, SimulationPace, substep_count
-from lagbench.generators.simulate import (
+from lagbench.generators.batch import (
+    SimulationJob,
+    SimulationPace,
     perturbed_substep_count,
-    simulate,
+    substep_count,
 )
+from lagbench.generators.simulate import simulate
 from lagbench.make.generate import generate
 from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 

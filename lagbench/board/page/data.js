@@ -1,5 +1,5 @@
 // The data of the page: JSON, and arrays of 16-bit integers; see lagbench/board/encoding.py.
-// First stand the lower bytes of all integers, then the upper ones.
+// First stand the lower bytes of all integers, then the upper ones; arrays of a kind stand together.
 
 const MISSING_LEVEL = -32768;
 
@@ -46,8 +46,9 @@ function numbersOf(array) {
   return array.numbers;
 }
 
-function readNumbers({ start, rows, columns, zero, step, log }) {
-  const levels = Int16Array.from({ length: rows * columns }, (_, i) => storedAt(start + i));
+function readNumbers({ kind, start, rows, columns, zero, step, log }) {
+  const first = BOARD.starts[kind] + start;
+  const levels = Int16Array.from({ length: rows * columns }, (_, i) => storedAt(first + i));
   // Rows are stored as differences, which wrap around as the elements of an Int16Array do.
   for (let i = columns; i < levels.length; i += 1) levels[i] += levels[i - columns];
   return Float64Array.from(levels, (level) => {

@@ -7,11 +7,18 @@ function drawDetail(tab, state, row) {
     drawTiles(tab, row),
     drawFlags(row),
     el("div", { class: "figures" }, [drawErrors(tab, row), drawScenarios(tab, row), row.pictures ? drawMaps(tab, row) : null, filmFigure, drawEnergy(tab, row), row.pictures ? drawHistograms(tab, row) : null]),
+    drawUnpictured(tab, row),
     drawFrames(tab, row),
     drawNumbers(tab, row),
     drawOrigin(row),
   ];
   return [content, film];
+}
+
+/** Return why an entry has no maps and no film; null where it has them, and for variants, whose method has them. */
+function drawUnpictured(tab, row) {
+  if (row.pictures || row.variantOf || !tab.pictured) return null;
+  return el("p", { class: "muted" }, `The page has maps and films of the first ${tab.pictured} methods of each data set.`);
 }
 
 /** Return the reference predictors of a tab, each with the class of its marks. */
