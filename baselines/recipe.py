@@ -464,7 +464,7 @@ def change_options(
         layers = _merge(layers, _parse_setting(setting))
         if "training" in layers:
             raise UsageError(
-                "the training is over",
+                "an option of the training cannot change now",
                 where="--set",
                 got=setting,
                 fix="set options of the model: --set model.KEY=VALUE",

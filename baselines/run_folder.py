@@ -133,8 +133,8 @@ class RunFolder:
                     where="--processes",
                     expected=process_count,
                     got=processes,
-                    fix="the learning rate and the order of windows follow from it; or "
-                    "train anew with --fresh",
+                    fix="go on with the old number of processes, or train anew with "
+                    "--fresh",
                 ),
             ),
         ]

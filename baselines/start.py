@@ -70,7 +70,7 @@ class TrainingStart:
                 where=WHERE,
                 expected="weights of the network that is trained",
                 got="weights of one with " + ", ".join(settings)[:500],
-                fix="leave out what was --set of these, or start from other weights",
+                fix="leave out the --set of these options, or start from other weights",
             )
         load_weights(model, adapted, where=str(self.path))
 

@@ -393,7 +393,7 @@ def _form_scores(
             missing.append(name)
     if missing:
         raise UnreadableFileError(
-            "a score file lacks metrics that every one has",
+            "a score file lacks metrics that every score file has",
             where=str(board.path / entry.score_paths[0]),
             expected=", ".join(missing),
             fix="score the predictions again: lagbench submit",
@@ -947,7 +947,7 @@ def build(
         for path, data in stale.items():
             descriptions.append(f"{path.name} of {len(data)} bytes")
         raise ChecksFailedError(
-            "the page is not what the submissions give",
+            "the page is out of date",
             where=", ".join(str(path) for path in stale),
             expected=", ".join(descriptions),
             got="another content, or no file",

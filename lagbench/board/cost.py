@@ -250,7 +250,7 @@ def picture(board: Board, size: Size) -> str:
         raise DataError(
             "nothing to draw: neither entries nor reference predictors with a cost",
             where=name,
-            fix="`lagbench predict` labels what a frame takes",
+            fix="state seconds_per_frame, as `lagbench predict` does",
         )
 
     drawing = draw(

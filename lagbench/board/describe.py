@@ -114,8 +114,7 @@ def _place_of(header: Header, meta: Meta) -> Place:
             where="--method",
             expected="a name of your own",
             got=ascii(method),
-            fix="name your method otherwise; reference predictors are added by "
-            "themselves",
+            fix="choose another name; lagbench adds the reference predictors itself",
         )
     return header.split, header.size, method
 
@@ -124,7 +123,7 @@ def _require_free(folder: Folder, place: Place) -> None:
     path = folder.path / entry_path(place)
     if path.exists():
         raise UsageError(
-            "there is such an entry already",
+            "the leaderboard has an entry of this method already",
             where=str(path),
             expected="a method without an entry on this data set",
             got=place[2],
@@ -152,7 +151,7 @@ def _require_distinct_name(name: str, rivals: Mapping[Path, Entry]) -> None:
     for other_name, owner in owners.items():
         if confusable_key(other_name) == key:
             raise UsageError(
-                "the name looks like another's",
+                "the name looks like that of another entry",
                 where="name in --from meta.yaml",
                 expected=f"a name that cannot be taken for {other_name!a} of {owner}",
                 got=ascii(name),
@@ -202,7 +201,7 @@ def _date_of(meta: Meta) -> datetime.date:
     latest = latest_date()
     if date > latest:
         raise UsageError(
-            "a day to come",
+            "the date lies in the future",
             where="date",
             expected=f"at most {latest}",
             got=date,
@@ -227,7 +226,7 @@ def _budget_of(
 ) -> EntryBudget | None:
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
-            "a track is not stated",
+            "an entry cannot state its track",
             where="budget.track",
             expected="no track: it follows from the budget of the predictions",
             got=ascii(meta.budget.track),

@@ -161,7 +161,7 @@ class Folder:
         if len(other_names) > 3:
             shown += " and more"
         raise UsageError(
-            "no room for a leaderboard",
+            "a new leaderboard cannot be made here",
             where=str(self.path),
             expected="a folder that is not there yet, or is empty",
             got=shown,

@@ -89,7 +89,7 @@ def publish(
         raise UsageError(
             "the entry changed while the files were scored",
             where=str(entry_path(draft.place)),
-            fix="submit again: what was added meanwhile stays",
+            fix="submit again; what others added meanwhile stays",
         )
 
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)

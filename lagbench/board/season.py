@@ -234,7 +234,7 @@ def _check_seeds(season: Season, file: Path, name: str) -> None:
     expected = with_seeds(season)
     if season.season != name or expected != season:
         raise ChecksFailedError(
-            "a season has other seeds than follow from its frozen models",
+            "the seeds of a season do not follow from its frozen models",
             where=str(file),
             expected=", ".join(
                 str(data_set.draw_seed)[:16] for data_set in expected.data_sets
@@ -351,14 +351,14 @@ def close(
 def _check_options(name: str, scenarios: int) -> None:
     if not FEWEST_SCENARIOS <= scenarios <= MOST_SCENARIOS:
         raise UsageError(
-            "so many blind scenarios cannot be drawn",
+            "this number of blind scenarios is not possible",
             where="--scenarios",
             expected=f"{FEWEST_SCENARIOS} to {MOST_SCENARIOS}",
             got=scenarios,
         )
     if Path(name).name != name or name.startswith("."):
         raise UsageError(
-            "that names no season",
+            "this cannot be the name of a season",
             where="NAME",
             expected="small letters, digits and single hyphens, as in spring-2027",
             got=ascii(name)[:80],
@@ -368,7 +368,7 @@ def _check_options(name: str, scenarios: int) -> None:
 def _require_open(folder: Folder, name: str) -> None:
     if (folder.path / season_path(name)).exists():
         raise UsageError(
-            "the season is closed already: what is frozen stays",
+            "the season is closed already, and its models stay frozen",
             where=str(folder.path / season_path(name)),
             fix="choose another name; with --value, give the random value that it "
             "waits for",
@@ -386,7 +386,7 @@ def _freeze(
     """Return a data set of a season with the models of its entries."""
     if max(size.scenarios) >= FIRST_SCENARIO:
         raise UsageError(
-            "the data set has ids of blind scenarios",
+            "the data set uses ids that are reserved for blind scenarios",
             where=f"{size.split} {size.name}",
             expected=f"ids below {FIRST_SCENARIO}",
             got=max(size.scenarios),
@@ -473,7 +473,7 @@ def reveal(board: str | Path, name: str, value: str) -> Season:
         revealed, issues = examine(Season, season.model_dump() | {"value": value})
         if revealed is None or not value.strip():
             raise UsageError(
-                "that is no random value",
+                "this cannot be a random value",
                 where="--value",
                 expected="a text of one line, as the source publishes it",
                 got=format_issues(issues) if issues else "an empty text",

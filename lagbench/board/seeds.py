@@ -43,7 +43,7 @@ def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
             raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
     if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
         raise UsageError(
-            "several files need seeds that differ",
+            "several files must have different seeds",
             got=_format_seeds(seeds),
             fix="write them with submission.write(..., seed=0), seed=1 and so on",
         )
@@ -118,7 +118,7 @@ def _require_new_seeds(
 ) -> None:
     if None in entry_seeds or None in new_seeds:
         raise UsageError(
-            "seeds that are added need numbers, those of the entry too",
+            "seeds can be added only if the files and the entry state their seeds",
             where=str(path),
             got=f"the entry has {_format_seeds(entry_seeds)}, "
             f"the files {_format_seeds(new_seeds)}",
@@ -128,11 +128,11 @@ def _require_new_seeds(
     common_seeds = sorted(set(entry_seeds) & set(new_seeds), key=str)
     if common_seeds:
         raise UsageError(
-            "the entry has such a seed already",
+            "the entry has this seed already",
             where=str(path),
             got=f"seed {_format_seeds(common_seeds)}; "
             f"the entry has {_format_seeds(entry_seeds)}",
-            fix=f"leave out what is there, {SUBMIT_ANEW}",
+            fix=f"leave out the files of these seeds, {SUBMIT_ANEW}",
         )
     count = len(entry_seeds) + len(new_seeds)
     if count > MOST_SEEDS:
@@ -211,13 +211,13 @@ def require_new(
     that has it already.
 
     Raises:
-        UsageError: the same predictions are there.
+        UsageError: these predictions are submitted already.
     """
     owner_of = dict(owners)
     for identity, path in zip(identities, paths, strict=True):
         if identity in owner_of:
             raise UsageError(
-                "the same predictions are there",
+                "these predictions are submitted already",
                 where=str(path),
                 got=f"those of {owner_of[identity]}",
                 fix="submit the file of each seed once; what goes by a new name "

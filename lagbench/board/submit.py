@@ -160,7 +160,7 @@ def _require_fit_arguments(
     with errors:
         if add and replace:
             raise UsageError(
-                "an entry is added to or replaced",
+                "--add and --replace exclude each other",
                 where="--add, --replace",
                 fix="give one",
             )
@@ -232,7 +232,7 @@ def _read_predictions(
             )
         if header.subset != "test":
             raise UsageError(
-                "an entry is made of predictions of test",
+                "an entry needs predictions of the subset test",
                 where=str(path),
                 expected="test",
                 got=header.subset,

@@ -183,9 +183,9 @@ def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> Non
     """Refuse a training state, and weights of another data set or seed."""
     if file.is_state:
         raise UsageError(
-            "a state to go on from, not the weights of a model",
+            "this is a checkpoint of a training, not the weights of a model",
             where=str(file.path),
-            fix="give weights.pt beside it, and predictions that were made with that",
+            fix="give the weights.pt beside it, and predictions that it made",
         )
     data_set = (header.split, header.size, header.dataset_sha256)
     if file.data_set != data_set or file.seed not in seeds:

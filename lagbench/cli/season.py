@@ -91,9 +91,10 @@ def close_command(
     """
     if value is not None and source:
         raise UsageError(
-            "a source is named before its value is known",
+            "--source and --value exclude each other",
             where="--source and --value",
             expected="one of the two",
+            fix="give --source before the value is known, and --value afterwards",
         )
     if value is not None:
         season = reveal(board, name, value)

@@ -235,7 +235,7 @@ def expand_path(path: str | Path, where: str) -> Path:
             "there is no such home folder",
             where=where,
             got=ascii(str(path)),
-            fix="write it out",
+            fix="write the whole path",
         ) from error
 
 

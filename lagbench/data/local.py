@@ -121,7 +121,7 @@ def _named_root(root: str | Path | None) -> str | Path | None:
     text = str(root)
     if not text.strip() or _SCHEME_ALONE.fullmatch(text):
         raise UsageError(
-            "that names no root",
+            "this cannot be a root folder",
             where=_ROOT_OPTION,
             expected="a folder, or s3://bucket/prefix",
             got=ascii(text),

@@ -93,7 +93,7 @@ def parse_viscosity(stated: object, *, where: str) -> float | None:
     viscosity = float(values.item()) if is_number else math.nan
     if not 0.0 <= viscosity < math.inf:
         raise DataError(
-            "the viscosity is no viscosity",
+            "the viscosity has an impossible value",
             where=f"{where}, attribute viscosity",
             expected="a finite number from 0 [length^2/s]",
             got=stated,

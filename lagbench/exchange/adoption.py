@@ -180,7 +180,7 @@ def _divide_into_subsets(
     if len(paths) == 1 and (paths[0] / HASHED_SUBSETS[0]).is_dir():
         if valid is not None or test is not None:
             raise UsageError(
-                "the folders say what is valid and test",
+                "the folders train, valid and test decide the subsets",
                 where="--valid and --test",
                 expected="no such option beside the folders train, valid and test",
                 fix="leave them out, or name the files",
@@ -236,7 +236,7 @@ def _refuse_duplicates(rows: Sequence[Row]) -> None:
                 where=str(path),
                 expected="each once",
                 got=f"{path_of[row]} before",
-                fix="leave it out once: it could be trained on and tested",
+                fix="name it once; otherwise models could be trained and tested on it",
             )
         path_of[row] = path
 
@@ -279,7 +279,7 @@ def import_split(
     options = check_options(options)
     if "axes" in options:
         raise UsageError(
-            "a format states the order of its axes",
+            "the format itself states the order of the axes",
             where="axes",
             expected="no such key",
             fix="leave it out; adopt takes it",
@@ -359,7 +359,7 @@ def _merge_options(metadata: SourceMetadata, options: DataOptions) -> dict[str, 
     if "frame_interval" not in merged:
         raise UsageError(
             "the metadata state no time between frames",
-            fix="say it: --frame-interval SECONDS",
+            fix="state it: --frame-interval SECONDS",
         )
     return merged
 

@@ -181,7 +181,7 @@ def download(
 def _check_connections(count: int) -> None:
     if count < 1:
         raise UsageError(
-            "no file comes without a connection", where="--connections", expected=">= 1"
+            "a download needs a connection", where="--connections", expected=">= 1"
         )
 
 

@@ -117,7 +117,9 @@ def export(
     form = parse_format(format)
     if from_walls and form is not Format.LAGRANGEBENCH_H5:
         raise UsageError(
-            "only lagrangebench-h5 needs it", where="--from-walls", got=form.value
+            "this option is for lagrangebench-h5 only",
+            where="--from-walls",
+            got=form.value,
         )
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     target = Path(output)
@@ -253,7 +255,7 @@ def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> N
     """Refuse wall particles where no wall can move, or where they have no room."""
     if not has_moving_walls or size.box.is_periodic or size.dimension != 2:
         raise UsageError(
-            "the box is no plane one with walls that could move on every side",
+            "wall particles need a box of two dimensions with four walls",
             where="--wall-particles",
             got=size.split,
         )

@@ -353,7 +353,7 @@ class SplitBuilder:
         if self.has_walls:
             expected = "wall_velocity, as before"
         raise DataError(
-            "velocities of walls in some trajectories only",
+            "only some trajectories have velocities of walls",
             where=trajectory.name,
             expected=expected,
             fix="give zeros where walls rest",

@@ -165,11 +165,11 @@ def find_materials(
             unknown.append(f"{n} ({meanings.get(n, 'unknown')})")
         first = unknown_numbers[0]
         raise UnreadableFileError(
-            "particles of a kind that no material is known for",
+            "no material is known for a kind of particle",
             where=where,
             expected=", ".join(meanings_in_file),
             got=", ".join(unknown),
-            fix=f"say what they stand for: --kinds {first}=jelly, or leave them "
+            fix=f"state their material: --kinds {first}=jelly, or leave them "
             f"out: {first}=drop",
         )
 

@@ -360,7 +360,7 @@ def _count_frames(data: xr.Dataset) -> int:
         else:
             got = "no dimension frame"
         raise UsageError(
-            "a picture needs all frames of a scenario: a frame is called by its number",
+            "a picture needs all frames of a scenario, because a number names a frame",
             where="coordinate frame",
             expected=f"0, 1, 2, ... to {expected - 1}",
             got=got,

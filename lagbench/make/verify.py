@@ -161,7 +161,10 @@ def verify(
     cores = worker_count(workers)
     if regenerate < 0:
         raise UsageError(
-            "fewer than none", where="--regenerate", expected=">= 0", got=regenerate
+            "the number is negative",
+            where="--regenerate",
+            expected=">= 0",
+            got=regenerate,
         )
     if regenerate:
         check_installed("taichi", extra="generate")

@@ -458,7 +458,7 @@ def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> Non
     if is_bare:
         scores = "PREDICTIONS"
     raise UsageError(
-        "a reference is part of the scores of a submission",
+        "a reference predictor cannot be the first argument",
         got=str(first),
         fix=f"give the reference last: lagbench compare {scores} {first}",
     )

@@ -300,7 +300,7 @@ def _check_overwriting(path: Path, header: Header) -> None:
     expected = f"{header.method} {header.split} {header.size}"
     if present != expected:
         raise UsageError(
-            "the scores of another submission lie there",
+            "the folder holds the scores of another submission",
             where=str(path),
             expected=f"no such file, or the scores of {expected}",
             got=present,

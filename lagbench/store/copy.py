@@ -89,7 +89,7 @@ def parse_manifest(size: Size, text: bytes, *, where: str, hint: str) -> Manifes
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
         raise NotDataError(
-            "the store's manifest is none",
+            "the store's manifest.json is no manifest of lagbench",
             where=where,
             expected="a manifest.json as lagbench generate writes it",
             got=ascii(text[:80].decode("utf-8", "replace")),
@@ -248,7 +248,7 @@ def _check_objects(size: Size, url: str, manifest: Manifest) -> None:
     if wrong_scenarios:
         address = object_address(size, url, MANIFEST_NAME)
         raise DataError(
-            "the store's manifest names objects that it lacks, or of another length",
+            "the store lacks objects of its manifest, or they have another length",
             where=f"{address}, scenarios {format_ids(wrong_scenarios)}",
             fix=_store_hint(size, url),
         )
@@ -428,7 +428,7 @@ def _check_entry_lengths(size: Size, url: str, entries: Iterable[FileEntry]) -> 
     if too_long:
         ids = format_ids(entry.scenario for entry in too_long)
         raise WrongLengthError(
-            "the store's manifest names longer files than there can be",
+            "the store's manifest states impossible lengths of files",
             where=f"{object_address(size, url, MANIFEST_NAME)}, scenarios {ids}",
             expected=f"at most {size.longest_file(too_long[0].scenario)} bytes",
             got=too_long[0].bytes,

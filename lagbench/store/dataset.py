@@ -196,7 +196,7 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             raise damage_error(path, reason, fix=fix) from error
         if not _is_of(key, attributes):
             raise DataError(
-                "a scenario file is another scenario",
+                "a file holds another scenario",
                 where=str(path),
                 expected=key,
                 got=attributes,

@@ -115,7 +115,7 @@ class Publication:
         if file_sha256(path) != entry.file_sha256:
             root = self._objects.root
             raise DataError(
-                "a file of the working copy is another than its manifest says",
+                "a file of the working copy is not the one that its manifest names",
                 where=str(path),
                 fix=f"remove it, then lagbench generate with --root {root}",
             )

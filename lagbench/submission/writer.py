@@ -359,7 +359,7 @@ class PredictionsWriter:
             if sorted(array.shape) == sorted(expected_shape):
                 fix = "transpose it: frame, particle, space"
             raise UsageError(
-                "the shape is another",
+                "the array has the wrong shape",
                 where=where,
                 expected=expected_shape,
                 got=array.shape,

@@ -124,7 +124,7 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
         return default or available_cores()
     if workers < 1:
         raise UsageError(
-            "there is no work without a worker",
+            "at least one worker is needed",
             where="--workers",
             expected=">= 1",
             got=workers,

@@ -93,7 +93,7 @@ def check_folder(folder: str | Path) -> None:
     """Refuse a folder where a report cannot be written or would replace another page.
 
     Raises:
-        UsageError: a page that is no report lies there.
+        UsageError: the folder holds an index.html that is no report.
         WorkFailedError: the folder cannot be written.
     """
     check_writable(Path(folder), option="--report")
@@ -105,7 +105,7 @@ def check_folder(folder: str | Path) -> None:
         head = stream.read(4 * len(policy_tag))
     if policy_tag not in head:
         raise UsageError(
-            "a page that is no report lies there",
+            "the folder holds an index.html that is no report",
             where="--report",
             got=str(path),
             fix="name another folder, or remove the page",
