@@ -101,7 +101,7 @@ HOW_TO_READ = """\
   orientation. Size `mini` has about a quarter of the particles and about half the cells
   along an axis, so compare only the order of the models there.
 - **Metrics** are defined in [scoring](scoring.md). In the heads ↓ means that less is
-  better, ↑ that more is better, and ◎ that the value behind it is best.
+  better, ↑ that more is better, and ◎ that the value after the sign is best.
 - **Comparisons** have two models. `means` and `seeds` have a number for each, that of
   the first model first. `lead` is the amount by which the first mean is better, in the
   units of the metric; a negative lead means that the second mean is better.

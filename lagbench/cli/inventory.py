@@ -78,7 +78,7 @@ def list_command(
         print_line(line)
     for line in _describe_times(overviews):
         print_line(line)
-    print_line(f"data sets live in {url_of(folder) or folder}")
+    print_line(f"folder of all data sets: {url_of(folder) or folder}")
 
 
 def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
@@ -102,8 +102,8 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
         print_line(line)
     print_line("")
     print_references(sizes, references)
-    print_line(f"more: lagbench info {split}")
-    print_line(f"data sets live in {url_of(folder) or folder}")
+    print_line(f"all parameters: lagbench info {split}")
+    print_line(f"folder of all data sets: {url_of(folder) or folder}")
 
 
 def _list_overviews(folder: Path) -> list[Overview]:

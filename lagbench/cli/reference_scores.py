@@ -52,5 +52,6 @@ def print_references(
                 kind = "classical"
             rows.append((name, kind, *cells))
     columns = ("reference", "kind", *size_names)
-    print_line(f"{ranking_metric(sizes[0])} of the references, less is better")
+    metric = ranking_metric(sizes[0])
+    print_line(f"{metric} of the reference predictors: lower is better")
     print_table("", columns, rows, is_narrow=True)

@@ -42,7 +42,7 @@ ARROWS = {
 }
 """Marks of the better side of a metric, behind its name."""
 
-LEGEND = "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
+LEGEND = "↑ higher is better; ↓ lower is better; ◎ best at its perfect value"
 
 CHANCE = "?"
 """Mark of a difference that may be chance, behind better or worse."""
