@@ -73,7 +73,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         against = None if model is None else results.against_classical(model)
         if against is None:
             if model is not None and results.seconds_per_frame(model) is not None:
-                unmatched.append(results.where)
+                unmatched.append(_cheaper_than_solvers(results, model))
             continue
         low, high = against.interval
         if high < 1.0:
@@ -97,11 +97,17 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"
             " costs no more is more accurate than the best learned or hybrid model."
         )
-    if unmatched:
-        sentences.append(
-            f"On {_join(unmatched)} no classical solver is as cheap as the best model."
-        )
-    return " ".join(sentences)
+    return " ".join([*sentences, *unmatched])
+
+
+def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
+    """Return which solvers a model beats that is cheaper than all of them."""
+    opening = f"On {results.where} no classical solver is as cheap as the best model"
+    beaten = results.less_accurate(model, Kind.CLASSICAL)
+    if not beaten:
+        return f"{opening}."
+    names = _join([label(name) for name in beaten])
+    return f"{opening}, which is more accurate than {names}."
 
 
 def _join(names: Sequence[str]) -> str:

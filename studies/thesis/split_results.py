@@ -407,6 +407,12 @@ class SplitResults:
                 scores[name] = self.methods[name].scores[self.ranking]
         return rank(scores)
 
+    def less_accurate(self, model: str, kind: Kind) -> list[str]:
+        """Return the methods of a kind that are behind a model, best first."""
+        names = [name for name, method in self.methods.items() if method.kind is kind]
+        ranked = self.order([model, *names])
+        return ranked[ranked.index(model) + 1 :]
+
     @property
     def best_naive(self) -> str | None:
         """Name of the best naive baseline, which skill is measured from; None without.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lagbench.board.build import collect
+from studies.result_tables import verdict_on_learning
 from studies.thesis.split_results import BOARD, Sources, SplitResults
 
 
@@ -28,3 +29,21 @@ def test_learning_is_judged_as_the_leaderboard_judges_it() -> None:
             assert against.value == pytest.approx(row.against_classical.mean, rel=1e-6)
             compared += 1
     assert compared > 40
+
+
+def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats() -> (
+    None
+):
+    """On cylinder mini a frame of NeuralMPM costs less than one of any solver: its
+    scores beside theirs say which it beats.
+    """
+    results = SplitResults(Sources(), "cylinder", "mini")
+    scores = {}
+    for name, method in results.methods.items():
+        scores[name] = method.scores[results.ranking].mean
+    assert results.against_classical("neuralmpm") is None
+    solvers = ("projection-3x", "projection-2x", "projection")
+    beaten = [name for name in solvers if scores[name] > scores["neuralmpm"]]
+    verdict = verdict_on_learning([results])
+    assert beaten
+    assert verdict.endswith(f"more accurate than {' and '.join(beaten)}.")
