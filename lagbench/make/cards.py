@@ -21,47 +21,46 @@ from lagbench.figures.tables import escape, markdown
 from .croissant import KEYWORDS, croissant_json
 
 _PAIRS_WITH_SNOW = (
-    "Pairs with snow come to rest first. `active_frames` of a file says for how "
-    "many predicted frames "
-    "its scenario moves: up to the last with at least 1 % of the greatest "
+    "Pairs with snow come to rest first. The attribute `active_frames` of a file "
+    "counts the predicted frames up to the last one with at least 1 % of the greatest "
     "kinetic energy."
 )
 
 # what a reader of one split's card must know beside its description
 NOTES: Mapping[str, str] = {
     "cavity": (
-        "The wall velocities of all frames, those to be predicted included, are part "
-        "of what is given: they "
-        "are the forcing. `wall_velocity` at frame f is what acts from frame f-1 to f."
+        "The walls drive the flow. A model is given their velocities in all frames, "
+        "also in the frames that it predicts. `wall_velocity` at frame f acts from "
+        "frame f-1 to frame f."
     ),
     "cavity-3d": (
-        "The wall velocities of all frames, those to be predicted included, are part "
-        "of what is given. `wall_velocity` at frame f is what acts from frame f-1 to f."
+        "The walls drive the flow. A model is given their velocities in all frames, "
+        "also in the frames that it predicts. `wall_velocity` at frame f acts from "
+        "frame f-1 to frame f."
     ),
     "multimaterial": _PAIRS_WITH_SNOW,
     "multimaterial-3d": _PAIRS_WITH_SNOW,
     "fluid": (
-        "Scenarios of train differ in length: the longer ones are those that still "
-        "move. `active_frames` of "
-        "a file says for how many predicted frames it moves: up to the last with at "
-        "least 1 % of the "
-        "greatest kinetic energy."
+        "Scenarios of train differ in length: those that move longer have more "
+        "frames. The attribute `active_frames` of a file counts the predicted frames "
+        "up to the last one with at least 1 % of the greatest kinetic energy."
     ),
     "poiseuille": (
-        "The force of all frames, those to be predicted included, is part of what is "
-        "given. `body_force` at frame f is what acts from frame f-1 to f: first on the "
-        "lower half, then on the upper one."
+        "A force drives the flow. A model is given the force in all frames, also in "
+        "the frames that it predicts. `body_force` at frame f acts from frame f-1 to "
+        "frame f. Its first value acts on the lower half, its second one on the upper "
+        "half."
     ),
     "cylinder": (
         "The disc stands at (`obstacle_x`, `obstacle_y`) and has the diameter "
-        "`obstacle_diameter`: attributes of each file, part of what is given, as are "
-        "the speed of the stream and the fringe. Files hold the particles of the fluid "
-        "only; none of them enters the disc."
+        "`obstacle_diameter`. These are attributes of each file. A model is given "
+        "them, and also the speed of the stream and the fringe. Files hold the "
+        "particles of the fluid only; none of them enters the disc."
     ),
     "curl-noise": (
-        "Energy only decays: the higher the frequency, the faster. The equations have "
-        "no viscosity, the grid "
-        "has: benchmarks/effective_viscosity.py fits it to the decay of each size."
+        "The energy decays, and it decays faster if the frequency is higher. The "
+        "equations have no viscosity. The grid acts like one; "
+        "benchmarks/effective_viscosity.py fits its value to the decay at each size."
     ),
 }
 
@@ -217,7 +216,7 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         ("identity", manifest.identity),
         ("scenarios", len(manifest.files)),
         ("frames per scenario", frame_range),
-        ("frames together", sum(frame_counts)),
+        ("frames of all scenarios", sum(frame_counts)),
         ("particles", size.particles),
         ("frame interval", f"{size.frame_interval:.6g} s"),
         ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
@@ -316,7 +315,7 @@ def _task_table(size: Size, manifest: Manifest) -> str:
         last = sum(limit[-1] for limit in limits) / len(limits)
         at_first = f"{first:.3g} at the first predicted frame"
         text = f"position RMSE {at_first}, {last:.3g} at the last"
-        rows.append(("twin that starts 2^-20 away", text))
+        rows.append(("perturbed run, which starts 2^-20 away", text))
     return markdown(("", ""), rows)
 
 
@@ -326,8 +325,8 @@ def _statistics_section(size: Size, manifest: Manifest) -> list[str]:
         rows.append((name.replace("_", " "), *row))
     return [
         "## Statistics of train",
-        "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its "
-        "difference.",
+        "The unit of time is the frame. The velocity is x(f) - x(f-1), and the "
+        "acceleration is the difference of two velocities.",
         markdown(("", *AXES[: size.dimension]), rows),
     ]
 
