@@ -288,14 +288,14 @@ def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
 
 
 def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Batch:
-    """Return each window moved by a random way along the periodic axes of the box.
+    """Return each window displaced at random along the periodic axes of the box.
 
-    Where a force acts on layers along y, windows are not moved along y.
+    A body force differs from layer to layer up y: with one, no window moves along y.
 
     Args:
         batch: windows.
         box: box that holds the particles.
-        generator: source of the ways, uniform over a period.
+        generator: source of the displacements, uniform over a period.
     """
     dimension = batch.position.shape[2]
     shape = (batch.windows, dimension)

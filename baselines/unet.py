@@ -49,10 +49,20 @@ class Frame(nn.Module):
         return pad(with_ends, self.walled)
 
 
-def convolve_three(
+def three_node_convolution(
     inputs: int, outputs: int, periodic: Sequence[bool], *, stride: int = 1
 ) -> nn.Module:
-    """Return a convolution over three nodes along each axis of a grid."""
+    """Return a convolution over three nodes along each axis of a grid.
+
+    Beyond walls it sees zeros, beyond a periodic axis the nodes of the other end; with
+    stride 1 the grid keeps its size.
+
+    Args:
+        inputs: channels of the input.
+        outputs: channels of the output.
+        periodic: whether each axis is periodic.
+        stride: nodes from one output node to the next.
+    """
     dimension = len(periodic)
     convolution = CONVOLUTIONS[dimension]
     if not any(periodic):
@@ -67,9 +77,9 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, periodic: Sequence[bool]) -> None:
         super().__init__()
-        self.first = convolve_three(inputs, outputs, periodic)
+        self.first = three_node_convolution(inputs, outputs, periodic)
         self.norm = nn.GroupNorm(4, outputs)
-        self.second = convolve_three(outputs, outputs, periodic)
+        self.second = three_node_convolution(outputs, outputs, periodic)
         self.shortcut: nn.Module = nn.Identity()
         if inputs != outputs:
             convolution = CONVOLUTIONS[len(periodic)]
@@ -109,7 +119,7 @@ class UNet(nn.Module):
         middle = 2 * width
         coarse = 4 * width
 
-        self.begin = convolve_three(inputs, fine, periodic)
+        self.begin = three_node_convolution(inputs, fine, periodic)
         self.down_fine = ResidualBlock(fine, fine, periodic)
         self.down_middle = ResidualBlock(middle, middle, periodic)
         self.halve_fine = convolution(fine, middle, 2, stride=2)
@@ -121,7 +131,7 @@ class UNet(nn.Module):
         self.double_middle = transposed(middle, fine, 2, stride=2)
         self.up_middle = ResidualBlock(2 * middle, middle, periodic)
         self.up_fine = ResidualBlock(2 * fine, fine, periodic)
-        self.end = convolve_three(fine, outputs, periodic)
+        self.end = three_node_convolution(fine, outputs, periodic)
         for parameter in self.end.parameters():
             nn.init.zeros_(parameter)
 
@@ -165,11 +175,11 @@ class ContextNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.fields = nn.Sequential(
-            convolve_three(inputs, width, periodic),
+            three_node_convolution(inputs, width, periodic),
             nn.GELU(),
-            convolve_three(width, width, periodic, stride=2),
+            three_node_convolution(width, width, periodic, stride=2),
             nn.GELU(),
-            convolve_three(width, width, periodic),
+            three_node_convolution(width, width, periodic),
             nn.GELU(),
         )
         hidden = nn.Linear(width, width)

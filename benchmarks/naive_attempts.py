@@ -791,14 +791,19 @@ def error_on_train(
         frame_errors = []
         for frame in case.frames:
             true_cloud = truth[frame][::THINNING]
-            error = cloud_error(clouds[frame], true_cloud, case.material)
+            error = cloud_distance_by_material(clouds[frame], true_cloud, case.material)
             frame_errors.append(error)
         errors.append(float(np.mean(frame_errors)))
     return float(np.mean(errors))
 
 
-def cloud_error(cloud: Floats, true_cloud: Floats, material: NDArray[np.int8]) -> float:
-    """Return the distance of clouds of each material, weighted by its particles."""
+def cloud_distance_by_material(
+    cloud: Floats, true_cloud: Floats, material: NDArray[np.int8]
+) -> float:
+    """Return the sliced Wasserstein-2 distance of two clouds [length].
+
+    It is taken material by material; the mean is weighted by the share of each.
+    """
     error = 0.0
     for kind in np.unique(material):
         members = material == kind

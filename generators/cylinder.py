@@ -62,12 +62,13 @@ def lattice_counts(size: Size) -> tuple[int, int]:
 
 
 def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
-    """Draw where the disc stands [length].
+    """Draw the centre of the fixed disc [length]; only its y differs by scenario.
 
-    It moves by whole spacings of the lattice, so that all discs hold as many particles.
+    It lies off the middle of the channel by whole spacings of the lattice, so that
+    every disc covers as many places of the lattice.
     """
-    most = int(size.value("offset_max"))
-    steps = choice(rng, 2 * most + 1) - most
+    most_steps = int(size.value("offset_max"))
+    steps = choice(rng, 2 * most_steps + 1) - most_steps
     x = float(size.value("obstacle_x"))
     middle = float(size.box.centre[1])
     return x, middle + steps / size.value("lattice")

@@ -388,8 +388,11 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.keep_deformation(s, p, f)
 
     @ti.func
-    def yield_snow(self, s: ti.i32, p: ti.i32) -> None:
-        """Let snow flow: its F is a trial gradient."""
+    def apply_snow_plasticity(self, s: ti.i32, p: ti.i32) -> None:
+        """Bring F of a snow particle back to its yield limits; others stay as they are.
+
+        F from :meth:`deform` is the trial gradient. What it loses goes into Jp.
+        """
         if self.matter[s, p][0] == SNOW:
             trial = self.deformation(s, p)
             f, growth = plastic_return(trial, self.yield_low, self.yield_high)
@@ -448,7 +451,7 @@ class ParticleStress3D(FreeSurfaceKernels):
                 for p in range(particles):
                     self.deform(0, p)
                 for p in range(particles):
-                    self.yield_snow(0, p)
+                    self.apply_snow_plasticity(0, p)
                 for p in range(particles):
                     self.keep_jacobian(0, p)
 
@@ -472,7 +475,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.g2p(s, p, solid)
             if ti.static(solid):
                 self.deform(s, p)
-                self.yield_snow(s, p)
+                self.apply_snow_plasticity(s, p)
                 self.keep_jacobian(s, p)
 
     def restart_extremes(self) -> None:

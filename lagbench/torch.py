@@ -388,7 +388,7 @@ def predict(
                 fix="predict the subset test, whose scenarios are long enough",
             )
         # The forcing is given for all frames, unlike the positions.
-        _, wall_velocity = data.store.constants(scenario)
+        _, wall_velocity = data.store.material_and_walls(scenario)
         forcing = None
         if wall_velocity is not None:
             forcing = torch.from_numpy(wall_velocity.copy())

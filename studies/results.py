@@ -33,7 +33,7 @@ from .result_tables import (
 from .thesis.cases import key_frame
 from .thesis.claims import CLAIMS, claim_rows, comparison_table, leading_references
 from .thesis.items import table_markdown
-from .thesis.plan import TABLES, read_studies, study_name, study_rows
+from .thesis.plan import TABLES, read_study_results, study_name, study_rows
 from .thesis.published import TABLE_4_8
 from .thesis.roster import (
     EXPECTED,
@@ -303,7 +303,7 @@ def _studies(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
             measured = sources.size(split, size).measured
             data_hash = measured.dataset_sha256 if measured else None
             folders = [home / split / size for home in homes]
-            studies = read_studies(folders, data_hash)
+            studies = read_study_results(folders, data_hash)
             row_names = {study_name(study) for study in study_rows(name)}
             if row_names & studies.keys():
                 yield studies_beside_thesis(name, size, studies).text

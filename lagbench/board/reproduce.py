@@ -185,7 +185,7 @@ def reproduce(
                 path = entry.yaml_path.as_posix()
                 run.result.failures.append(Failure(entry=path, error=error))
     if costs:
-        run.measure_costs(chosen, time_solver)
+        run.measure_frame_costs(chosen, time_solver)
     for entry in chosen:
         line = run.line_of(entry)
         if line is not None:
@@ -391,10 +391,14 @@ class _Reproduction:
             )
         self._lines[entry.yaml_path.as_posix()] = change(line)
 
-    def measure_costs(
+    def measure_frame_costs(
         self, entries: Sequence[Entry], time_solver: TimeSolver | None
     ) -> None:
-        """Measure the costs of the data sets of entries."""
+        """Measure what a frame costs each model on the data sets of some entries.
+
+        Costs compare within one run only. So all active entries of such a data set are
+        timed, not the given ones alone, unless all have costs of one run already.
+        """
         by_data_set: dict[tuple[str, str], list[Entry]] = {}
         for entry in entries:
             by_data_set.setdefault((entry.split, entry.size), []).append(entry)

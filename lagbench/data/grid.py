@@ -73,7 +73,12 @@ class Grid:
     box: Box = UNIT_SQUARE  # that holds the particles
 
     def __post_init__(self) -> None:
-        """Accept the placement's name as it stands in datasets.yaml."""
+        """Check the cells, and accept the placement's name as in datasets.yaml.
+
+        Raises:
+            UsageError: fewer than two cells, or a periodic axis that is not three or
+                more whole cells long.
+        """
         if self.cells < 2:
             raise UsageError(
                 "a grid needs cells",

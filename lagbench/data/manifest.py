@@ -405,7 +405,7 @@ def record_hashes(
     """
     if not contents:
         return
-    old_notes = _read_notes(folder)
+    old_notes = _read_hash_notes(folder)
     new_notes = {}
     for path, content in contents.items():
         stamp = _file_stamp(path)
@@ -443,7 +443,7 @@ def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | Non
     The function returns None for a file that was not hashed here or has changed since.
     It reads the bytes once in a process; values are not unpacked.
     """
-    notes = _read_notes(folder)
+    notes = _read_hash_notes(folder)
 
     def find_hashes(path: Path) -> tuple[str, str] | None:
         note = notes.get(_relative_name(path, folder))
@@ -458,7 +458,11 @@ def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | Non
     return find_hashes
 
 
-def _read_notes(folder: Path) -> dict[str, _HashNote]:
+def _read_hash_notes(folder: Path) -> dict[str, _HashNote]:
+    """Return the notes of ``.verified.json`` by the files' relative names.
+
+    A file that is missing or damaged has no notes: that costs another hashing only.
+    """
     path = folder / NOTES_NAME
     notes = {}
     try:

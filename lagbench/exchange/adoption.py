@@ -293,7 +293,7 @@ def import_split(
     description = Description(
         name=output_name(output),
         source=f"{form.value}: {', '.join(digests)}",
-        **_merge_options(metadata, options),
+        **_description_options(metadata, options),
     )
 
     user_kinds = dict.fromkeys(metadata.lagbench.wall_particle_type, DROP)
@@ -337,11 +337,16 @@ def _require_files(folder: Path, names: Sequence[str]) -> None:
     )
 
 
-def _merge_options(metadata: SourceMetadata, options: DataOptions) -> dict[str, Any]:
-    """Return the arguments of a description.
+def _description_options(
+    metadata: SourceMetadata, options: DataOptions
+) -> dict[str, Any]:
+    """Return the keywords of a ``Description``, without its name and source.
 
-    The user's options win over what our own exports add, which wins over the rest of
-    the metadata.
+    The user's options win over what our own exports add (``metadata.lagbench``), which
+    wins over the rest of the metadata.
+
+    Raises:
+        UsageError: nothing states the time between frames.
     """
     keys = metadata.lagbench
     if "input_frames" in options or "horizon" in options:

@@ -124,7 +124,7 @@ def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajecto
 def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Trajectory:
     """Return the trajectory of a pair (positions, kinds), or of a triple.
 
-    The third part is a material property.
+    The third part is a material property; it is kept where it has one value for all.
     """
     parts = _split_parts(item)
     if len(parts) not in (2, 3) or not isinstance(parts[0], np.ndarray):

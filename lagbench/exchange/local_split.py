@@ -696,7 +696,14 @@ class SplitBuilder:
         return {count: format_ids(scenarios_of[count]) for count in frame_counts}
 
     def _describe_task(self) -> dict[str, Any]:
-        """Return the task, as far as the shortest test scenario allows one."""
+        """Return the key ``task`` of the size; what is not stated gets a default.
+
+        The horizon is by default what the shortest test scenario leaves.
+
+        Raises:
+            UsageError: a test scenario is too short for the task, or a frame of
+                interest is not predicted.
+        """
         description = self.description
         shortest = min(entry.frames for entry in self._test_entries())
         horizon = description.horizon

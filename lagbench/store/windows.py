@@ -135,11 +135,14 @@ class FrameStore:
             self.cached_bytes += positions.nbytes
         self._cached_frames.move_to_end(key)
 
-    def constants(self, scenario: int) -> tuple[NDArray[np.int8], Floats | None]:
-        """Return material, shape [particle], and wall velocity [length/s].
+    def material_and_walls(
+        self, scenario: int
+    ) -> tuple[NDArray[np.int8], Floats | None]:
+        """Return the material of each particle, and the walls' velocity in each frame.
 
-        Material is 0, liquid, in files without it. Wall velocity has the shape [frame,
-        wall, axis]; it is None where the files hold none.
+        Material has the shape [particle] and is 0, liquid, in files without it. Wall
+        velocity [length/s] has the shape [frame, wall, axis]; it is None where the
+        files hold none.
         """
         self._reset_after_fork()
         opened = self._open(scenario)
@@ -460,7 +463,7 @@ class WindowReader:
         scenario, frame = self.place(index)
         end = frame + self.length
         frames = self.store.frames(scenario, frame, end)
-        material, walls = self.store.constants(scenario)
+        material, walls = self.store.material_and_walls(scenario)
         if walls is not None:
             walls = walls[frame:end]
         window = copy_window(frames, material, walls, scenario, frame)

@@ -156,7 +156,8 @@ def compare_models(
 ) -> list[ComparedModels]:
     """Compare a model with its rivals by each metric that both have.
 
-    The values are those over the horizon, or those of a frame.
+    The values are those over the horizon, or those of a frame. The p-values of a metric
+    are corrected for the number of rivals (Holm). Rivals without results are left out.
     """
     all_rows: list[ComparedModels] = []
     for metric in metrics:

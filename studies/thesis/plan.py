@@ -184,11 +184,15 @@ def study_folder(plan: Plan, name: str, study: MLPStudy) -> Path:
     return plan.home(split) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
 
 
-def read_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
-    """Return the results of rows by :func:`study_name`.
+def read_study_results(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
+    """Return our results for rows of the tables of MLPs, by :func:`study_name`.
 
-    A row has the errors ``train`` and ``valid`` and the record of its ``training``. A
-    later folder wins over an earlier one. Rows of data with another hash are left out.
+    Each has the errors ``train`` and ``valid``, the ``seed``, and the record of its
+    ``training``.
+
+    Args:
+        homes: folders that may hold such results; a later one wins.
+        data: hash of the data set; results of other data are left out. None takes all.
     """
     studies: dict[str, Any] = {}
     for home in homes:

@@ -121,7 +121,10 @@ class Method:
         return fmean(hours)
 
     def of_seeds(self, seeds: Collection[int | None]) -> Method:
-        """Return this model with the trainings of some seeds only, in their order."""
+        """Return this model with the trainings of some seeds only, in ascending order.
+
+        The seed None, of a reference predictor, comes first.
+        """
 
         def order(training: ScoredTraining) -> int:
             if training.seed is None:

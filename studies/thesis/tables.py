@@ -39,7 +39,7 @@ from .plan import (
     SHARES,
     TABLES,
     Plan,
-    read_studies,
+    read_study_results,
     study_folder,
     study_name,
     study_rows,
@@ -321,7 +321,7 @@ def _study_results(plan: Plan, item: ThesisItem) -> dict[str, Any]:
     homes = [plan.home(split)]
     if not plan.settings and plan.recipe is None:
         homes.insert(0, plan.studies / split / plan.size)
-    studies = read_studies(homes, plan.hash(split))
+    studies = read_study_results(homes, plan.hash(split))
     return {name: row for name, row in studies.items() if row["seed"] == plan.seeds[0]}
 
 
@@ -331,7 +331,7 @@ def studies(plan: Plan, item: ThesisItem) -> Sheet:
 
 
 def studies_beside_thesis(name: str, size: str, results: Mapping[str, Any]) -> Sheet:
-    """Return a table of MLPs; results are those of :func:`~.plan.read_studies`."""
+    """Return a table of MLPs, from the results of :func:`~.plan.read_study_results`."""
     table_number, split = TABLES[name]
     rows = []
     for study in study_rows(name):

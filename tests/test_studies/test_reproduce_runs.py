@@ -20,7 +20,7 @@ from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score_file import read_statistics
 from studies.thesis import __main__ as command
 from studies.thesis import runs, tables
-from studies.thesis.plan import TABLES, Plan, read_studies
+from studies.thesis.plan import TABLES, Plan, read_study_results
 from studies.thesis.published import MLP_STUDIES
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
@@ -151,7 +151,7 @@ def test_studies_are_what_was_asked_for(
     first = written_at()
     runs.make_studies(plan, "table_4_2")
     assert written_at() == first
-    studies = read_studies([home], plan.hash(SPLIT))
+    studies = read_study_results([home], plan.hash(SPLIT))
     study = studies["mlp-4-2-1"]
     assert study["train"] > 0.0
     assert study["training"]["step"] == 1
@@ -159,13 +159,13 @@ def test_studies_are_what_was_asked_for(
     (row,) = item.tables[0].rows
     assert f"{study['valid']:.3g}" in row
     other_hash = "f" * 64
-    assert read_studies([home], other_hash) == {}
+    assert read_study_results([home], other_hash) == {}
     stale = {**study, "training": {"dataset_sha256": other_hash}}
     later = {**study, "train": 9.0}
     for other, expected in ((stale, study), (later, later)):
         content = json.dumps({"mlp-4-2-1": other})
         (tmp_path / "mlp_studies.json").write_text(content)
-        studies = read_studies([home, tmp_path], plan.hash(SPLIT))
+        studies = read_study_results([home, tmp_path], plan.hash(SPLIT))
         assert studies == {"mlp-4-2-1": expected}
     more_steps = replace(plan, settings=("training.steps=2", "model.widths=[4]"))
     with pytest.raises(UsageError):
