@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
+_CODE = re.compile(r"`[A-Za-z0-9_.-]+`")
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,23 @@ def escape(text: object) -> str:
     """
     one_line = " ".join(str(text).split())
     return _SPECIAL.sub(r"\\\1", one_line)
+
+
+def escape_prose(text: object) -> str:
+    r"""Return text that Markdown shows as it stands, its names in backticks as code.
+
+    >>> print(escape_prose("a_b: `active_frames` | <c>"))
+    a\_b: `active_frames` \| \<c\>
+    """
+    parts = []
+    end = 0
+    one_line = " ".join(str(text).split())
+    for code in _CODE.finditer(one_line):
+        parts.append(escape(one_line[end : code.start()]))
+        parts.append(code[0])
+        end = code.end()
+    parts.append(escape(one_line[end:]))
+    return "".join(parts)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -16,7 +16,7 @@ from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Parameter, Registry, Size, Split
-from lagbench.figures.tables import escape, markdown
+from lagbench.figures.tables import escape, escape_prose, markdown
 
 from .croissant import KEYWORDS, croissant_json
 
@@ -148,10 +148,10 @@ def dataset_card(
     parts = [
         _yaml_head(size, split, manifest),
         f"# {escape(split.title)} · {size.split} {size.name}",
-        escape(split.description),
+        escape_prose(split.description),
     ]
     if size.split in NOTES:
-        parts.append(escape(NOTES[size.split]))
+        parts.append(escape_prose(NOTES[size.split]))
     for name in pictures:
         parts.append(f"![{PICTURES[name]}]({name})")
 

@@ -275,6 +275,17 @@ def test_snow_snow_comes_to_rest_and_its_card_says_so() -> None:
         assert has_note == name.startswith("multimaterial")
 
 
+@pytest.mark.parametrize("name", sorted(cards.NOTES))
+def test_names_in_the_note_of_a_split_are_code(name: str) -> None:
+    """No backtick of a note is escaped: `active_frames` reads as a name."""
+    size = registry.load().size(name, "tiny")
+    manifest = Manifest(split=name, size="tiny", version=size.version)
+    text = card(size, manifest)
+    assert "\\`" not in text
+    for code in re.findall(r"`\w+`", cards.NOTES[name]):
+        assert code in text
+
+
 @pytest.mark.parametrize(
     ("split", "variables", "axes"),
     [

@@ -7,7 +7,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lagbench.figures.tables import escape, markdown
+from lagbench.figures.tables import escape, escape_prose, markdown
 
 ESCAPED = re.compile(r"\\([\\`*_\[\]<>|#&~$])")
 SPECIAL = re.compile(r"[`*_\[\]<>|#&~$]")
@@ -27,6 +27,22 @@ def test_no_special_character_stands_bare(text: str) -> None:
     """Without what is escaped no character has a meaning for Markdown."""
     bare = re.sub(r"\\.", "", escape(text))
     assert not SPECIAL.search(bare)
+
+
+@given(st.text(letters))
+def test_prose_keeps_names_in_backticks_and_nothing_else(text: str) -> None:
+    """Without escaped characters and such names no character has a meaning."""
+    prose = escape_prose(text)
+    one_line = " ".join(text.split())
+    assert ESCAPED.sub(r"\1", prose) == one_line
+    bare = re.sub(r"\\.", "", prose)
+    bare = re.sub(r"`[A-Za-z0-9_.-]+`", "", bare)
+    assert not SPECIAL.search(bare)
+
+
+def test_prose_of_a_stranger_holds_no_link() -> None:
+    prose = escape_prose("`a`![x](y) `b c` ``d``")
+    assert prose == r"`a`!\[x\](y) \`b c\` \``d`\`"
 
 
 def test_tables_set_numbers_flush_right() -> None:
