@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import re
 import stat
 import sys
 import threading
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
 
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
+
+_USER_OF_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*:/{2,})[^\s/]*@")
+
+SPLIT_NAMED = "SPLIT or --split"
+"""Where a user names a split, for messages."""
 
 PATIENCE = 20.0
 """Time that the import of a package's module may take before a line names it [s]."""
@@ -48,11 +54,16 @@ class LagbenchError(Exception):
         got: object = None,
         fix: str | None = None,
     ) -> None:
-        self.what = what  # what is wrong, one clause without a full stop
-        self.where = where  # file, key, variable or flag concerned
-        self.expected = expected  # what would have been right
-        self.got = got  # the value that is wrong
-        self.fix = fix  # what the user can do about it
+        # what is wrong, one clause without a full stop
+        self.what = hide_user(what)
+        # file, key, variable or flag concerned
+        self.where = None if where is None else hide_user(where)
+        # what would have been right
+        self.expected = hide_user(expected) if isinstance(expected, str) else expected
+        # the value that is wrong
+        self.got = hide_user(got) if isinstance(got, str) else got
+        # what the user can do about it
+        self.fix = None if fix is None else hide_user(fix)
         super().__init__(self._compose())
 
     def _compose(self) -> str:
@@ -87,6 +98,17 @@ class LagbenchError(Exception):
             self.fix,
         )
         return _rebuild, state
+
+
+def hide_user(text: str, mark: str = "...@") -> str:
+    """Return a text with a mark for the users and passwords of the addresses in it.
+
+    Messages are printed, logged and sent to others.
+
+    >>> hide_user("ftp://ann:secret@host/data does not answer")
+    'ftp://...@host/data does not answer'
+    """
+    return _USER_OF_ADDRESS.sub(rf"\1{mark}", text)
 
 
 def escape_unprintable(text: str) -> str:

@@ -50,6 +50,7 @@ def bench_command(
         raise UsageError(
             "a local split cannot be simulated",
             where="--split",
+            expected="a split that a generator makes",
             got=tier.split,
             fix="name a split of ours; `lagbench list` shows them",
         )

@@ -9,7 +9,7 @@ from typing import Annotated
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Registry, load
-from lagbench.errors import UsageError, format_count
+from lagbench.errors import UsageError, format_count, hide_user
 from lagbench.make.generate import GenerationResult, generate
 
 from .options import (
@@ -157,6 +157,8 @@ def _season_places(
             where="--split, --size",
             expected=", ".join(known),
             got=f"{split or 'any split'} {size or 'any size'}",
+            fix=f"name one of these, or leave both out; `lagbench season show {name}` "
+            "describes the season",
         )
     return places
 
@@ -179,7 +181,7 @@ def _describe_default_size(split: str, root: Path | None) -> str:
 
 def _describe_plan(result: GenerationResult) -> list[str]:
     if result.measured:
-        source = "at the rate measured here"
+        source = "at the pace of this machine's last generations"
     else:
         source = "estimated; measured after the first generate"
     needed = format_bytes(result.bytes_needed)
@@ -214,7 +216,7 @@ def _describe_result(result: GenerationResult) -> list[str]:
     url = url_of(result.root)
     if url is not None:
         folder = result.folder.relative_to(result.root).as_posix()
-        lines.append(f"  store   {url}/{folder}")
+        lines.append(f"  store   {hide_user(url)}/{folder}")
     if result.missing:
         missing_ids = format_ids(result.missing)
         lines.append(f"  missing {missing_ids}: the data set is incomplete")

@@ -12,7 +12,7 @@ import typer
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, hide_user
 from lagbench.make.inventory import Overview, overview
 
 from .options import JsonFlag, RootOption, accept_split, choose_split, option
@@ -78,7 +78,7 @@ def list_command(
         print_line(line)
     for line in _describe_times(overviews):
         print_line(line)
-    print_line(f"folder of all data sets: {url_of(folder) or folder}")
+    print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
 
 
 def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
@@ -103,7 +103,7 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
     print_line("")
     print_references(sizes, references)
     print_line(f"all parameters: lagbench info {split}")
-    print_line(f"folder of all data sets: {url_of(folder) or folder}")
+    print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
 
 
 def _list_overviews(folder: Path) -> list[Overview]:
@@ -142,7 +142,7 @@ def _describe_times(overviews: Sequence[Overview]) -> list[str]:
 
     if not estimated_splits:
         if has_measured:
-            return ["time: at the rate measured here"]
+            return ["time: at the pace of the last generations of this machine"]
         return []
     subject = "time"
     if has_measured:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lagbench.errors import UsageError
+from lagbench.errors import SPLIT_NAMED, UsageError
 
 
 def parse_root(text: str) -> Path:
@@ -94,7 +94,7 @@ def choose_split(argument: str | None, option: str | None) -> str:
     if not names:
         raise UsageError(
             "no split is named",
-            where="--split",
+            where=SPLIT_NAMED,
             expected="the name of a split, or the folder of a local one",
             got="nothing",
             fix=fix,
@@ -102,7 +102,8 @@ def choose_split(argument: str | None, option: str | None) -> str:
     if len(names) > 1:
         raise UsageError(
             "two splits are named",
-            where="--split",
+            where=SPLIT_NAMED,
+            expected="one split: by SPLIT, by --split, or twice the same",
             got=" and ".join(sorted(names)),
             fix=fix,
         )

@@ -108,8 +108,9 @@ def predict_command(
         raise UsageError(
             "weights state their split themselves",
             where="--split",
+            expected="no such option, as the model is no ONNX file",
             got=split,
-            fix="leave it out",
+            fix="leave it out; --size chooses another size",
         )
     require_libraries(PREDICTION_LIBRARIES)
     from lagbench.baselines.predict import predict

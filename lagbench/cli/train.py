@@ -14,8 +14,9 @@ import typer
 
 from lagbench.data.local import locate
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError, UsageError, format_count
 from lagbench.scoring.scorability import check_scorability
+from lagbench.submission.budget import EQUAL_MINUTES
 
 from .model_options import (
     TRAINING_LIBRARIES,
@@ -269,5 +270,19 @@ def _describe_budget(result: TrainingResult) -> str:
     return (
         f"{windows}{result.epochs:.3g} epochs; "
         f"{validation_share:.0%} of the processor time for validations; "
-        f"{result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
+        f"{result.device}, {format_count(result.threads, 'thread')}; "
+        f"{_describe_track(result)}"
+    )
+
+
+def _describe_track(result: TrainingResult) -> str:
+    """Return what the leaderboard will call the training, and of none the reason."""
+    if result.track is not None:
+        return f"track: {result.track}"
+    minutes = EQUAL_MINUTES.get(result.size)
+    if minutes is None:
+        return f"no track: those of {result.size} are not compared by budget"
+    return (
+        f"no track: neither equal compute ({minutes:.0f} min of processor time) nor "
+        "converged"
     )

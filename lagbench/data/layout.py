@@ -24,7 +24,7 @@ from pathlib import Path
 
 import platformdirs
 
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, hide_user
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable for the folder of working copies and of measured speeds."""
@@ -80,7 +80,8 @@ def working_copy_of(url: str) -> Path:
     >>> working_copy_of("s3://bucket/data").name
     's3-bucket-data-397b84d8'
     """
-    words = re.sub(r"[^A-Za-z0-9._]+", "-", url).strip("-.")[:60]
+    address = hide_user(url, mark="")
+    words = re.sub(r"[^A-Za-z0-9._]+", "-", address).strip("-.")[:60]
     digest = hashlib.sha256(url.encode()).hexdigest()
     return cache_folder("stores") / f"{words}-{digest[:8]}"
 
@@ -234,6 +235,7 @@ def expand_path(path: str | Path, where: str) -> Path:
         raise UsageError(
             "there is no such home folder",
             where=where,
+            expected="a folder, or ~ for your own home folder",
             got=ascii(str(path)),
             fix="write the whole path",
         ) from error
@@ -281,4 +283,7 @@ def generation_command(path: Path) -> str | None:
 
 def quote_root(root: Path) -> str:
     """Return a root as an option's value for a shell: its URL, or its absolute path."""
-    return shlex.quote(url_of(root) or os.path.abspath(root))
+    url = url_of(root)
+    if url is not None:
+        return shlex.quote(hide_user(url))
+    return shlex.quote(os.path.abspath(root))

@@ -24,7 +24,13 @@ from typing import NamedTuple
 import platformdirs
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import UnreadableFileError, UsageError, check_regular, suggest_name
+from lagbench.errors import (
+    SPLIT_NAMED,
+    UnreadableFileError,
+    UsageError,
+    check_regular,
+    suggest_name,
+)
 
 from .layout import (
     CACHE_VARIABLE,
@@ -101,6 +107,7 @@ def _check_folder_name(folder: Path) -> None:
             where=_ROOT_OPTION,
             expected="a path",
             got=f"{name[:60]!a}..., {len(name)} characters",
+            fix="name another folder",
         ) from error
 
 
@@ -125,6 +132,7 @@ def _named_root(root: str | Path | None) -> str | Path | None:
             where=_ROOT_OPTION,
             expected="a folder, or s3://bucket/prefix",
             got=ascii(text),
+            fix="name a folder; without a root the folder for user data is taken",
         )
     return root
 
@@ -168,7 +176,7 @@ class RootedRegistry(Registry):
             known_names = (*self.splits, *self.local_names())
             raise UsageError(
                 f"no split {name!r}",
-                where="--split",
+                where=SPLIT_NAMED,
                 expected="the name of a split, or the folder of a local one",
                 got=ascii(name),
                 fix=suggest_name(name, known_names),
@@ -206,6 +214,20 @@ def is_split_name(text: str) -> bool:
     (True, False)
     """
     return _SPLIT_NAME.fullmatch(text) is not None
+
+
+def suggest_split_of(name: str) -> str:
+    """Return a hint which split to name for a file that states the split of a name.
+
+    >>> suggest_split_of("dam")
+    'give the split of the file, --split dam, or of a split of your own its folder; or leave --split out'
+    """  # noqa: E501
+    if not is_split_name(name):
+        return "leave --split out"
+    return (
+        f"give the split of the file, --split {name}, or of a split of your own its "
+        "folder; or leave --split out"
+    )
 
 
 def load_rooted_registry(
@@ -301,7 +323,7 @@ def _locate_folder(
     if root is not None and resolve_root(root).resolve() != parent.resolve():
         raise UsageError(
             "a path and another root name the split",
-            where="--split and --root",
+            where="the split (SPLIT or --split) and --root",
             expected=f"the root {parent}",
             got=root,
             fix="give the path alone, or the root and the split's name",
@@ -309,7 +331,7 @@ def _locate_folder(
     if not (folder / DESCRIPTION).is_file() or not is_split_name(name):
         raise UsageError(
             "no local split there",
-            where="--split",
+            where=SPLIT_NAMED,
             expected=f"the name of a split, or a folder that holds {DESCRIPTION}, "
             f"named like its split",
             got=folder,
@@ -321,6 +343,8 @@ def _locate_folder(
         raise UsageError(
             f"the name {name!r} is taken by another split",
             where=str(folder),
+            expected="a name that no split of lagbench or of a package has",
+            got=ascii(name),
             fix="import or adopt the data again under another name",
         )
     rooted_registry.split(name)

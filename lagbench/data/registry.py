@@ -32,6 +32,7 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from lagbench.errors import (
+    SPLIT_NAMED,
     LagbenchError,
     UnreadableFileError,
     UsageError,
@@ -106,6 +107,12 @@ Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
+
+CARD_BYTES = 150_000
+"""Bytes that manifest, card and pictures of a data set have at most."""
+
+CARD_ROW_BYTES = 20_000
+"""Bytes by which they grow with a scenario, at most."""
 
 HEADER_BYTES = 64 * 1024
 """The most bytes of a file's header, constants and index of chunks."""
@@ -246,6 +253,7 @@ class Size(BaseModel):
                 f"no scored subset {subset!r}",
                 where=f"{self.split} {self.name}",
                 expected=" or ".join(choices),
+                got=ascii(subset),
                 fix=suggest_name(subset, choices),
             )
         return self.model_copy(update={"scored_subset": subset})
@@ -296,6 +304,8 @@ class Size(BaseModel):
             raise UsageError(
                 f"no parameter {name!r}",
                 where=f"{self.record_name}, {self.split} {self.name}",
+                expected="a parameter of the split",
+                got=ascii(name),
                 fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
@@ -405,7 +415,11 @@ class Size(BaseModel):
             if scenario in ids:
                 return count
         raise UsageError(
-            f"no scenario {scenario}", where=f"{self.split} {self.name}, frames"
+            f"no scenario {scenario}",
+            where=f"{self.split} {self.name}, frames",
+            expected=f"an id among {format_ids(self.scenarios)}",
+            got=scenario,
+            fix=f"name one of these; `lagbench info {self.split}` shows their subsets",
         )
 
     @property
@@ -420,6 +434,14 @@ class Size(BaseModel):
         """Return the most bytes of a scenario's file, on average over a data set."""
         moving_variables = 2 if self.stores_velocity else 1
         return self._value_bytes(scenario, moving_variables) + HEADER_BYTES
+
+    def data_set_bytes(self, scenarios: Collection[int]) -> int:
+        """Return the most bytes of some scenarios' files, card and pictures with them.
+
+        Pictures and texts grow with the number of scenarios.
+        """
+        card_bytes = CARD_BYTES + CARD_ROW_BYTES * len(scenarios)
+        return card_bytes + sum(map(self.file_bytes, scenarios))
 
     def longest_file(self, scenario: int) -> int:
         """Return the most bytes of a scenario's file; a store may claim more.
@@ -489,20 +511,29 @@ class Registry:
     def split(self, name: str) -> Split:
         """Return a split by name."""
         if name not in self.splits:
-            hint = suggest_name(name, self.splits)
-            raise UsageError(f"no split {name!r}", where="--split", fix=hint)
+            raise UsageError(
+                f"no split {name!r}",
+                where=SPLIT_NAMED,
+                expected="the name of a split; `lagbench list` shows all",
+                got=ascii(name),
+                fix=suggest_name(name, self.splits),
+            )
         return self.splits[name]
 
     def size(self, split: str, name: str) -> Size:
-        """Return one size of a split with its merged parameters and measured values."""
+        """Return one size of a split with its merged parameters and measured values.
+
+        Raises:
+            UsageError: the split has no such size.
+        """
         parent = self.split(split)
         if name not in parent.sizes:
             raise UsageError(
                 f"split {split!r} has no size {name!r}",
                 where="--size",
-                expected=", ".join(parent.sizes),
+                expected=" or ".join(parent.sizes),
                 got=ascii(name),
-                fix=suggest_name(name, parent.sizes),
+                fix=f"name one of them; `lagbench list {split}` says what they cost",
             )
         entry = parent.sizes[name]
         parameters = {}

@@ -24,7 +24,7 @@ from lagbench.data.manifest import (
     write_manifest,
 )
 from lagbench.data.registry import Registry, Size, Split
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DataError, UsageError, WorkFailedError, hide_user
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import (
@@ -181,7 +181,11 @@ def download(
 def _check_connections(count: int) -> None:
     if count < 1:
         raise UsageError(
-            "a download needs a connection", where="--connections", expected=">= 1"
+            "a download needs a connection",
+            where="--connections",
+            expected="1 or more",
+            got=count,
+            fix="leave it out, or give a larger number",
         )
 
 
@@ -420,7 +424,7 @@ class DownloadJob:
             entry = entry.model_copy(update=update)
         self._entries.append(entry)
         self.downloaded.append(scenario)
-        self.url = url
+        self.url = hide_user(url)
         self._meter.count(scenarios=1)
 
     def _count(self, byte_count: int) -> None:

@@ -288,6 +288,8 @@ class SplitBuilder:
                 "too many trajectories",
                 where=trajectory.name,
                 expected=f"at most {MAX_ID + 1}",
+                got="one more",
+                fix="leave some out, or make two splits",
             )
         self._check_dimension(trajectory)
         self._check_walls(trajectory)
@@ -356,6 +358,7 @@ class SplitBuilder:
             "only some trajectories have velocities of walls",
             where=trajectory.name,
             expected=expected,
+            got="wall_velocity" if has_walls else "no wall_velocity",
             fix="give zeros where walls rest",
         )
 
@@ -450,6 +453,7 @@ class SplitBuilder:
                 "a velocity is not finite",
                 where=where,
                 expected="numbers",
+                got="NaN, infinity, or a number beyond float32",
                 fix="leave velocities out: they are then differences of positions",
             )
         return velocity
@@ -483,9 +487,21 @@ class SplitBuilder:
 
     def _format_extent(self, trajectory: Trajectory) -> str:
         """Return the box that all positions of a trajectory fill, in the unit box."""
-        bounds = self.description.transform.transform_box(find_bounds([trajectory]))
-        low, high = np.array(bounds).T
+        extent = self._source_extent(trajectory)
+        low, high = np.array(self.description.transform.transform_box(extent)).T
         return format_box(low, high)
+
+    def _source_extent(self, trajectory: Trajectory) -> Bounds:
+        """Return the box that a trajectory needs, in the length of the source.
+
+        Along a periodic axis that is the period: positions beyond it are wrapped.
+        """
+        sides = list(find_bounds([trajectory]))
+        description = self.description
+        for axis, name in enumerate(AXES[: len(sides)]):
+            if name in description.periodic and description.bounds is not None:
+                sides[axis] = description.bounds[axis]
+        return tuple(sides)
 
     def _check_stated_bounds(
         self,
@@ -511,7 +527,7 @@ class SplitBuilder:
         if excess <= self.spacing:
             return
         # of all frames: bounds that hold this one only would be refused by a later one
-        source_low, source_high = np.array(find_bounds([trajectory])).T
+        source_low, source_high = np.array(self._source_extent(trajectory)).T
         raise UsageError(
             "particles lie outside the stated bounds, by more than their spacing",
             where=f"{where}; --bounds, or bounds of the metadata",
@@ -719,6 +735,7 @@ class SplitBuilder:
                 where="--input-frames and --horizon",
                 expected=f"together at most {shortest} frames, one of them to predict",
                 got=got,
+                fix="give fewer frames, or longer test trajectories",
             )
 
         interest = sorted(set(description.frames_of_interest or (last,)))
@@ -731,6 +748,8 @@ class SplitBuilder:
                 where="--frames-of-interest",
                 expected=f"frames {description.input_frames} to {last}",
                 got=got,
+                fix="name frames of these, or leave --frames-of-interest out: the last "
+                "one is taken",
             )
 
         placement = Placement.NODES

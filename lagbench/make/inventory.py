@@ -109,7 +109,7 @@ def overview(size: Size, root: Path) -> Overview:
         scenarios=counts,
         particles=size.particles,
         frames=sum(map(size.frame_count, ids)),
-        bytes=sum(map(size.file_bytes, ids)),
+        bytes=size.data_set_bytes(ids),
         seconds=seconds,
         measured=is_measured,
         present=present,

@@ -100,7 +100,8 @@ def select(
             f"no scenario {missing} in {', '.join(names)}",
             where=f"--scenarios, {size.split} {size.name}",
             expected="; ".join(choices),
-            got=format_ids(ids),
+            got=format_ids(ids) or "none",
+            fix="name ids of these, or leave --scenarios out to take all",
         )
     return tuple(sorted(set(ids)))
 
@@ -114,6 +115,8 @@ def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
             raise UsageError(
                 f"{size.split} {size.name} has no subset {name!r}",
                 where="--subset",
+                expected=", ".join(size.subsets),
+                got=ascii(name),
                 fix=suggest_name(name, size.subsets),
             )
     return names
@@ -130,6 +133,7 @@ def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
             where="--scenarios",
             expected="ids, as in (0, 3) or '0,3-5'",
             got=repr(scenarios)[:80],
+            fix="give a text, or whole numbers in a list",
         ) from None
 
 
@@ -174,6 +178,8 @@ def estimate(
         raise UsageError(
             "a local split cannot be simulated",
             where=f"{size.split} {size.name}",
+            expected="a split that a generator makes",
+            got="a split that was adopted or imported",
             fix="lagbench import or lagbench adopt makes it again from the data that "
             "it came from",
         )
@@ -202,7 +208,7 @@ def estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
-        bytes=sum(map(size.file_bytes, scenarios)),
+        bytes=size.data_set_bytes(scenarios),
         core_seconds=(ratio or 1.0) * seconds,
         start_seconds=SOLVER_COSTS[kind].start,
         measured=ratio is not None,

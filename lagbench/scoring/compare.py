@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lagbench.data.local import locate_split
-from lagbench.data.registry import Registry
+from lagbench.data.local import locate, locate_split, suggest_split_of
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     ChecksFailedError,
     DataError,
@@ -32,7 +32,7 @@ from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_see
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
-from lagbench.references.table import REFERENCES
+from lagbench.references.table import REFERENCES, references_of
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
 
@@ -284,8 +284,9 @@ def compare(
         _check_files(second)
 
     def require_second(split: str, size: str) -> None:
-        if is_bare and str(second) not in REFERENCES:
-            _require_entry(str(second), split, size, entries=entries)
+        if is_bare:
+            tier = locate(split, size, root=root, registry=registry).size
+            _require_opponent(str(second), tier, entries=entries)
 
     scoring = _ScoringOptions(
         split=expected_split,
@@ -384,6 +385,7 @@ def list_entries(board: str | Path | None) -> dict[Place, Path]:
                 "no leaderboard here",
                 where=f"--board {board}",
                 expected=f"a folder that holds {SCORES}/",
+                got="a folder without it" if folder.is_dir() else "no such folder",
                 fix="name the folder of a leaderboard, or leave the option out",
             )
         return {}
@@ -428,22 +430,23 @@ def _check_files(source: str | Path) -> None:
         check_regular(path)
 
 
-def _require_entry(
-    name: str, split: str, size: str, *, entries: Mapping[Place, Path]
-) -> None:
-    """Refuse a name that is no entry of a data set."""
-    if (split, size, name) in entries:
+def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -> None:
+    """Refuse a name that is neither a reference nor an entry of a data set."""
+    references = [predictor.name for predictor in references_of(size)]
+    if name in references or (size.split, size.name, name) in entries:
         return
-    methods = [place[2] for place in entries if place[:2] == (split, size)]
+    methods = [place[2] for place in entries if place[:2] == (size.split, size.name)]
     others = [" ".join(place[:2]) for place in entries if place[2] == name]
-    fix = suggest_name(name, {*methods, *REFERENCES})
-    if others:
+    fix = suggest_name(name, {*methods, *references})
+    if name in REFERENCES:
+        fix = f"{name} is a reference of other data sets; {fix}"
+    elif others:
         fix = f"{name} is an entry of {', '.join(others)}; {fix}"
     elif not entries:
         fix = f"no leaderboard is found: --board FOLDER names one; {fix}"
     raise UsageError(
         "no reference predictor and no entry of that name",
-        where=f"{split} {size}",
+        where=f"{size.split} {size.name}",
         expected="a reference predictor, an entry of the leaderboard, or a file",
         got=ascii(name),
         fix=fix,
@@ -459,6 +462,8 @@ def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> Non
         scores = "PREDICTIONS"
     raise UsageError(
         "a reference predictor cannot be the first argument",
+        where="A, the first of the two",
+        expected="predictions, scores, or an entry of the leaderboard",
         got=str(first),
         fix=f"give the reference last: lagbench compare {scores} {first}",
     )
@@ -493,6 +498,7 @@ def _no_such_name(
     return UsageError(
         "neither a reference, nor an entry of the leaderboard, nor a file",
         where=f"{split} {size}",
+        expected="the name of one of these",
         got=ascii(second),
         fix=f"{hint}name scores, predictions or a folder of them",
     )
@@ -581,8 +587,7 @@ def _check_split(
         where=str(path),
         expected=expected_split,
         got=ascii(identity["split"]),
-        fix="name that split with --split, as `lagbench list` shows it, or the folder"
-        " of a split of your own",
+        fix=suggest_split_of(identity["split"]),
     )
 
 
@@ -600,6 +605,7 @@ def _check_seeds(source: str | Path, seeds: Sequence[PublishedScores]) -> None:
             "the same predictions twice",
             where=str(source),
             expected="another seed of the method in each folder",
+            got=f"{len(seeds) - len(hashes)} of {len(seeds)} once more",
             fix="one file stands for one training: leave copies out",
         )
 
@@ -625,6 +631,7 @@ def _seed_files(path: Path) -> list[Path]:
         where=str(path),
         expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
         f"method's seeds",
+        got=", ".join(sorted(inner.name for inner in path.iterdir())[:5]) or "nothing",
         fix="`lagbench score` writes them; or name a predictions.nc",
     )
 

@@ -286,7 +286,8 @@ def comparison_tables(
 ) -> Iterator[Table]:
     """Yield which method is better, then means with their units.
 
-    The difference is that of the loss: below 0 where the first method is better, also
+    The second column names the first method: it is better or worse than the second. The
+    difference is that of the loss: below 0 where the first method is better, also
     where more of the metric is better. With ``every`` all metrics are shown, not only
     the chosen ones.
     """
@@ -294,7 +295,7 @@ def comparison_tables(
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
     yield Table(
         title,
-        ("metric", "first is", "loss difference [95 %]", "p"),
+        ("metric", f"{_break_name(result.first)}\nis", "loss difference [95 %]", "p"),
         tuple(_difference_row(comparison) for comparison in shown),
     )
     yield Table(
@@ -307,6 +308,10 @@ def comparison_tables(
 def comparison_lines(result: ComparisonResult, *, every: bool = False) -> Iterator[str]:
     """Yield the lines below the tables, which explain the marks that these have."""
     yield LEGEND
+    yield (
+        f"loss difference: {result.first} minus {result.second}; below 0 "
+        f"{result.first} is better"
+    )
     shown = _shown_metrics(result, every=every)
     if any(any(comparison.undefined) for comparison in shown):
         yield "†: so many frames without a value"

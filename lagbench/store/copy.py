@@ -35,7 +35,7 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
-from lagbench.errors import DataError, UsageError, suggest_name
+from lagbench.errors import DataError, UsageError, hide_user, suggest_name
 from lagbench.work.machine import may_differ
 from lagbench.work.progress import watched
 
@@ -552,7 +552,7 @@ class _TransferDisplay:
     """Prints on a terminal how much has been fetched."""
 
     def __init__(self, url: str, object_count: int, total_bytes: int) -> None:
-        self._url = url
+        self._url = hide_user(url)
         self._object_count = object_count
         self._total_bytes = total_bytes
         self.finished_objects = 0

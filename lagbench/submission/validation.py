@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.local import load_rooted_registry, resolve_root, suggest_split_of
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.machine import ChildStopped, LimitedChild
@@ -413,6 +413,5 @@ def require_split(result: ValidationResult, expected_split: str | None) -> None:
         where=str(result.path),
         expected=expected_split,
         got=ascii(result.split),
-        fix="name that split with --split, as `lagbench list` shows it, or the folder"
-        " of a split of your own",
+        fix=suggest_split_of(result.split),
     )

@@ -74,7 +74,8 @@ def test_list_has_counts_bytes_time_and_local_data_as_json(
     assert set(full["present"].values()) == {0}
     frame_bytes = 8192 * 16
     header_bytes = 65536
-    assert full["bytes"] == frame_count * frame_bytes + 84 * header_bytes
+    card_bytes = 150_000 + 84 * 20_000
+    assert full["bytes"] == frame_count * frame_bytes + 84 * header_bytes + card_bytes
     assert full["seconds"] > 60.0
 
 

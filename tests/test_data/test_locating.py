@@ -134,7 +134,7 @@ def test_all_ways_to_name_it(
     assert by_path_and_root.root == own.parent
     with pytest.raises(UsageError) as caught:
         locate(str(own), root=tmp_path)
-    assert caught.value.where == "--split and --root"
+    assert caught.value.where == "the split (SPLIT or --split) and --root"
 
 
 def test_ours_are_found_as_before(tmp_path: Path) -> None:
@@ -202,10 +202,10 @@ def test_unknown_names_list_local_ones(own: Path) -> None:
     """The nearest known name may be that of a local split."""
     with pytest.raises(UsageError) as caught:
         locate("owm", root=own.parent)
-    assert caught.value.where == "--split"
+    assert caught.value.where == "SPLIT or --split"
     with pytest.raises(UsageError) as caught:
         locate(str(own.parent / "other"))
-    assert caught.value.where == "--split"
+    assert caught.value.where == "SPLIT or --split"
     with pytest.raises(UsageError) as caught:
         locate(str(own), "tiny")
     assert caught.value.where == "--size"

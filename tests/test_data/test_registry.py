@@ -221,10 +221,11 @@ def test_unknown_names_offer_the_nearest() -> None:
     """Split, size, parameter and scenario, each with what is known."""
     with pytest.raises(UsageError) as caught:
         load().size("multimatrial", "full")
-    assert caught.value.where == "--split"
+    assert caught.value.where == "SPLIT or --split"
     with pytest.raises(UsageError) as caught:
         load().size("fluid", "ful")
     assert caught.value.where == "--size"
+    assert caught.value.expected == "full or mini or tiny"
     fluid = load().size("fluid", "full")
     with pytest.raises(UsageError) as caught:
         fluid.value("liqid_modulus")

@@ -1130,6 +1130,23 @@ def test_bounds_are_told_for_all_frames(tmp_path: Path, adopt_here: Adopt) -> No
     assert max(ends) == pytest.approx(high, rel=1e-4)
 
 
+def test_bounds_of_a_periodic_axis_are_its_period(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """Positions beyond a period are wrapped: their extent is not what is needed."""
+    runs = [run + np.array([3.0, 0.0], np.float32) for run in straight_runs(3)]
+    paths = save_runs(tmp_path / "in", runs)
+    with pytest.raises(UsageError) as caught:
+        adopt_here(paths, periodic=["x"], bounds=((0.0, 1.0), (0.0, 0.1)))
+    expected = str(caught.value.expected)
+    assert expected.startswith("bounds that hold [0, 1] x ")
+    high = [run + np.array([3.0, 5.0], np.float32) for run in straight_runs(3)]
+    high_paths = save_runs(tmp_path / "high", high)
+    with pytest.raises(DataError) as outside:
+        adopt_here(high_paths, periodic=["x"], bounds=((0.0, 1.0), (0.0, 9.0)))
+    assert str(outside.value.got).startswith("[0, 1] x [5")
+
+
 def test_all_that_a_description_states_wrongly_is_told_at_once(
     tmp_path: Path,
 ) -> None:

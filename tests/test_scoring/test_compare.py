@@ -366,6 +366,33 @@ def test_an_unknown_entry_is_refused_before_predictions_are_scored(
     assert "'moving'" in str(caught.value.fix)
 
 
+@pytest.mark.parametrize("name", ["ballistic", "baristic"])
+def test_only_references_of_the_data_set_are_offered(
+    name: str,
+    scored: Folders,
+    entries: Path,
+    bench: ScoreBench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A full box has no ballistic predictor; nothing is scored to find that out."""
+
+    def score_nothing(*_: object, **__: object) -> None:
+        pytest.fail("the predictions were scored")
+
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", score_nothing)
+    with pytest.raises(UsageError) as caught:
+        compare(
+            scored["still"] / "predictions.nc",
+            name,
+            board=entries,
+            root=bench.root,
+            registry=bench.registry,
+        )
+    known = str(caught.value.fix).rpartition("known: ")[2]
+    assert "persistence" in known
+    assert "ballistic" not in known
+
+
 def test_an_entry_of_another_data_set_is_named(
     scored: Folders, entries: Path, bench: ScoreBench
 ) -> None:
@@ -398,7 +425,7 @@ def side_of(first: Path, second: Path) -> str:
     """Return what the table says of the first method beside the second."""
     result = compare(first, second)
     table, *_ = comparison_tables(result)
-    column = table.columns.index("first is")
+    column = table.columns.index(f"{result.first}\nis")
     return table.rows[0][column]
 
 
@@ -449,11 +476,11 @@ def test_lines_explain_only_what_the_tables_show(tmp_path: Path) -> None:
     a = publish(tmp_path, ONES, method="a")
     b = publish(tmp_path, TWOS, method="b")
     lines = list(comparison_lines(compare(a, b)))
-    assert len(lines) == 1
+    assert len(lines) == 2
     c = publish(tmp_path, WORSE_AND_BETTER, method="c")
     rows = rows_of(ONES, undefined=[2, 0, 0, 0, 0, 0])
     d = publish(tmp_path, ONES, method="d", rows=rows)
-    _, undefined, chance = comparison_lines(compare(d, c))
+    _, _, undefined, chance = comparison_lines(compare(d, c))
     assert undefined.startswith("†")
     assert chance.startswith("?")
 

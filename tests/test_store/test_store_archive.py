@@ -16,6 +16,7 @@ from faulty_server import Mirror, serving
 
 import lagbench
 from lagbench import addresses
+from lagbench.data.layout import working_copy_of
 from lagbench.data.manifest import Manifest
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.exchange import download
@@ -241,6 +242,26 @@ def test_an_address_of_releases_that_is_none_is_told(
     assert "secret" not in str(error)
     assert len(str(error)) < 1000
     assert not list(here.rglob("*.nc"))
+
+
+@pytest.mark.parametrize(
+    "address", ["ftp://ann:secret@localhost:1/data", "memory://ann:secret@x/data"]
+)
+def test_no_message_shows_the_user_of_an_address(address: str, here: Path) -> None:
+    """The store fails or is empty: neither part of the message has the password."""
+    with pytest.raises(LagbenchError) as caught:
+        download(SPLIT, SIZE, root=here, mirror=address, or_generate=False)
+    message = f"{caught.value} {caught.value.where} {caught.value.fix}"
+    assert "secret" not in message
+    assert "ann" not in message.replace("cannot", "")
+    assert "...@" in message
+
+
+def test_no_name_of_a_working_copy_holds_a_password() -> None:
+    copy = working_copy_of("ftp://ann:secret@host/data")
+    assert copy.name.startswith("ftp-host-data-")
+    other = working_copy_of("ftp://ann:other@host/data")
+    assert copy != other
 
 
 def test_a_compressed_archive_is_not_unpacked(
