@@ -123,6 +123,7 @@ class Baseline(nn.Module):
                 where=f"the box of {info.split} {info.size}",
                 expected="walls along every axis",
                 got=f"periodic along {', '.join(info.periodic)}",
+                fix="train neuralmpm, or a graph network such as gns",
             )
         if len(info.bounds) != 2 and not self.any_box:
             raise UsageError(
@@ -155,6 +156,14 @@ class Baseline(nn.Module):
             options: plain values by name, without those of the training.
         """
         return weights, options
+
+    @property
+    def forcing_seen(self) -> frozenset[str]:
+        """What the model sees of "body_force" and "obstacle", by the names in batches.
+
+        A training warns of what drives the flow and is not seen.
+        """
+        return frozenset()
 
     @property
     @abstractmethod

@@ -7,6 +7,7 @@ from pathlib import Path
 from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
@@ -43,14 +44,28 @@ def read_dataset_info(
         )
     dataset_sha256 = _find_hash(manifest, tier)
     if dataset_sha256 is None:
-        raise DataError("the data set is not complete", where=str(folder), fix=hint)
+        raise DataError(
+            "the data set is not complete",
+            where=str(folder),
+            expected=f"all {len(tier.scenarios)} scenarios",
+            got=f"{len(manifest.files)} of them",
+            fix=hint,
+        )
     if not manifest.files:
-        raise DataError("the data set is empty", where=str(folder), fix=hint)
+        raise DataError(
+            "the data set is empty",
+            where=str(folder),
+            expected=f"{len(tier.scenarios)} scenarios",
+            got="none",
+            fix=hint,
+        )
     statistics = _find_statistics(manifest, tier)
     if not statistics:
         raise DataError(
             "the subset train is not complete, its statistics are unknown",
             where=str(folder),
+            expected="all scenarios of train",
+            got="some of them, and no recorded statistics",
             fix=hint,
         )
 
@@ -77,6 +92,33 @@ def read_dataset_info(
         moving_walls=moving_walls,
         statistics=statistics,
     )
+
+
+def find_forcing(size: Size, root: Path) -> frozenset[str]:
+    """Return which of "body_force" and "obstacle" act in the scenarios of a data set.
+
+    One scenario that is here stands for all.
+
+    Args:
+        size: the data set.
+        root: folder of all data sets.
+    """
+    for scenario in size.scenarios:
+        path = size.path(root, scenario)
+        if path.is_file():
+            break
+    else:
+        return frozenset()
+
+    forcing = set()
+    with read_scenario(path) as file:
+        header = file.header
+        if "body_force" in file.variables:
+            forcing.add("body_force")
+        where = str(header.key)
+        if parse_obstacle(header.parameters, size.dimension, where=where) is not None:
+            forcing.add("obstacle")
+    return frozenset(forcing)
 
 
 def _find_hash(manifest: Manifest, size: Size) -> str | None:

@@ -240,6 +240,13 @@ class NeuralMPM(Baseline):
         per_second = given.wall_velocity[:, last_frame:]
         return per_second * self.info.frame_interval
 
+    @property
+    def forcing_seen(self) -> frozenset[str]:
+        """The force by an option; an obstacle is the hole in the mass."""
+        if self.options.body_force:
+            return frozenset({"body_force", "obstacle"})
+        return frozenset({"obstacle"})
+
     def _coming_force(self, given: Batch) -> Tensor | None:
         """Return the force from the last frame on [length/frame^2], if it is seen.
 

@@ -9,6 +9,7 @@ of an uninterrupted one.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, count, islice, pairwise
@@ -21,7 +22,7 @@ from torch.utils.data import DataLoader, Sampler
 from lagbench.atomic import check_writable
 from lagbench.data.contents import check_contents
 from lagbench.data.local import locate
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
 from lagbench.tensors import Batch, TensorWindow, collate
@@ -32,7 +33,7 @@ from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters
 from .catalogue import find
 from .checkpoint import load_weights, round_weights, save
-from .dataset_info import read_dataset_info
+from .dataset_info import find_forcing, read_dataset_info
 from .job import TrainingJob
 from .machine import (
     bound_memory,
@@ -93,6 +94,17 @@ class TrainingResult:
     wall_seconds: float  # time of all runs [s]
 
 
+FORCING = {
+    "body_force": "the force that drives the flow",
+    "obstacle": "the obstacle in the flow",
+}
+"""What drives a flow beside walls, by its name in batches."""
+
+
+class UnseenForcingWarning(UserWarning):
+    """A model is trained that does not see what drives the flow."""
+
+
 def train(
     baseline: str,
     split: str,
@@ -137,6 +149,9 @@ def train(
         workers: processes that read windows ahead; 0 reads them in between.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
+
+    An :class:`UnseenForcingWarning` tells of a force or an obstacle that the model does
+    not see.
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
@@ -200,6 +215,7 @@ def train(
         explain_memory_errors(MEMORY_HINT),
     ):
         model = _build_model(job, entry.model, initial)
+        _warn_of_unseen_forcing(model, tier, root_folder)
         if earlier is None and not is_helper():
             folder.clear()
         if getattr(model, "closed_form", False):
@@ -207,6 +223,23 @@ def train(
         else:
             log, steps = descend(job, model)
         return _result(job, model, log, steps)
+
+
+def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:
+    """Warn before a training whose model does not see what drives the flow."""
+    unseen = sorted(find_forcing(size, root) - model.forcing_seen)
+    if not unseen or is_helper():
+        return
+    names = " and ".join(FORCING[name] for name in unseen)
+    keys = " and ".join(unseen)
+    fix = "NeuralMPM sees it"
+    if "body_force" in unseen and "body_force" in type(model.options).model_fields:
+        fix = "--set model.body_force=true shows it"
+    message = (
+        f"{model.method} does not see {names} of {size.split} ({keys}): it can only "
+        f"learn the mean effect; {fix}"
+    )
+    warnings.warn(message, UnseenForcingWarning, stacklevel=3)
 
 
 def _open_folder(

@@ -92,6 +92,7 @@ TAKE_PART = """\
 lagbench generate --split cavity --size mini       # the data, bit for bit
 lagbench predict weights.pt -o predictions.nc      # or write the file yourself
 lagbench submit predictions.nc --from meta.yaml    # scores, and adds the entry
+lagbench leaderboard check --base origin/main      # what the pull request must pass
 lagbench leaderboard reproduce SPLIT/SIZE/METHOD   # anybody can repeat a score"""
 """Commands by which a reader takes part."""
 
@@ -334,8 +335,11 @@ def draw_empty(board: Board) -> Markup:
         tag("h2", "Take part"),
         tag(
             "p",
-            "Predict the test scenarios with your model and submit the file; nobody "
-            "runs your code unless you give the model too.",
+            "Predict the test scenarios with your model. Describe it in meta.yaml: "
+            "authors and command are required. lagbench submit scores the predictions "
+            "and writes the entry into a clone of the repository; open a pull request "
+            "with these files and nothing else. Nobody runs your code unless you give "
+            "the model too. docs/submitting.md has a meta.yaml and each step.",
         ),
         tag("pre", tag("code", TAKE_PART)),
     ]
@@ -483,7 +487,8 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     parts = []
     if row.skill is not None:
         parts.append(tag("span", text(row.skill.mean), class_="n"))
-    parts.append(tag("span", ", ".join(remarks), class_="ci"))
+    for remark in remarks:
+        parts.append(tag("span", remark, class_="ci"))
     link = tag("a", *parts, href=f"#tab={tab.id}&entry={row.id}")
     return tag("td", link, class_="best" if row.rank == 1 else None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import mirror_batch, shift_batch
-from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.dataset_info import find_forcing, read_dataset_info
 from lagbench.baselines.neuralmpm import NeuralMPM
+from lagbench.baselines.train import UnseenForcingWarning, train
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError, UsageError
@@ -164,3 +166,52 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
     without_force = replace(given, body_force=None)
     with pytest.raises(DataError):
         model.start(without_force)
+
+
+RECIPE = """\
+format: 1
+recipes:
+  poiseuille/tiny:
+    model: {model}
+    training: {{steps: 1, warmup_steps: 0}}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("baseline", "model", "has_warning"),
+    [
+        ("gns", "{latent: 4, layers: 1}", True),
+        ("neuralmpm", "{cells: 12, width: 8, bundle: 2}", True),
+        ("neuralmpm", "{cells: 12, width: 8, bundle: 2, body_force: true}", False),
+    ],
+)
+def test_a_training_says_that_its_model_does_not_see_the_force(
+    baseline: str, model: str, has_warning: bool, root: Path, tmp_path: Path
+) -> None:
+    recipe = tmp_path / "own.yaml"
+    recipe.write_text(RECIPE.format(model=model))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UnseenForcingWarning)
+        train(
+            baseline,
+            SPLIT,
+            "tiny",
+            recipe=str(recipe),
+            root=root,
+            output=tmp_path / "run",
+        )
+    messages = [str(warning.message) for warning in caught]
+    assert bool(messages) == has_warning, messages
+    if has_warning:
+        assert "does not see the force that drives the flow" in messages[0]
+    if baseline == "neuralmpm" and has_warning:
+        assert "--set model.body_force=true" in messages[0]
+
+
+def test_the_obstacle_of_a_data_set_is_found(
+    root: Path, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    cylinder = load().size("cylinder", "tiny")
+    assert find_forcing(cylinder, tiny_split("cylinder").root) == {"obstacle"}
+    assert find_forcing(SIZE, root) == {"body_force"}

@@ -33,6 +33,7 @@ from sample_boards import make_board, with_entry
 from lagbench.board.columns import columns_of, format_value, presets_of, value_of
 from lagbench.board.model import Board, BoardRow, ReferenceRow, Tab
 from lagbench.board.page import render
+from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Direction
 
 pytestmark = pytest.mark.skipif(
@@ -75,6 +76,22 @@ def go(page: Page, tab: Tab) -> None:
     """Choose a tab as a reader does."""
     run(page, f"document.querySelector('.tabs a[data-tab=\"{tab.id}\"]').click()")
     until(page, f"!document.getElementById('{tab.id}').hidden")
+
+
+@pytest.mark.slow
+def test_the_overview_of_all_splits_fits_a_laptop(
+    running: Browser, tmp_path: Path
+) -> None:
+    """Every split that has a size mini has a column, and none lies outside."""
+    data_sets = [(name, "mini") for name in load().splits]
+    path = tmp_path / "index.html"
+    page_text = render(make_board(tuple(data_sets), nodes=16))
+    path.write_text(page_text, encoding="utf-8")
+    page = running.open(path, width=1280)
+    box = "document.querySelector('.across').parentElement"
+    assert page.value(f"{box}.querySelectorAll('thead th').length") > len(data_sets)
+    assert page.value(f"{box}.scrollWidth") <= page.value(f"{box}.clientWidth")
+    close(page)
 
 
 @pytest.mark.parametrize(
