@@ -71,6 +71,7 @@ def find(name: str) -> CatalogueEntry:
         raise UsageError(
             f"the baseline {name!r} cannot be loaded",
             where=package_of(points[name]),
+            expected="a module that can be imported",
             got=_describe_error(error),
             fix="mend or uninstall that package",
         ) from error
@@ -115,7 +116,11 @@ def _load_entry(point: EntryPoint) -> CatalogueEntry:
     loaded_class = load_entry_point(point)
     if not inspect.isclass(loaded_class):
         raise UsageError(
-            f"{point.value} is no class", expected="a subclass of Baseline or Operator"
+            f"{point.value} is no class",
+            where=package_of(point),
+            expected="a subclass of Baseline or Operator",
+            got=type(loaded_class).__name__,
+            fix="name the class in its entry point, as in package.module:MyModel",
         )
     if issubclass(loaded_class, Baseline):
         _check_complete(loaded_class, point)
@@ -126,7 +131,11 @@ def _load_entry(point: EntryPoint) -> CatalogueEntry:
         recipes = _find_recipes(loaded_class, OPERATOR_RECIPES)
         return CatalogueEntry(name=point.name, model=model, recipes=recipes)
     raise UsageError(
-        f"{point.value} is no baseline", expected="a subclass of Baseline or Operator"
+        f"{point.value} is no baseline",
+        where=package_of(point),
+        expected="a subclass of Baseline or Operator",
+        got=", ".join(base.__name__ for base in loaded_class.__bases__),
+        fix="derive it from lagbench.baselines.baseline.Baseline: docs/extending.md",
     )
 
 
@@ -138,7 +147,11 @@ def _check_complete(model: type[Baseline], point: EntryPoint) -> None:
             missing.append(name)
     if missing:
         raise UsageError(
-            f"{point.value} lacks {', '.join(missing)}", expected=", ".join(REQUIRED)
+            f"{point.value} lacks {', '.join(missing)}",
+            where=package_of(point),
+            expected=", ".join(REQUIRED),
+            got=", ".join(name for name in REQUIRED if name not in missing) or "none",
+            fix="add them: docs/extending.md has the contract",
         )
 
 

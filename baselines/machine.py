@@ -31,7 +31,13 @@ def choose_device(name: str) -> str:
     expected = "cpu or auto: torch sees no GPU"
     if has_gpu:
         expected = "cpu, cuda or auto"
-    raise UsageError(f"no device {name!r} here", where="--device", expected=expected)
+    raise UsageError(
+        f"no device {name!r} here",
+        where="--device",
+        expected=expected,
+        got=ascii(name),
+        fix="leave --device out: auto takes a GPU where there is one",
+    )
 
 
 def is_helper() -> bool:

@@ -351,6 +351,7 @@ def check_replaceable(output: Path) -> None:
         raise UsageError(
             "the output is a folder",
             where="--output",
+            expected="the name of a file",
             got=str(costs),
             fix=f"name a file, as in -o {costs / 'predictions.nc'}",
         )
@@ -358,6 +359,7 @@ def check_replaceable(output: Path) -> None:
         raise UsageError(
             "predictions are no JSON",
             where="--output",
+            expected="a name that ends in .nc",
             got=str(output),
             fix=f"name it {output.with_suffix('.nc').name}: the costs of the "
             f"predictions go to {costs.name}",
@@ -377,6 +379,7 @@ def _check_kind(path: Path, *, signs: tuple[bytes, ...]) -> None:
         raise UsageError(
             "the output would replace a file that is something else",
             where="--output",
+            expected="no file, or predictions to replace",
             got=str(path),
             fix="name another file: -o predictions.nc",
         )
@@ -515,6 +518,7 @@ def restore_for_size(
         raise UsageError(
             "the weights do not fit the model with these settings",
             where="--set",
+            expected="settings that leave the shapes of the weights",
             got=", ".join(settings),
             fix="set options without weights, or train with these settings",
         ) from error

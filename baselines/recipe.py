@@ -398,6 +398,8 @@ def _missing_recipe(
     return UsageError(
         f"{entry.name} has no recipe {name!r}",
         where="--split, --size, --recipe",
+        expected="a recipe of the split and size",
+        got=ascii(name),
         fix=f"{hint}write your own: --recipe FILE.yaml, see docs/baselines.md",
     )
 
@@ -445,7 +447,11 @@ def _check_baselines(part: _SharedRecipe, *, where: str) -> None:
     for name in part.baselines:
         if name not in names:
             raise UnreadableFileError(
-                f"unknown baseline {name!r}", where=where, fix=suggest_name(name, names)
+                f"unknown baseline {name!r}",
+                where=where,
+                expected="the name of a reference model",
+                got=ascii(name),
+                fix=suggest_name(name, names),
             )
 
 
@@ -466,6 +472,7 @@ def change_options(
             raise UsageError(
                 "an option of the training cannot change now",
                 where="--set",
+                expected="an option of the model",
                 got=setting,
                 fix="set options of the model: --set model.KEY=VALUE",
             )
@@ -542,7 +549,9 @@ def _parse_setting(text: str) -> Layer:
         raise UsageError(
             "the value is no YAML",
             where=f"--set {key}",
+            expected="a value as in YAML: a number, true, a word, [1, 2]",
             got=" ".join(str(error).split()),
+            fix="put the value in quotes: --set 'KEY=VALUE'",
         ) from None
     for name in reversed((group, *path)):
         layer = {name: layer}

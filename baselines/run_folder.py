@@ -144,6 +144,8 @@ class RunFolder:
         return UsageError(
             "the folder holds a training",
             where=str(self.path),
+            expected="a folder without one, or the same recipe",
+            got="a training",
             fix="go on with the recipe of the folder, train anew with --fresh, or name "
             "another --output",
         )
@@ -164,6 +166,7 @@ class RunFolder:
         return UsageError(
             what,
             where=str(self.path),
+            expected=f"{self.checkpoint.name}, or an empty folder",
             got=f"{self.weights.name} without {self.checkpoint.name}",
             fix=f"{instead}, or train anew with --fresh",
         )

@@ -117,6 +117,7 @@ def start_from(
         raise UsageError(
             f"{entry.model.method} is fitted as a whole, without steps",
             where=WHERE,
+            expected="a model that is trained by steps",
             got=str(path),
             fix="leave the option out",
         )

@@ -257,6 +257,7 @@ def _open_folder(
         raise UsageError(
             "the weights to start from lie in the folder of the training",
             where="--start",
+            expected="weights in another folder",
             got=str(initial.path),
             fix="name another folder with --output",
         )

@@ -72,6 +72,7 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
             "Taichi runs already with another device or fewer threads",
             where=f"device {device.value}, threads {threads}",
             expected=f"{running_device} with at most {pool_size} threads",
+            got=f"{device.value} with {threads or 1} threads",
             fix="use another process",
         )
     return threads or min(pool_size, available_cores())
@@ -124,10 +125,17 @@ def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
         return UsageError(
             "Taichi cannot use this device",
             where="cuda",
+            expected="an NVIDIA GPU with its driver",
             got=error,
             fix="use --device cpu: there is no NVIDIA GPU, or no driver of one",
         )
-    return UsageError("Taichi cannot use this device", where="cpu", got=error)
+    return UsageError(
+        "Taichi cannot use this device",
+        where="cpu",
+        expected="an x86-64 processor that Taichi compiles for",
+        got=error,
+        fix="`lagbench doctor` shows this machine; `lagbench download` needs no Taichi",
+    )
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)

@@ -250,13 +250,19 @@ def split_module(size: Size) -> SplitGenerator:
         raise UsageError(
             f"the generator of split {size.split!r} cannot be imported",
             where=size.generator,
+            expected="a module that can be imported",
             got=error,
+            fix="mend the module, or correct the key generator of the split",
         ) from error
     needed = ("solver_parameters", "initial_state")
     missing = [name for name in needed if not hasattr(module, name)]
     if missing:
         raise UsageError(
-            f"a generator lacks {' and '.join(missing)}", where=size.generator
+            f"a generator lacks {' and '.join(missing)}",
+            where=size.generator,
+            expected=" and ".join(needed),
+            got="a module without",
+            fix="add the functions: docs/extending.md has the contract of a split",
         )
     return cast("SplitGenerator", module)
 

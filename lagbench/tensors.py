@@ -165,6 +165,7 @@ class Batch:
                 where="Batch.part",
                 expected=f"some of {self.frames} frames, in steps of 1",
                 got=frames,
+                fix="take frames in steps of 1, as in batch.part(slice(2))",
             )
         first = frame_numbers[0]
         wall_velocity = self.wall_velocity
@@ -250,6 +251,7 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             f"with moving walls, {len(body_forces)} with a body force, "
             f"{len(origins)} with their first frame, "
             f"{len(viscosities)} with a viscosity, {len(obstacles)} with an obstacle",
+            fix="collate windows of one WindowDataset",
         )
 
     particle_counts = torch.tensor([len(window.material) for window in windows])

@@ -157,6 +157,7 @@ class WindowSampler(Sampler[int]):
                 where="WindowSampler",
                 expected=f"0 <= rank < ranks <= {len(data)}",
                 got=f"rank {rank} of {ranks}",
+                fix="use fewer processes, or more windows",
             )
         self.rank = rank
         self.ranks = ranks
@@ -220,6 +221,7 @@ class WindowSampler(Sampler[int]):
                 where="WindowSampler",
                 expected=f"at most {window_count}",
                 got=position,
+                fix="seek the next epoch",
             )
         self.epoch = epoch
         self.position = position
@@ -255,6 +257,7 @@ def _check_natural(value: object, name: str) -> int:
             where="WindowSampler",
             expected="a whole number from 0",
             got=repr(value),
+            fix=f"give such a number as {name}",
         )
     return number
 
@@ -321,6 +324,7 @@ def _check_step_result(position: object, shape: torch.Size) -> None:
             where="roll_out, step",
             expected=f"a tensor of shape {list(shape)}: [particle, axis]",
             got=getattr(position, "shape", None) or type(position).__name__,
+            fix="return the positions of the next frame only: position[:, -1] + v",
         )
 
 
@@ -373,6 +377,7 @@ def predict(
             where="predict",
             expected=f"history from 1 to {task.input_frames}",
             got=history,
+            fix="leave history out, or give fewer frames",
         )
     visible_frames = slice(task.input_frames - history, None)
     needed_frames = task.input_frames + task.horizon

@@ -40,10 +40,18 @@ def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
     seeds = tuple(header.seed for header in headers)
     for seed in seeds:
         if seed is not None and not 0 <= seed < 2**63:
-            raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
+            raise UsageError(
+                "a seed does not fit",
+                where="seed of the predictions",
+                expected="0 to 2^63 - 1",
+                got=seeds,
+                fix="write them again with such a seed: submission.write(..., seed=0)",
+            )
     if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
         raise UsageError(
             "several files must have different seeds",
+            where="the predictions, one file for each seed",
+            expected="another seed in each file",
             got=_format_seeds(seeds),
             fix="write them with submission.write(..., seed=0), seed=1 and so on",
         )
@@ -61,7 +69,11 @@ def _require_equal(name: str, values: Sequence[str]) -> None:
             "lagbench predict --method NAME"
         )
     raise UsageError(
-        f"the files differ in {name}", got=", ".join(map(ascii, different)), fix=fix
+        f"the files differ in {name}",
+        where="the predictions, one file for each seed",
+        expected="files that differ in their seed only",
+        got=", ".join(map(ascii, different)),
+        fix=fix,
     )
 
 
@@ -97,6 +109,8 @@ def require_extendable(
         raise UsageError(
             "there is no entry to add seeds to",
             where=str(path),
+            expected="an active entry of that name",
+            got="no such file",
             fix="submit it without --add; --method names the entry",
         )
     entry = read_entry(path)
@@ -104,6 +118,7 @@ def require_extendable(
         raise UsageError(
             "seeds are added to active entries only",
             where=str(path),
+            expected=f"an entry whose status is {Status.ACTIVE}",
             got=entry.status,
             fix="submit by another --method",
         )
@@ -120,6 +135,7 @@ def _require_new_seeds(
         raise UsageError(
             "seeds can be added only if the files and the entry state their seeds",
             where=str(path),
+            expected="a number in each file",
             got=f"the entry has {_format_seeds(entry_seeds)}, "
             f"the files {_format_seeds(new_seeds)}",
             fix="write every file with a seed, as submission.write(..., seed=0) does; "
@@ -130,6 +146,7 @@ def _require_new_seeds(
         raise UsageError(
             "the entry has this seed already",
             where=str(path),
+            expected="seeds that the entry has not",
             got=f"seed {_format_seeds(common_seeds)}; "
             f"the entry has {_format_seeds(entry_seeds)}",
             fix=f"leave out the files of these seeds, {SUBMIT_ANEW}",
@@ -141,6 +158,7 @@ def _require_new_seeds(
             where=str(path),
             expected=f"at most {MOST_SEEDS}",
             got=count,
+            fix="submit fewer files",
         )
 
 
@@ -219,6 +237,7 @@ def require_new(
             raise UsageError(
                 "these predictions are submitted already",
                 where=str(path),
+                expected="predictions that no entry and no other seed has",
                 got=f"those of {owner_of[identity]}",
                 fix="submit the file of each seed once; what goes by a new name "
                 "supersedes its old entry",

@@ -47,6 +47,8 @@ def choose_entries(
                 raise UsageError(
                     "the entry has no model to run",
                     where=key,
+                    expected="weights.pt, safetensors or ONNX of each seed",
+                    got="predictions only",
                     fix="its submitter may add one: lagbench submit --weights",
                 )
             chosen.append(entry)

@@ -51,7 +51,13 @@ def choose_data_sets(
     fix: str | None = "submit something: lagbench submit"
     if known:
         fix = suggest_name(request, [" ".join(data_set) for data_set in known])
-    raise UsageError("no entries there", where=f"leaderboard {request}", fix=fix)
+    raise UsageError(
+        "no entries there",
+        where=f"leaderboard, {request}",
+        expected="a data set with entries",
+        got=ascii(request),
+        fix=fix,
+    )
 
 
 def scope_of_tables(metrics: Collection[str], *, wide: bool) -> Scope:
@@ -85,6 +91,8 @@ def tables(
             raise UsageError(
                 f"no metric {name!r} here",
                 where="--metric",
+                expected="the name of a metric",
+                got=ascii(name),
                 fix=suggest_name(name, METRICS),
             )
     for tab in board.tabs:

@@ -162,7 +162,9 @@ def _require_fit_arguments(
             raise UsageError(
                 "--add and --replace exclude each other",
                 where="--add, --replace",
-                fix="give one",
+                expected="one of the two",
+                got="both",
+                fix="--add for more seeds, --replace for new predictions of all",
             )
         if not add:
             _require_keys(meta)

@@ -127,6 +127,8 @@ def require_weights(
             raise UsageError(
                 f"two files of weights of seed {file.seed}",
                 where=str(path),
+                expected="one file for each seed",
+                got=f"two of seed {file.seed}",
                 fix="give one of each seed at most",
             )
         if file.sha256 in owners:
@@ -174,6 +176,7 @@ def _owned_error(path: Path, owner: str) -> UsageError:
     return UsageError(
         "these weights lie beside another entry",
         where=str(path),
+        expected="weights that no other entry has",
         got=f"those of {owner}",
         fix="leave them out, and name them in --command; or give those of this method",
     )
@@ -185,6 +188,8 @@ def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> Non
         raise UsageError(
             "this is a checkpoint of a training, not the weights of a model",
             where=str(file.path),
+            expected="weights.pt",
+            got="a checkpoint of a training",
             fix="give the weights.pt beside it, and predictions that it made",
         )
     data_set = (header.split, header.size, header.dataset_sha256)
@@ -206,6 +211,7 @@ def _require_made_by(file: WeightsFile, header: Header) -> None:
             where=str(file.path),
             expected="predictions that state their training, or how many parameters "
             "the model has",
+            got="predictions that state neither",
             fix="predict with these weights: lagbench predict; or leave them out",
         )
 

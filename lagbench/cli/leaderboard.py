@@ -134,6 +134,7 @@ def check_command(
             "--split and --size choose data to measure again",
             where="--root",
             expected="the folder of the data",
+            got="nothing",
             fix="give --root as well",
         )
     if recording and not predictions:
@@ -141,6 +142,7 @@ def check_command(
             "there is nothing to record",
             where="--record",
             expected="predictions that are scored again",
+            got="no --predictions",
             fix="give --predictions FILE as well",
         )
     sizes: Sequence[Size] = ()
@@ -177,6 +179,8 @@ def _sizes_to_measure(root: Path, split: str | None, size: str | None) -> list[S
         raise DataError(
             "no test scenarios are there",
             where=str(root),
+            expected="scenarios of the subset test",
+            got="none of the chosen data sets",
             fix="make them with `lagbench generate`, or name another --root",
         )
     return sizes
@@ -231,6 +235,7 @@ def picture_command(
             where="--output",
             expected="a name that ends in .svg",
             got=output,
+            fix=f"-o {output.stem or 'cost'}.svg",
         )
     model = collect(board, only=[(tier.split, tier.name)])
     svg = picture(model, tier)
@@ -298,6 +303,8 @@ def reproduce_command(
             "the options do not fit together",
             where="--costs, --no-costs, --scenarios",
             expected="--costs or --no-costs, and at least one scenario",
+            got="both" if costs and no_costs else f"--scenarios {scenarios}",
+            fix="leave one of the options out, or ask for one scenario or more",
         )
     with progress_bar(quiet=quiet or as_json) as progress:
         result = reproduce(

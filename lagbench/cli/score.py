@@ -183,6 +183,7 @@ def _score_folders(
             raise UsageError(
                 "the scores of two files would go to one folder",
                 where=str(folder),
+                expected="a folder for each file",
                 got=f"{other_path} and {path}",
                 fix="name each file once, give the files different names, or leave "
                 "--output out",

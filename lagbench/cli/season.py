@@ -94,6 +94,7 @@ def close_command(
             "--source and --value exclude each other",
             where="--source and --value",
             expected="one of the two",
+            got="both",
             fix="give --source before the value is known, and --value afterwards",
         )
     if value is not None:
@@ -226,6 +227,8 @@ def show_command(
         raise ChecksFailedError(
             "the season was not run yet",
             where=str(board / season_path(name, SEASON_SCORES)),
+            expected="the scores of its run",
+            got="no such file",
             fix=f"lagbench generate --season {name}; lagbench season run {name}",
         )
     rows = season_rows(season, scores)

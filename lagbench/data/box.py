@@ -55,10 +55,15 @@ class Box:
                 where="low, high, periodic",
                 expected="as many values in each",
                 got=f"{len(self.low)}, {len(self.high)} and {len(self.periodic)}",
+                fix="give a low, a high and a periodic value for each axis",
             )
         if self.dimension not in (2, 3):
             raise UsageError(
-                "a box has two or three dimensions", where="low", got=self.dimension
+                "a box has two or three dimensions",
+                where="low",
+                expected="2 or 3 values",
+                got=self.dimension,
+                fix="give a value for each axis",
             )
         for axis, low, high in zip(AXES, self.low, self.high, strict=False):
             if not low < high:
@@ -67,6 +72,7 @@ class Box:
                     where=axis,
                     expected="low < high",
                     got=f"{low} and {high}",
+                    fix="exchange them, or correct one",
                 )
 
     @classmethod
@@ -298,6 +304,7 @@ def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
             where="periodic",
             expected=f"some of {', '.join(names)}",
             got=", ".join(map(str, axes)),
+            fix=f"name axes of the box, as in {names[0]} or {','.join(names)}",
         )
     return tuple(name in axes for name in names)
 

@@ -85,6 +85,7 @@ class Grid:
                 where="cells",
                 expected="at least 2",
                 got=self.cells,
+                fix="give more cells",
             )
         object.__setattr__(self, "placement", Placement(self.placement))
         if not self.box.has_whole_cells(self.cells):
@@ -294,8 +295,10 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != dimension:
         raise UsageError(
             "positions and velocities do not fit",
+            where="position and velocity",
             expected=f"two arrays of one shape [..., particle, {dimension}]",
             got=f"{x.shape} and {u.shape}",
+            fix="give both for the same particles",
         )
     scatter = scatter_in_box
     if dimension == 2 and not grid.box.is_periodic:

@@ -662,6 +662,7 @@ def _read(path: Path) -> _RegistryFile:
         raise UnreadableFileError(
             f"{error.error_count()} mistake(s) in the registry",
             where=str(path),
+            expected="a registry as docs/extending.md describes it",
             got="\n    ".join(lines),
             fix="mend the keys named above",
         ) from None

@@ -183,6 +183,7 @@ def _divide_into_subsets(
                 "the folders train, valid and test decide the subsets",
                 where="--valid and --test",
                 expected="no such option beside the folders train, valid and test",
+                got=f"--valid {valid}, --test {test}",
                 fix="leave them out, or name the files",
             )
         return {
@@ -282,6 +283,7 @@ def import_split(
             "the format itself states the order of the axes",
             where="axes",
             expected="no such key",
+            got="axes",
             fix="leave it out; adopt takes it",
         )
     form = parse_format(format)
@@ -333,7 +335,7 @@ def _require_files(folder: Path, names: Sequence[str]) -> None:
         where=str(folder),
         expected=", ".join(names),
         got=f"no {', no '.join(missing)}",
-        fix=fix,
+        fix=fix or "name their folder; `lagbench adopt` takes other files",
     )
 
 
@@ -364,6 +366,9 @@ def _description_options(
     if "frame_interval" not in merged:
         raise UsageError(
             "the metadata state no time between frames",
+            where="metadata.json",
+            expected="dt",
+            got="none",
             fix="state it: --frame-interval SECONDS",
         )
     return merged
@@ -399,7 +404,11 @@ def _parse_group(
         members = set(group)
     if not {"position", "particle_type"} <= members:
         raise UnreadableFileError(
-            "this is no trajectory", where=name, expected="position and particle_type"
+            "this is no trajectory",
+            where=name,
+            expected="position and particle_type",
+            got=", ".join(sorted(members)[:10]) or "no members",
+            fix="export it again as LagrangeBench writes it, or use lagbench adopt",
         )
     position = group["position"]
     shape = position.shape

@@ -120,6 +120,7 @@ def list_trajectories(path: Path) -> list[Row]:
             where=str(path),
             expected=f"at most {MAX_ID + 1}",
             got=shape[0],
+            fix="save fewer in a file, and adopt two splits",
         )
     return [(path, number) for number in range(shape[0])]
 
@@ -161,6 +162,7 @@ def _parse_trajectory(
             where=name,
             expected=f"an array {POSITION!r}",
             got=", ".join(arrays) or f"none of {', '.join(ARRAYS)}",
+            fix=f"save them as {POSITION!r}, shape [frame, particle, axis]",
         )
     position = OrderedArray(arrays[POSITION], order or ORDER)
     shape = position.shape
@@ -208,7 +210,14 @@ def _parse_material(
     _check_numbers(array, meaning, (particle_count,), where=where, kinds=INTEGER_KINDS)
     material = np.asarray(array[...])
     if not np.isin(material, range(len(MATERIALS))).all():
-        raise DataError(f"these are no {meaning}", where=where)
+        unknown = np.unique(material[~np.isin(material, range(len(MATERIALS)))])
+        raise DataError(
+            f"these are no {meaning}",
+            where=where,
+            expected=f"numbers from 0 to {len(MATERIALS) - 1}",
+            got=", ".join(map(str, unknown[:10].tolist())),
+            fix="number them so, or leave materials out: all are liquid then",
+        )
     return material.astype(np.int8)
 
 
@@ -232,7 +241,13 @@ def _parse_walls(
     with np.errstate(over="ignore"):  # they are stored as float32
         is_finite = np.isfinite(walls.astype(np.float32)).all()
     if not is_finite:
-        raise DataError("a velocity of a wall is not finite", where=where)
+        raise DataError(
+            "a velocity of a wall is not finite",
+            where=where,
+            expected="numbers",
+            got="NaN, infinity, or a number beyond float32",
+            fix="give zeros where walls rest",
+        )
     return walls
 
 
@@ -256,6 +271,7 @@ def _check_numbers(
         where=where,
         expected=f"{expected} of shape {' or '.join(map(str, shapes))}",
         got=f"{dtype} of shape {shape}",
+        fix="save them in that shape, or leave them out",
     )
 
 
@@ -286,6 +302,7 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
             "the file holds pickled objects",
             where=name,
             expected="arrays of numbers",
+            got=dtype,
             fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
     # NumPy reserves memory for what the header claims before it reads.
@@ -297,6 +314,7 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
             where=name,
             expected=f"{available_bytes} bytes",
             got=f"{dtype} of shape {shape}",
+            fix="save it again: it was cut",
         )
 
 
@@ -349,6 +367,7 @@ def _read_netcdf(path: Path) -> dict[str, Any]:
                 "the values are packed",
                 where=f"{path}, {name}, {', '.join(sorted(packing))}",
                 expected="positions as they are, float32 or float64",
+                got="values that stand for others",
                 fix="write them again without scale_factor and add_offset",
             )
         arrays[name] = variable
@@ -368,4 +387,5 @@ def _reading(path: Path) -> Iterator[None]:
             where=str(path),
             expected="arrays of numbers",
             got=f"{type(error).__name__}: {error}",
+            fix="save it as .npy, .npz, .h5 or .nc again",
         ) from error

@@ -119,7 +119,9 @@ def export(
         raise UsageError(
             "this option is for lagrangebench-h5 only",
             where="--from-walls",
+            expected="--format lagrangebench-h5",
             got=form.value,
+            fix="leave --from-walls out",
         )
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     target = Path(output)
@@ -236,6 +238,8 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
         raise UsageError(
             "the folder holds a program that readers of this format run",
             where=str(folder / FORCE),
+            expected="a folder without it",
+            got=FORCE,
             fix="name another folder: --output",
         )
     existing = []
@@ -246,6 +250,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
         raise UsageError(
             "files of that name are there",
             where=str(folder),
+            expected="a folder without them",
             got=", ".join(existing),
             fix="name another folder, or write over them: --force",
         )
@@ -257,12 +262,16 @@ def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> N
         raise UsageError(
             "wall particles need a box of two dimensions with four walls",
             where="--wall-particles",
+            expected="a split as cavity",
             got=size.split,
+            fix="leave --wall-particles out",
         )
     if has_unit_box:
         raise UsageError(
             "wall particles lie outside the unit box's bounds",
             where="--wall-particles and --unit-box",
+            expected="one of the two",
+            got="both",
             fix="leave out --unit-box",
         )
 
@@ -429,6 +438,8 @@ def _recorded_statistics(
             "the data set is not complete: the statistics of train are "
             "recorded nowhere",
             where=f"{size.split} {size.name} in {root}",
+            expected="all scenarios of train",
+            got="some, and no recorded statistics",
             fix=suggest_repair(size, root=root),
         )
     return dict(manifest.statistics), manifest.dataset_sha256

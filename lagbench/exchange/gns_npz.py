@@ -107,7 +107,9 @@ def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajecto
         raise UnreadableFileError(
             "cannot read an npz file",
             where=str(path),
+            expected="a file of numpy.savez",
             got=f"{type(error).__name__}: {error}",
+            fix="fetch it again, or name the format that it has: --format",
         ) from error
     with archive:
         for member in archive.namelist():
@@ -133,6 +135,7 @@ def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Traj
             where=name,
             expected="positions, kinds[, a material property]",
             got=f"{type(item).__name__} of {len(parts)} parts",
+            fix="save a tuple for each trajectory; `lagbench adopt` takes plain arrays",
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
@@ -145,6 +148,7 @@ def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Traj
             where=name,
             expected="numbers",
             got=error,
+            fix="save one number for each particle, and one property",
         ) from error
 
     material, is_kept = find_materials(
@@ -157,7 +161,11 @@ def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Traj
         parameters["material_property"] = properties[0]
         if not np.isfinite(properties[0]):
             raise UnreadableFileError(
-                "the material property is not finite", where=name, got=properties[0]
+                "the material property is not finite",
+                where=name,
+                expected="a number",
+                got=properties[0],
+                fix="save it again, or leave it out",
             )
     return Trajectory(
         name=name,
@@ -201,6 +209,7 @@ def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
             where=name,
             expected="an object array of arrays",
             got=f"{type(error).__name__}: {error}",
+            fix="fetch it again, or save it with numpy.savez",
         ) from error
 
 

@@ -178,7 +178,13 @@ def find_materials(
         material[numbers == number] = code_of[number]
     is_kept = material != DROPPED_CODE
     if not is_kept.any():
-        raise UnreadableFileError("every particle is padding or left out", where=where)
+        raise UnreadableFileError(
+            "every particle is padding or left out",
+            where=where,
+            expected="particles of a kind that is kept",
+            got=f"kinds {', '.join(map(str, stored_numbers[:10]))}",
+            fix="say which are kept: --kinds, as in 3=jelly,0=drop",
+        )
     return material[is_kept], is_kept
 
 
@@ -200,6 +206,7 @@ def _check_kinds(
             where=where,
             expected=expected,
             got=f"{numbers.dtype} of shape {numbers.shape}",
+            fix="save one integer for each particle",
         )
 
 
@@ -210,6 +217,8 @@ def _material_code(name: str) -> int:
         raise UsageError(
             f"no material {name!r}",
             where="--kinds",
+            expected="the name of a material, or drop",
+            got=ascii(name),
             fix=suggest_name(name, (*MATERIALS, DROP)),
         )
     return MATERIALS.index(name)
@@ -228,7 +237,11 @@ def parse_kinds(text: str | None) -> dict[int, str]:
         number, _, name = part.strip().partition("=")
         if not re.fullmatch(r"-?[0-9]{1,9}", number):
             raise UsageError(
-                "bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text
+                "bad kinds",
+                where="--kinds",
+                expected="as in 3=jelly,0=drop",
+                got=text,
+                fix="write NUMBER=MATERIAL with commas in between",
             )
         _material_code(name)  # refuses unknown names
         kinds[int(number)] = name
@@ -447,6 +460,7 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
             where=f"{path}, key dim",
             expected=len(bounds),
             got=repr(dimension),
+            fix="correct dim, or give a pair of bounds for each axis",
         )
     spacing = None
     substeps = 1
@@ -480,6 +494,7 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
         where=f"{path}, key {key}",
         expected=first["msg"],
         got=first["input"],
+        fix="correct the key in the metadata",
     )
 
 
@@ -491,10 +506,18 @@ def _read_json(path: Path) -> dict[str, Any]:
         values = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFileError(
-            "cannot read the metadata", where=where, expected="a JSON object", got=error
+            "cannot read the metadata",
+            where=where,
+            expected="a JSON object",
+            got=error,
+            fix="fetch the file again, or correct it",
         ) from error
     if not isinstance(values, dict):
         raise UnreadableFileError(
-            "the metadata are no JSON object", where=where, got=type(values).__name__
+            "the metadata are no JSON object",
+            where=where,
+            expected="an object, {...}",
+            got=type(values).__name__,
+            fix="fetch the file again, or correct it",
         )
     return values

@@ -208,6 +208,7 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
             raise UsageError(
                 "there are more mistakes",
                 where=where or "the options",
+                expected="options as docs/exchange.md has them",
                 got=f"{untold} more",
                 fix="mend those that are told, then try again",
             )
@@ -314,6 +315,7 @@ class Description:
                     "there are no bounds to fit into the unit box",
                     where="--rescale",
                     expected="bounds of the data",
+                    got="none",
                     fix="add --bounds",
                 )
             object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
@@ -458,6 +460,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             where=name,
             expected="floats of shape (frame, particle, 2 or 3)",
             got=f"{dtype} of shape {shape}",
+            fix="save positions as float32, with the axes in this order",
         )
     frame_count, particle_count, component_count = shape
     if component_count not in DIMENSIONS:
@@ -487,6 +490,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
                 where=name,
                 expected=limit,
                 got=count,
+                fix=f"give fewer {kind}",
             )
 
 
@@ -498,6 +502,7 @@ def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
             where=where,
             expected=f"at most {MOST_INFLATION} times {packed} bytes",
             got=f"{unpacked} bytes",
+            fix="save it without compression if it is yours; else leave it out",
         )
 
 

@@ -204,6 +204,7 @@ def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
             where="--dpi",
             expected=f"{COARSEST} to {FINEST}",
             got=dpi,
+            fix="leave it out, or give a number of these",
         )
     matplotlib = require("matplotlib", extra="plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg

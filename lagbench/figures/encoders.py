@@ -54,7 +54,13 @@ def encode_mp4(
         ffmpeg = str(require("imageio_ffmpeg", extra="plots").get_ffmpeg_exe())
     except RuntimeError as error:
         fix = "pip install 'lagbench[plots]', or write a .gif"
-        raise UsageError("no ffmpeg", got=error, fix=fix) from None
+        raise UsageError(
+            "no ffmpeg",
+            where=str(path),
+            expected="the ffmpeg that imageio-ffmpeg brings",
+            got=error,
+            fix=fix,
+        ) from None
 
     width, height = size
     command = [ffmpeg, "-y", "-loglevel", "error", *_INPUT]

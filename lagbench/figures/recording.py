@@ -308,7 +308,9 @@ def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     if "scenario" in data.dims:
         raise UsageError(
             "a picture shows one scenario",
-            got=f"a data set of {data.sizes['scenario']}",
+            where="the data set that is drawn",
+            expected="one scenario",
+            got=f"{data.sizes['scenario']} scenarios",
             fix="choose one: data.sel(scenario=3)",
         )
     attributes: dict[str, Any] = {str(name): v for name, v in data.attrs.items()}

@@ -96,7 +96,13 @@ class VerificationResult:
             if len(self.problems) == 1:
                 count = "1 problem"
             what = "\n  ".join([count, *self.problems])
-            raise DataError(what, where=where, fix=self.fix)
+            raise DataError(
+                what,
+                where=where,
+                expected="files and hashes as they are recorded",
+                got=count,
+                fix=self.fix,
+            )
 
         if not any(report.present for report in self.subsets):
             raise DataError(
@@ -115,6 +121,7 @@ class VerificationResult:
             raise DataError(
                 "the data set is incomplete",
                 where=where,
+                expected="all scenarios",
                 got=f"missing: {', '.join(gaps)}",
                 fix=self.fix,
             )
@@ -165,6 +172,7 @@ def verify(
             where="--regenerate",
             expected=">= 0",
             got=regenerate,
+            fix="leave it out, or give such a number",
         )
     if regenerate:
         check_installed("taichi", extra="generate")

@@ -294,9 +294,11 @@ class Scenario:
             return
         raise UsageError(
             "the input frames do not fit the scenario",
+            where="input_positions",
             expected=f"[2 or more frames, {len(self.material)} particles, "
             f"{self.config.box.dimension}]",
             got=str(shape),
+            fix="give positions [frame, particle, axis] of all its particles",
         )
 
     @property
@@ -365,8 +367,10 @@ class Scenario:
         if x.shape != expected or before.shape != expected:
             raise UsageError(
                 "wrong shape of positions",
+                where="position and previous",
                 expected=str(expected),
                 got=f"{x.shape} and {before.shape}",
+                fix="give positions [particle, axis] of all its particles",
             )
 
         is_finite = np.isfinite(x)
@@ -374,6 +378,8 @@ class Scenario:
             count = np.count_nonzero(~is_finite.all(axis=1))
             raise ChecksFailedError(
                 "positions are not finite",
+                where="position",
+                expected="numbers",
                 got=f"{count} of {len(x)} particles",
                 fix="freeze the rollout at its last finite frame",
             )

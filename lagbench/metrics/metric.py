@@ -177,10 +177,20 @@ class Metric:
         self._check_names()
         if self.statistic is None and not self.of:
             raise UsageError(
-                f"metric {self.name!r} has no statistic, own or of other metrics"
+                f"metric {self.name!r} has no statistic, own or of other metrics",
+                where="statistic and of",
+                expected="one of the two",
+                got="neither",
+                fix="decorate the function of the statistic, or name others by of=",
             )
         if self.perfect is None and self.direction is Direction.TARGET:
-            raise UsageError(f"metric {self.name!r} has a target without a value")
+            raise UsageError(
+                f"metric {self.name!r} has a target without a value",
+                where="perfect",
+                expected="the value of a perfect prediction",
+                got="none",
+                fix="add perfect=, as in perfect=1.0",
+            )
         if not self.of:
             object.__setattr__(self, "of", (self.name,))
 
@@ -191,6 +201,7 @@ class Metric:
         except ValueError:
             raise UsageError(
                 f"metric {self.name!r} has no such direction",
+                where="direction",
                 expected=", ".join(Direction),
                 got=repr(self.direction),
                 fix="name one of these",
@@ -204,6 +215,7 @@ class Metric:
             raise UsageError(
                 f"metric {self.name!r} follows from a text, "
                 f"not from a tuple of statistics",
+                where="of",
                 expected=f"({statistics!r},)",
                 got=repr(statistics),
                 fix="add the comma",
@@ -213,8 +225,10 @@ class Metric:
             if not is_text or not NAME.fullmatch(name) or name in RESERVED:
                 raise UsageError(
                     f"no name for a metric: {name!r}",
+                    where="the name of a metric, or of",
                     expected="up to 64 small letters, digits and underscores, "
                     "as in my_error; not skill",
+                    got=repr(name)[:100],
                     fix="rename it",
                 )
 
@@ -308,7 +322,13 @@ class Metric:
             UsageError: an observable is not judged.
         """
         if self.direction is Direction.NONE:
-            raise UsageError(f"{self.name} is an observable: it ranks nothing")
+            raise UsageError(
+                f"{self.name} is an observable: it ranks nothing",
+                where=self.name,
+                expected="a metric with a direction",
+                got="an observable",
+                fix="compare by another metric",
+            )
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
         if self.direction is Direction.HIGHER:

@@ -151,7 +151,10 @@ def _load(point: EntryPoint) -> Sequence[Metric]:
         if not isinstance(metric, Metric):
             raise UsageError(
                 f"it has a {type(metric).__name__}, which is no metric",
+                where=point.value,
                 expected="a lagbench.metrics.Metric or a sequence of them",
+                got=type(metric).__name__,
+                fix="decorate its function: see docs/extending.md",
             )
         checked.append(metric)
     return checked
@@ -190,7 +193,13 @@ def select(
     needed: set[str] = set()
     for name in names:
         if name not in table:
-            raise UsageError(f"no metric {name!r}", fix=suggest_name(name, table))
+            raise UsageError(
+                f"no metric {name!r}",
+                where="names of metrics",
+                expected="the name of a metric that is installed",
+                got=ascii(name),
+                fix=suggest_name(name, table),
+            )
         needed.update((name, *table[name].of))
     chosen_metrics = []
     for name, metric in table.items():

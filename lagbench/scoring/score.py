@@ -117,7 +117,11 @@ def score(
         result = validate(path, root=data_root, require_truth=True, registry=splits)
     if result.path != path:
         raise UsageError(
-            "the validation is of another file", where=str(path), got=result.path
+            "the validation is of another file",
+            where=str(path),
+            expected="the result of validate for this file",
+            got=result.path,
+            fix="leave validated out: score validates by itself",
         )
     require_split(result, expected_split)
     if examined is not None:
@@ -356,6 +360,8 @@ def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
             raise UsageError(
                 f"no extra {extra!r} with metrics",
                 where="--extras",
+                expected="an extra that brings metrics",
+                got=ascii(extra),
                 fix=suggest_name(extra, extras_with_metrics),
             )
     return select(extras=extras)

@@ -139,6 +139,8 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
             raise UsageError(
                 f"no subset {subset!r}",
                 where=f"{size.split} {size.name}",
+                expected=", ".join(size.subsets),
+                got=ascii(subset),
                 fix=suggest_name(str(subset), size.subsets),
             )
         for scenario in size.subsets[subset]:

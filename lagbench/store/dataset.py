@@ -59,6 +59,8 @@ def load_manifest(
         raise DataError(
             "the data set has no manifest",
             where=str(tier.folder(root_folder)),
+            expected="manifest.json beside the scenarios",
+            got="none",
             fix=suggest_repair(tier, root=root_folder),
         )
     return manifest

@@ -356,6 +356,8 @@ class Objects:
             raise UsageError(
                 "nothing can be written over HTTP",
                 where=root,
+                expected="a folder, or s3://bucket/prefix",
+                got=root,
                 fix="name another --root",
             )
         with _store_errors(self.url):

@@ -391,6 +391,7 @@ class WindowReader:
                 where=where,
                 expected="a subset at least, and cache_bytes >= 0",
                 got=f"{len(frame_counts)} scenarios, cache_bytes {cache_bytes}",
+                fix="name a subset, as in subset='train'; leave cache_bytes out",
             )
         if not len(self):
             raise UsageError(

@@ -148,6 +148,7 @@ class PredictionsWriter:
                     f"no label {name!r}",
                     where=f"label {quote(name)}",
                     expected=", ".join(OPTIONAL),
+                    got=quote(name),
                     fix=suggest_name(name, OPTIONAL),
                 )
             require_valid_attribute(name, value)
@@ -225,6 +226,8 @@ class PredictionsWriter:
             raise UsageError(
                 "no file is open",
                 where=str(self.path),
+                expected="a call within its with block",
+                got="a writer that is closed or was not entered",
                 fix="with PredictionsWriter(...) as writer:",
             )
         self._check_scenario(scenario)
@@ -266,6 +269,7 @@ class PredictionsWriter:
                 "a scenario is written twice",
                 where=where,
                 expected=expected,
+                got=f"{scenario} once more",
                 fix="add every scenario once, with all of its frames",
             )
         if scenario not in self._row_of:
@@ -273,6 +277,7 @@ class PredictionsWriter:
                 "no such test scenario",
                 where=where,
                 expected=expected,
+                got=repr(scenario)[:80],
                 fix="name scenarios by id, not by row; predictions for other subsets "
                 "are not stored",
             )
@@ -645,6 +650,8 @@ def _check_output(output: Path, *, overwrite: bool) -> None:
         raise UsageError(
             "the output is a folder",
             where=str(output),
+            expected="the name of a file",
+            got="a folder",
             fix="write elsewhere: -o template.nc",
         )
     if output.exists() and not overwrite:

@@ -126,8 +126,9 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
         raise UsageError(
             "at least one worker is needed",
             where="--workers",
-            expected=">= 1",
+            expected="1 or more",
             got=workers,
+            fix="leave it out: one per core is taken",
         )
     return workers
 

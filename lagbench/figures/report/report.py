@@ -107,6 +107,7 @@ def check_folder(folder: str | Path) -> None:
         raise UsageError(
             "the folder holds an index.html that is no report",
             where="--report",
+            expected="a folder without index.html, or with a report",
             got=str(path),
             fix="name another folder, or remove the page",
         )

@@ -212,8 +212,10 @@ def load_subject(
     if not cards or len(cards) != len(predictions):
         raise UsageError(
             "a report needs score reports and their predictions",
+            where="cards and predictions",
             expected="one file per score report, at least one",
             got=f"{len(cards)} score reports, {len(predictions)} files",
+            fix="give the file of each score report, in the same order",
         )
     _check_same_data(cards, predictions)
     header = cards[0].header
