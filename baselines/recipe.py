@@ -533,9 +533,11 @@ def _parse_setting(text: str) -> Layer:
     group, *path = key.strip().split(".")
     groups = ("model", "training")
     if not equals or not path or group not in groups:
-        hint = None
+        hint = "name group, key and value, as in --set training.steps=100"
         if equals and path:
             hint = suggest_name(group, groups)
+        elif equals:
+            hint = f"name its group: --set training.{text}, or --set model.{text}"
         raise UsageError(
             "cannot understand the setting",
             where="--set",
@@ -586,11 +588,17 @@ def _check_options(
     expected = detail["msg"].removeprefix("Value error, ")
     if detail["type"] == "tuple_type":
         expected = "a list in brackets"
-    got: str | None = repr(detail["input"])[:80]
+    got = repr(detail["input"])[:80]
     is_type_error = detail["type"].endswith("_type")
     if isinstance(detail["input"], Mapping) and not is_type_error:
-        got = None  # the error is of the mapping as a whole
-    raise error_class(f"{key} does not fit", where=where, expected=expected, got=got)
+        got = ", ".join(map(str, detail["input"]))[:80]  # the mapping as a whole
+    raise error_class(
+        f"{key} does not fit",
+        where=where,
+        expected=expected,
+        got=got,
+        fix="give another value; docs/baselines.md has the keys and their values",
+    )
 
 
 def _known_keys(options: type[BaseModel], path: Iterable[int | str]) -> list[str]:

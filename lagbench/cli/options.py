@@ -16,7 +16,13 @@ from lagbench.errors import SPLIT_NAMED, UsageError
 def parse_root(text: str) -> Path:
     """Return a root folder; an empty text would mean the current folder as a path."""
     if not text.strip():
-        raise typer.BadParameter("it is empty: name a folder, or leave the option out")
+        raise UsageError(
+            "the root is empty",
+            where="--root",
+            expected="a folder, or s3://bucket/prefix",
+            got="an empty text",
+            fix="name a folder, or leave the option out",
+        )
     return Path(text)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
@@ -34,6 +35,8 @@ def files(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "notes.txt").write_text("a note\n")
     (folder / "empty.nc").touch()
     (folder / "bad.yaml").write_text("format: 1\nrecipes: [\n")
+    (folder / "bad_key.yaml").write_text("authors: [A]\ncomand: python x.py\n")
+    (folder / "model.onnx").write_bytes(b"onnx")
     runs = np.stack(straight_runs(3))
     np.save(folder / "runs.npy", runs)
     np.save(folder / "axes.npy", np.moveaxis(runs, 1, 3))
@@ -119,6 +122,64 @@ MISTAKES = {
     "a misspelt setting": f"{TRAIN} gns --set training.step=3",
     "weights that are none": "predict notes.txt -o x.nc",
     "a description that is not there": "submit good.nc --from meta.yaml",
+    "a misspelt split to list": "list cavitty",
+    "a misspelt split to describe": "info cavitty",
+    "a misspelt size to describe": "info curl-noise --size tinny",
+    "a misspelt split to cite": "cite cavitty --bibtex",
+    "two splits": "info cavity --split curl-noise",
+    "no split": "generate",
+    "a misspelt subset": "generate curl-noise --size tiny --subset tests",
+    "an id of no scenario": "generate curl-noise --size tiny --scenarios 99",
+    "ids in words": "generate curl-noise --size tiny --scenarios first",
+    "ids that run backwards": "generate curl-noise --size tiny --scenarios 4-1",
+    "an unknown device": "generate curl-noise --size tiny --device gpu",
+    "no worker": "generate curl-noise --size tiny --workers 0",
+    "nothing to verify": "verify cavity --size tiny",
+    "less than none to simulate": "verify curl-noise --size tiny --regenerate -1",
+    "an unknown format to export": "export curl-noise --size tiny --format h5 -o x",
+    "walls for another format": (
+        "export curl-noise --size tiny --format gns-npz --from-walls -o x"
+    ),
+    "an unknown format to import": "import . --format gns -o own",
+    "a folder that is no set": "import . --format gns-npz -o own",
+    "kinds in another form": "import . --format gns-npz --kinds jelly=3 -o own",
+    "a template of a misspelt split": "template cavitty -o x.nc",
+    "a template in a folder": "template curl-noise --size tiny -o .",
+    "a mirror that is none": "download curl-noise --size tiny --from nowhere --root new",
+    "no connection": (
+        "download curl-noise --size tiny --from file:///x --connections 0"
+    ),
+    "another thing to bench": "bench train",
+    "an adopted split to bench": "bench solver --split own --size tiny",
+    "a recipe that is not there": f"{TRAIN} gns --recipe tall",
+    "an unknown device to train on": f"{TRAIN} gns --device gpu",
+    "a setting without its group": f"{TRAIN} gns --set steps=3",
+    "a setting without a value": f"{TRAIN} gns --set training.steps",
+    "a setting of a wrong type": f"{TRAIN} gns --set training.steps=many",
+    "weights to start from that are none": f"{TRAIN} gns --start notes.txt",
+    "an unknown size to train on": ("train curl-noise --size tinny --baseline gns"),
+    "an ONNX file without its split": "predict model.onnx -o x.nc",
+    "weights that are not there": "predict weights.pt -o x.nc",
+    "no leaderboard": "leaderboard check --board nothing",
+    "no leaderboard to compare with": "compare good.nc still --board notes.txt",
+    "a folder without scores": "compare . persistence",
+    "the reference first": "compare persistence good.nc",
+    "nothing to record": "leaderboard check --board nothing --record",
+    "data without their folder": "leaderboard check --size tiny",
+    "a picture that is no SVG": "leaderboard picture cavity --size mini -o x.png",
+    "nothing to run again": "leaderboard reproduce",
+    "both kinds of costs": "leaderboard reproduce --all --costs --no-costs",
+    "a season that is none": "season show winter",
+    "a source and its value": "season close may --source drand --value 12",
+    "a description with an unknown key": "submit good.nc --from bad_key.yaml",
+    "a description that is no YAML": "submit good.nc --from bad.yaml",
+    "neither added nor replaced": "submit good.nc --add --replace --board .",
+    "an unknown extra": "score good.nc --extras transprot",
+    "an empty root": "list --root ''",
+    "one file twice": "score good.nc good.nc",
+    "an animation without pace": "animate SCENARIO --fps 0 -o x.gif",
+    "pixels that are none": "plot SCENARIO --dpi 0 -o x.png",
+    "files to clean that are none": "clean cavity --size tinny",
 }
 
 
@@ -139,7 +200,7 @@ def test_a_mistake_is_told_with_all_that_is_needed(
     monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
     scenario = bench.size.path(bench.root, 3)
     command = MISTAKES[mistake].replace("SCENARIO", str(scenario))
-    words = command.split()
+    words = shlex.split(command)
     monkeypatch.setattr("sys.argv", ["lagbench", *words])
     result = run(*words)
     assert result.exit_code in {1, 2, 3, 4, 5}
