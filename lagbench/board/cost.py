@@ -250,6 +250,8 @@ def picture(board: Board, size: Size) -> str:
         raise DataError(
             "nothing to draw: neither entries nor reference predictors with a cost",
             where=name,
+            expected="a method that states what a frame costs",
+            got="none",
             fix="state seconds_per_frame, as `lagbench predict` does",
         )
 

@@ -330,7 +330,11 @@ def draw_contact_sheet(
     if not files:
         where = f"{tier.split} {tier.name} under {folder}"
         raise DataError(
-            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
+            "nothing to draw",
+            where=where,
+            expected="scenario files",
+            got="none",
+            fix=suggest_repair(tier, root=folder),
         )
     kinds = _first_of_each_kind(files, registry)
     if kinds:

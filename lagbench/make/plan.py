@@ -61,10 +61,15 @@ SOLVER_COSTS = {
     "closed_box": SolverCost(start=8.0, particle_substep=45e-9),
     "free_surface": SolverCost(start=5.0, particle_substep=45e-9),
     "free_surface_3d": SolverCost(start=15.0, particle_substep=95e-9),
+    # without solids half of the kernel is compiled
+    "liquid_3d": SolverCost(start=7.0, particle_substep=95e-9),
     "full_box_2d": SolverCost(start=5.0, particle_substep=45e-9),
     "full_box_3d": SolverCost(start=10.0, particle_substep=95e-9),
 }
 """Kinds of solvers, whose pace a machine notes."""
+
+SOLID_PARAMETER = "jelly_modulus"
+"""Parameter of the splits with a free surface whose bodies may be solid."""
 
 Selection = str | Sequence[str] | None
 Scenarios = str | Iterable[int] | None
@@ -314,7 +319,9 @@ def _solver_kind(size: Size) -> str:
     if isinstance(constants, ClosedBoxParameters):
         return "closed_box"
     if size.dimension == 3:
-        return "free_surface_3d"
+        if SOLID_PARAMETER in size.parameters:
+            return "free_surface_3d"
+        return "liquid_3d"
     return "free_surface"
 
 

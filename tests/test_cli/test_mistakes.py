@@ -145,7 +145,9 @@ MISTAKES = {
     "kinds in another form": "import . --format gns-npz --kinds jelly=3 -o own",
     "a template of a misspelt split": "template cavitty -o x.nc",
     "a template in a folder": "template curl-noise --size tiny -o .",
-    "a mirror that is none": "download curl-noise --size tiny --from nowhere --root new",
+    "a mirror that is none": (
+        "download curl-noise --size tiny --from nowhere --root new --no-generate"
+    ),
     "no connection": (
         "download curl-noise --size tiny --from file:///x --connections 0"
     ),

@@ -46,6 +46,13 @@ def noted(cache: Path, **kinds: Any) -> None:
     (cache / "rates.json").write_text(text)
 
 
+def test_a_liquid_in_space_starts_sooner_than_solids() -> None:
+    """The kernel without solids compiles in about half of the time."""
+    liquid = estimate(load().size("fluid-3d", "tiny"), [0])
+    solids = estimate(load().size("multimaterial-3d", "tiny"), [0])
+    assert liquid.start_seconds < 0.6 * solids.start_seconds
+
+
 WORK = (1_000_000, 100)
 PLAIN = reference_seconds(*WORK, kind="free_surface")
 GOOD = {"256": [2 * PLAIN, *WORK]}
