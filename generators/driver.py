@@ -134,6 +134,7 @@ class Driver(ABC, Generic[Parameters]):
         for index, state in enumerate(states):
             self._check_state(index, state)
 
+        self._fixed = self._fixed_positions(states)
         self._place(stack(states, "position"))
         carried = np.empty((self.scenarios, self.parameters.particles, 4), np.float32)
         # what stands behind the velocity keeps its value at rest; its slopes are 0
@@ -240,11 +241,20 @@ class Driver(ABC, Generic[Parameters]):
         """
         self._place(self.position() + offset.astype(np.float32))
 
+    def _fixed_positions(self, states: Sequence[InitialState]) -> NDArray[np.float32]:
+        """Return where the particles that never move are, behind those of the states.
+
+        The fields have so many rows more. Shape [scenario, particle, 4], zeros beside
+        the positions [length]; this driver has none.
+        """
+        return np.zeros((len(states), 0, 4), np.float32)
+
     def _place(self, position: NDArray[np.float32]) -> None:
         """Set the positions, kept in the box; the fields hold zeros beside."""
         padded = np.zeros((*position.shape[:-1], 4), np.float32)
         padded[..., : self.dimension] = self._inside(position)
-        self._kernels.x.from_numpy(padded)
+        rows = np.concatenate([padded, self._fixed], axis=1)
+        self._kernels.x.from_numpy(rows)
 
     def _write(
         self,
@@ -257,10 +267,11 @@ class Driver(ABC, Generic[Parameters]):
         Args:
             field: field of a formulation.
             values: shape [scenario, particle, 4].
-            at_rest: value of particles that the formulation adds, which never move.
+            at_rest: value of the particles that never move.
         """
-        del at_rest  # this driver adds none
-        field.from_numpy(values)
+        fixed = np.empty_like(self._fixed)
+        fixed[...] = at_rest
+        field.from_numpy(np.concatenate([values, fixed], axis=1))
 
     def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return positions clipped to the box [length], shape [..., axis]."""

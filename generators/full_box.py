@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError
 
 from .box_tables import LANES
-from .driver import Driver, Field
+from .driver import Driver
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import broken_jacobian_bounds
 from .nodal_stress_nd import NodalStressND
@@ -70,33 +70,16 @@ class FullBox(Driver[FullBoxParameters]):
         clipped = super()._inside(wrapped)
         return np.where(box.periodic, wrapped, clipped)
 
-    def load(self, states: Sequence[InitialState]) -> None:
-        """Start one scenario per state; see :meth:`.Driver.load`."""
+    def _fixed_positions(self, states: Sequence[InitialState]) -> NDArray[np.float32]:
+        """Return the positions of the obstacles' particles, filled up with zeros."""
         for index, state in enumerate(states):
             self._check_obstacle(index, state)
         count = self.parameters.obstacle_particles
-        # positions of the obstacles' particles, filled up with zeros
-        self._solid = np.zeros((len(states), count, LANES), np.float32)
-        for rows, state in zip(self._solid, states, strict=True):
+        position = np.zeros((len(states), count, LANES), np.float32)
+        for rows, state in zip(position, states, strict=True):
             if state.obstacle is not None:
                 rows[:, : self.dimension] = state.obstacle.position
-        super().load(states)
-
-    def _place(self, position: NDArray[np.float32]) -> None:
-        padded = np.zeros((*position.shape[:-1], LANES), np.float32)
-        padded[..., : self.dimension] = self._inside(position)
-        rows = np.concatenate([padded, self._solid], axis=1)
-        self._kernels.x.from_numpy(rows)
-
-    def _write(
-        self,
-        field: Field,
-        values: NDArray[np.float32],
-        at_rest: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
-    ) -> None:
-        solid = np.empty_like(self._solid)
-        solid[...] = at_rest
-        field.from_numpy(np.concatenate([values, solid], axis=1))
+        return position
 
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""

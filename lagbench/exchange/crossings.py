@@ -32,13 +32,13 @@ class CrossingCheck:
     def __init__(self, *, periodic: Sequence[str]) -> None:
         self._periodic = periodic  # names of the axes that are stated to be periodic
         # by axis: the first frame with jumps, how many particles jump, and of how many
-        self._found: dict[str, tuple[int, int, int]] = {}
+        self._jumps: dict[str, tuple[int, int, int]] = {}
         self._dimension = 2  # components of a step
 
     @property
     def has_any(self) -> bool:
         """Whether particles jumped along an axis."""
-        return bool(self._found)
+        return bool(self._jumps)
 
     def add(
         self, step: NDArray[np.float64], lengths: NDArray[np.float64], *, frame: int
@@ -56,7 +56,7 @@ class CrossingCheck:
             crossing_count = int(np.count_nonzero(share[:, axis] > CROSSING))
             moves_little = np.median(share[:, axis]) < CROSSING_MEDIAN
             if crossing_count >= FEWEST_CROSSINGS and moves_little:
-                self._found.setdefault(name, (frame, crossing_count, len(step)))
+                self._jumps.setdefault(name, (frame, crossing_count, len(step)))
 
     def finish(self, *, where: str) -> None:
         """Refuse a trajectory with such steps.
@@ -64,12 +64,12 @@ class CrossingCheck:
         Raises:
             DataError: particles jump; the message names all axes.
         """
-        if not self._found:
+        if not self._jumps:
             return
-        names = [name for name in AXES if name in {*self._found, *self._periodic}]
+        names = [name for name in AXES if name in {*self._jumps, *self._periodic}]
         places = []
         counts = []
-        for name, (frame, crossing_count, particle_count) in self._found.items():
+        for name, (frame, crossing_count, particle_count) in self._jumps.items():
             places.append(f"frame {frame} along {name}")
             counts.append(f"{crossing_count} of {particle_count} along {name}")
         raise DataError(
