@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.fringe import fringe_rates
+from lagbench.data.fringe_region import fringe_rates
 
 __all__ = ["FullBoxParameters"]
 

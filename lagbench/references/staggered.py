@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.fringe import fringe_rates
+from lagbench.data.fringe_region import fringe_rates
 
 Floats = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from obstacle_flows import constants_around, regular_places
 from reference_full_box import ReferenceFullBox
 
 from lagbench.data.box import Box
@@ -40,17 +41,10 @@ class Run(NamedTuple):
     nodal: Array  # velocity at the nodes [length/s], shape [node along axes, axis]
 
 
-def places() -> Array:
-    """Return a regular lattice that fills the duct, shape [particle, axis]."""
-    cell = np.indices(COUNTS).reshape(3, -1).T
-    share = (cell + 0.5) / COUNTS
-    return np.array(DUCT.low) + DUCT.lengths * share
-
-
 def duct_state(*, stir: float) -> InitialState:
     """Return a stream around a ball, with random velocities of some width."""
     rng = np.random.default_rng(12)
-    lattice = places()
+    lattice = regular_places(DUCT, COUNTS)
     inside = is_inside(lattice, CENTRE, RADIUS)
     fluid = lattice[~inside]
     velocity = stir * (rng.random(fluid.shape) - 0.5)
@@ -70,24 +64,7 @@ def duct_state(*, stir: float) -> InitialState:
 
 def constants() -> FullBoxParameters:
     """Return the constants of the duct."""
-    state = duct_state(stir=0.0)
-    assert state.obstacle is not None
-    return FullBoxParameters(
-        particles=len(state.position),
-        grid=GRID,
-        dt=4e-3,
-        box=DUCT,
-        no_slip=False,
-        density=1e-4,
-        modulus=5e-4,
-        velocity_relaxation=0.01,
-        jacobian_relaxation=0.1,
-        density_coupling=0.01,
-        shift=0.01,
-        obstacle_particles=len(state.obstacle.position),
-        fringe_length=0.25,
-        fringe_rate=60.0,
-    )
+    return constants_around(duct_state(stir=0.0), DUCT, GRID)
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from obstacle_flows import constants_around, regular_places
 from reference_full_box import ReferenceFullBox
 
 from lagbench.data.box import Box
@@ -28,17 +29,10 @@ RADIUS = 0.13
 SPEED = 0.3  # of the stream [length/s]
 
 
-def places() -> Array:
-    """Return a regular lattice that fills the channel, shape [particle, axis]."""
-    cell = np.indices(COUNTS).reshape(2, -1).T
-    share = (cell + 0.5) / COUNTS
-    return np.array(CHANNEL.low) + CHANNEL.lengths * share
-
-
 def channel_state(centre: tuple[float, float] = (0.3, 0.5)) -> InitialState:
     """Return a stirred stream around a disc."""
     rng = np.random.default_rng(11)
-    lattice = places()
+    lattice = regular_places(CHANNEL, COUNTS)
     inside = is_inside(lattice, centre, RADIUS)
     fluid = lattice[~inside]
     jitter = 0.004 * (rng.random(fluid.shape) - 0.5)
@@ -58,24 +52,7 @@ def channel_state(centre: tuple[float, float] = (0.3, 0.5)) -> InitialState:
 
 def constants() -> FullBoxParameters:
     """Return the constants of the channel."""
-    state = channel_state()
-    assert state.obstacle is not None
-    return FullBoxParameters(
-        particles=len(state.position),
-        grid=GRID,
-        dt=4e-3,
-        box=CHANNEL,
-        no_slip=False,
-        density=1e-4,
-        modulus=5e-4,
-        velocity_relaxation=0.01,
-        jacobian_relaxation=0.1,
-        density_coupling=0.01,
-        shift=0.01,
-        obstacle_particles=len(state.obstacle.position),
-        fringe_length=0.25,
-        fringe_rate=60.0,
-    )
+    return constants_around(channel_state(), CHANNEL, GRID)
 
 
 @functools.cache
