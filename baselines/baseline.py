@@ -158,12 +158,13 @@ class Baseline(nn.Module):
         return weights, options
 
     @property
-    def forcing_seen(self) -> frozenset[str]:
+    def forcing_seen(self) -> frozenset[str] | None:
         """What the model sees of "body_force" and "obstacle", by the names in batches.
 
-        A training warns of what drives the flow and is not seen.
+        A training warns of what drives the flow and is not seen. None means that the
+        model does not say; then nothing warns.
         """
-        return frozenset()
+        return None
 
     @property
     @abstractmethod

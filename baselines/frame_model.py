@@ -162,6 +162,11 @@ class FrameModel(Baseline):
         self.frame_state = FrameState(info)
 
     @property
+    def forcing_seen(self) -> frozenset[str]:
+        """Neither a force nor an obstacle."""
+        return frozenset()
+
+    @property
     @abstractmethod
     def inputs(self) -> int:
         """Frames whose states the model is given."""

@@ -169,6 +169,11 @@ class HybridProjection(Baseline):
         self.register_buffer("coefficients", torch.zeros(3))  # a, b, c
 
     @property
+    def forcing_seen(self) -> frozenset[str]:
+        """Neither a force nor an obstacle."""
+        return frozenset()
+
+    @property
     def history(self) -> int:
         """Given frames that the solver reads: the last two."""
         return 2

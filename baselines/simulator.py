@@ -348,6 +348,11 @@ class GraphNetwork(Baseline):
             nn.init.zeros_(parameter)
 
     @property
+    def forcing_seen(self) -> frozenset[str]:
+        """Neither a force nor an obstacle."""
+        return frozenset()
+
+    @property
     def acceleration_std(self) -> float:
         """Deviation of true accelerations, of one component [length/frame^2]."""
         deviations = self.info.statistics["acceleration_std"]

@@ -227,12 +227,16 @@ def train(
 
 def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:
     """Warn before a training whose model does not see what drives the flow."""
+    if is_helper() or model.forcing_seen is None:
+        return
     unseen = sorted(find_forcing(size, root) - model.forcing_seen)
-    if not unseen or is_helper():
+    if not unseen:
         return
     names = " and ".join(FORCING[name] for name in unseen)
     keys = " and ".join(unseen)
     fix = "NeuralMPM sees it"
+    if "body_force" in unseen:
+        fix = "NeuralMPM with model.body_force=true sees it"
     if "body_force" in unseen and "body_force" in type(model.options).model_fields:
         fix = "--set model.body_force=true shows it"
     message = (

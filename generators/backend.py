@@ -70,9 +70,9 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         running_device = "CUDA" if running_on_gpu else "CPU"
         raise UsageError(
             "Taichi runs already with another device or fewer threads",
-            where=f"device {device.value}, threads {threads}",
+            where="Taichi in this process",
             expected=f"{running_device} with at most {pool_size} threads",
-            got=f"{device.value} with {threads or 1} threads",
+            got=f"{device.value}, threads: {threads or 1}",
             fix="use another process",
         )
     return threads or min(pool_size, available_cores())
@@ -132,7 +132,7 @@ def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
     return UsageError(
         "Taichi cannot use this device",
         where="cpu",
-        expected="an x86-64 processor that Taichi compiles for",
+        expected="a processor that Taichi can use",
         got=error,
         fix="`lagbench doctor` shows this machine; `lagbench download` needs no Taichi",
     )

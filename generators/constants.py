@@ -261,7 +261,7 @@ def split_module(size: Size) -> SplitGenerator:
             f"a generator lacks {' and '.join(missing)}",
             where=size.generator,
             expected=" and ".join(needed),
-            got="a module without",
+            got="a module without these functions",
             fix="add the functions: docs/extending.md has the contract of a split",
         )
     return cast("SplitGenerator", module)

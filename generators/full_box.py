@@ -72,8 +72,6 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _fixed_positions(self, states: Sequence[InitialState]) -> NDArray[np.float32]:
         """Return the positions of the obstacles' particles, filled up with zeros."""
-        for index, state in enumerate(states):
-            self._check_obstacle(index, state)
         count = self.parameters.obstacle_particles
         position = np.zeros((len(states), count, LANES), np.float32)
         for rows, state in zip(position, states, strict=True):
@@ -144,6 +142,7 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
+        self._check_obstacle(index, state)
         self._check_walls(index, state)
         self._check_force(index, state)
         self._check_stream(index, state)

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
 
-_USER_OF_ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*:/{2,})[^\s/]*@")
+# The scheme before it is only looked back at: a search through a long text is linear.
+_USER_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-])(:/+)[^\s/]*@")
 
 SPLIT_NAMED = "SPLIT or --split"
 """Where a user names a split, for messages."""
@@ -77,10 +78,11 @@ class LagbenchError(Exception):
         for label, part in labelled_parts.items():
             if part is not None:
                 lines.append(f"{label}: {part}")
-        return escape_unprintable("\n  ".join(lines))
+        return escape_unprintable(hide_user("\n  ".join(lines)))
 
     def add_note(self, note: str, /) -> None:
         """Add a place to ``where``; our messages do not show Python's own notes."""
+        note = hide_user(note)
         if self.where is None:
             self.where = note
         else:
@@ -219,6 +221,14 @@ def check_regular(
     """
     try:
         status = path.stat()
+    except FileNotFoundError as error:
+        raise UnreadableFileError(
+            "there is no such file",
+            where=str(path),
+            expected="a readable file",
+            got="nothing",
+            fix="check the path: relative ones start in the working folder",
+        ) from error
     except (OSError, ValueError) as error:
         raise UnreadableFileError(
             "cannot open the file",

@@ -102,12 +102,18 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
 
 def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
     """Return which solvers a model beats that is cheaper than all of them."""
-    opening = f"On {results.where} no classical solver is as cheap as the best model"
+    sentence = f"On {results.where} no classical solver is as cheap as the best model."
     beaten = results.less_accurate(model, Kind.CLASSICAL)
-    if not beaten:
-        return f"{opening}."
-    names = _join([label(name) for name in beaten])
-    return f"{opening}, which is more accurate than {names}."
+    if beaten:
+        sentence += f" Its mean error is less than that of {_label_all(beaten)}."
+    better = results.more_accurate(model, Kind.CLASSICAL)
+    if better:
+        sentence += f" That of {_label_all(better)} is less than the model's."
+    return sentence
+
+
+def _label_all(names: Sequence[str]) -> str:
+    return _join([label(name) for name in names])
 
 
 def _join(names: Sequence[str]) -> str:

@@ -35,7 +35,8 @@ SMALLEST_TOP = sys.float_info.min / SMALLEST_SHARE
 """Smaller tops have no logarithmic range: its ends may read back as zero."""
 
 DIGITS = 9  # most digits of a zero
-STEP_DIGITS = 3  # levels are counted in the rounded step: none is off
+# Values are divided by the rounded step, so its rounding moves no value.
+STEP_DIGITS = 3
 
 HARMLESS = bytes.maketrans(b"<>&", b",/.")
 """Digits of base 85 that mean something in HTML, and those that stand for them."""

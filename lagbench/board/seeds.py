@@ -146,7 +146,7 @@ def _require_new_seeds(
         raise UsageError(
             "the entry has this seed already",
             where=str(path),
-            expected="seeds that the entry has not",
+            expected="seeds that the entry does not have",
             got=f"seed {_format_seeds(common_seeds)}; "
             f"the entry has {_format_seeds(entry_seeds)}",
             fix=f"leave out the files of these seeds, {SUBMIT_ANEW}",

@@ -116,6 +116,9 @@ def score_on_shift(
         result=ShiftResult(folder=folder.path),
     )
     for entry in choose_entries(folder, entries, described, split=split, size=size):
+        tier = described.size(entry.split, entry.size)
+        if not entries and SUBSET not in tier.subsets:
+            continue
         path = entry.yaml_path.as_posix()
         try:
             run.score(entry)

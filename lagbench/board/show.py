@@ -53,7 +53,7 @@ def choose_data_sets(
         fix = suggest_name(request, [" ".join(data_set) for data_set in known])
     raise UsageError(
         "no entries there",
-        where=f"leaderboard, {request}",
+        where="--split, --size",
         expected="a data set with entries",
         got=ascii(request),
         fix=fix,

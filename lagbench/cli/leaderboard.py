@@ -325,9 +325,8 @@ def reproduce_command(
     if not as_json:
         for failure in result.failures:
             typer.echo(f"{failure.entry}: {failure.error}", err=True)
-    print_result(
-        result.to_plain(), _describe_reproduced(result), as_json=as_json, quiet=quiet
-    )
+    lines = _describe_reproduced(result, with_costs=not no_costs)
+    print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
 
@@ -340,7 +339,7 @@ def _time_solver(split: str, size: str) -> float | None:
         return None
 
 
-def _describe_reproduced(result: ReproduceResult) -> Iterator[str]:
+def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterator[str]:
     for path, line in result.lines.items():
         name = path.removeprefix("submissions/").removesuffix(".yaml")
         for one in line.reproduced:
@@ -355,7 +354,7 @@ def _describe_reproduced(result: ReproduceResult) -> Iterator[str]:
                 f"{one.submitted:.6g} ({one.difference:.1e} relative, {one.scenarios} "
                 f"of {one.of} scenarios)"
             )
-        if line.cost is not None:
+        if line.cost is not None and with_costs:
             milliseconds = 1e3 * line.cost.seconds_per_frame
             yield f"{name}: {milliseconds:.3g} ms per frame, {line.cost.machine}"
     yield (

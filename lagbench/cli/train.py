@@ -281,8 +281,11 @@ def _describe_track(result: TrainingResult) -> str:
         return f"track: {result.track}"
     minutes = EQUAL_MINUTES.get(result.size)
     if minutes is None:
-        return f"no track: those of {result.size} are not compared by budget"
+        return (
+            f"no track: it has not converged, and {result.size} has no limit of "
+            "equal compute"
+        )
     return (
-        f"no track: neither equal compute ({minutes:.0f} min of processor time) nor "
-        "converged"
+        "no track: neither equal compute (no GPU, at most "
+        f"{minutes:.0f} min of processor time) nor converged"
     )

@@ -238,7 +238,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
         raise UsageError(
             "the folder holds a program that readers of this format run",
             where=str(folder / FORCE),
-            expected="a folder without it",
+            expected=f"a folder without {FORCE}",
             got=FORCE,
             fix="name another folder: --output",
         )
@@ -250,7 +250,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
         raise UsageError(
             "files of that name are there",
             where=str(folder),
-            expected="a folder without them",
+            expected="a folder without files of these names",
             got=", ".join(existing),
             fix="name another folder, or write over them: --force",
         )
@@ -262,7 +262,7 @@ def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> N
         raise UsageError(
             "wall particles need a box of two dimensions with four walls",
             where="--wall-particles",
-            expected="a split as cavity",
+            expected="a split such as cavity",
             got=size.split,
             fix="leave --wall-particles out",
         )

@@ -160,7 +160,7 @@ def _check_pace(frames_per_second: float, every: int) -> None:
             expected=f"{SLOWEST:g} to {FASTEST:g} frames/s, every whole number "
             "from 1 on",
             got=f"{frames_per_second} frames/s, every {every}",
-            fix="leave both out, or give numbers of these",
+            fix="leave both out, or give numbers in these ranges",
         )
 
 

@@ -204,7 +204,7 @@ def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
             where="--dpi",
             expected=f"{COARSEST} to {FINEST}",
             got=dpi,
-            fix="leave it out, or give a number of these",
+            fix="leave it out, or give a number in this range",
         )
     matplotlib = require("matplotlib", extra="plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg

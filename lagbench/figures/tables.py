@@ -26,8 +26,7 @@ def escape(text: object) -> str:
     >>> print(escape("a_b | <c>"))
     a\_b \| \<c\>
     """
-    one_line = " ".join(str(text).split())
-    return _SPECIAL.sub(r"\\\1", one_line)
+    return _escape_specials(" ".join(str(text).split()))
 
 
 def escape_prose(text: object) -> str:
@@ -40,11 +39,16 @@ def escape_prose(text: object) -> str:
     end = 0
     one_line = " ".join(str(text).split())
     for code in _CODE.finditer(one_line):
-        parts.append(escape(one_line[end : code.start()]))
+        parts.append(_escape_specials(one_line[end : code.start()]))
         parts.append(code[0])
         end = code.end()
-    parts.append(escape(one_line[end:]))
+    parts.append(_escape_specials(one_line[end:]))
     return "".join(parts)
+
+
+def _escape_specials(text: str) -> str:
+    """Return a text with a backslash before what has a meaning for Markdown."""
+    return _SPECIAL.sub(r"\\\1", text)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -100,7 +100,7 @@ class VerificationResult:
                 what,
                 where=where,
                 expected="files and hashes as they are recorded",
-                got=count,
+                got=self.problems[0],
                 fix=self.fix,
             )
 

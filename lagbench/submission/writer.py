@@ -553,7 +553,8 @@ def _by_scenario(
             expected=f"{len(scenarios)} scenarios ({format_ids(scenarios)}) first, "
             f"{len(DIMS)} dimensions",
             got=f"shape {array.shape}",
-            fix="or give a mapping of scenario id to array",
+            fix="give all test scenarios in one array, or a mapping of scenario id to "
+            "array",
         )
     return dict(zip(scenarios, array, strict=True))
 

@@ -412,9 +412,17 @@ class SplitResults:
 
     def less_accurate(self, model: str, kind: Kind) -> list[str]:
         """Return the methods of a kind that are behind a model, best first."""
-        names = [name for name, method in self.methods.items() if method.kind is kind]
-        ranked = self.order([model, *names])
+        ranked = self._order_of_kind(model, kind)
         return ranked[ranked.index(model) + 1 :]
+
+    def more_accurate(self, model: str, kind: Kind) -> list[str]:
+        """Return the methods of a kind that are ahead of a model, best first."""
+        ranked = self._order_of_kind(model, kind)
+        return ranked[: ranked.index(model)]
+
+    def _order_of_kind(self, model: str, kind: Kind) -> list[str]:
+        names = [name for name, method in self.methods.items() if method.kind is kind]
+        return self.order([model, *names])
 
     @property
     def best_naive(self) -> str | None:

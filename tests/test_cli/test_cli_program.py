@@ -27,7 +27,7 @@ PROGRAM = [sys.executable, "-m", "lagbench"]
         ("info", "--split"),
         ("info cavity --split fluid", "cavity and fluid"),
         ("info cavty", "'cavity'"),
-        ("verify --split cavity --size ful", "'full'"),
+        ("verify --split cavity --size ful", "full or mini or tiny"),
         ("generate cavity --size tiny --scenarios 7-3", "7-3"),
         ("generate cavity --size tiny --scenarios 70", "70"),
         ("generate cavity --size tiny --device tpu", "tpu"),
