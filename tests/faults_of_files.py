@@ -16,7 +16,7 @@ from fault_registry import DIMS, FAULTS, SHAPE, Fault, fault, replace
 from submission_data import Bench
 
 
-@fault("readable", 3, says="cannot open")
+@fault("readable", 3, says="no such file")
 def missing_file(bench: Bench) -> Path:
     """No such file."""
     return bench.folder / "nowhere.nc"

@@ -528,12 +528,13 @@ class Registry:
         """
         parent = self.split(split)
         if name not in parent.sizes:
+            names = " or ".join(parent.sizes)
             raise UsageError(
                 f"split {split!r} has no size {name!r}",
                 where="--size",
-                expected=" or ".join(parent.sizes),
+                expected=names,
                 got=ascii(name),
-                fix=f"name one of them; `lagbench list {split}` says what they cost",
+                fix=f"name {names}; `lagbench list {split}` says what they cost",
             )
         entry = parent.sizes[name]
         parameters = {}

@@ -264,7 +264,7 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
     half = len(whole) // 2
     (tmp_path / "cut.pt").write_bytes(whole[:half])
     for name, words in (
-        ("none.pt", "No such file"),
+        ("none.pt", "no such file"),
         ("cut.pt", None),
         ("pipe.pt", None),
     ):

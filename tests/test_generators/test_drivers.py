@@ -119,7 +119,8 @@ def test_what_the_runtime_cannot_do_is_refused() -> None:
     assert caught.value.where == "device cpu"
     with pytest.raises(UsageError) as caught:
         build(NO_SLIP, device=Device.PARALLEL, threads=10_000)
-    assert caught.value.where == "device parallel, threads 10000"
+    assert caught.value.where == "Taichi in this process"
+    assert caught.value.got == "parallel, threads: 10000"
 
 
 def test_a_closed_solver_leaves_the_others_alone() -> None:

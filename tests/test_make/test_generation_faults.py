@@ -59,7 +59,7 @@ def manifest_of(root: Path) -> Manifest:
     ("options", "message"),
     [
         ({"split": "cavty"}, "did you mean 'cavity'?"),
-        ({"size": "tinny"}, "did you mean 'tiny'?"),
+        ({"size": "tinny"}, "full or mini or tiny"),
         ({"subset": "trian"}, "did you mean 'train'?"),
         ({"subset": "train", "scenarios": "3"}, "no scenario 3 in train"),
         ({"scenarios": "0,9"}, "no scenario 9 in train, valid, test"),
@@ -67,7 +67,7 @@ def manifest_of(root: Path) -> Manifest:
         ({"scenarios": "one"}, "'one' is no id and no range"),
         ({"device": "gpu"}, "no device 'gpu'"),
         ({"device": "cuba"}, "did you mean 'cuda'?"),
-        *(({"workers": count}, "without a worker") for count in (0, -1)),
+        *(({"workers": count}, "at least one worker") for count in (0, -1)),
     ],
 )
 def test_bad_input(
