@@ -21,6 +21,7 @@ from numpy.testing import assert_array_equal
 from PIL import Image
 from reproduce_bench import NOISE, SIZE, SPLIT, markdown_rows, pretend
 from score_bench import ScoreBench, bench_of
+from turns import of_this_turn
 
 from lagbench.baselines.checkpoint import load as load_checkpoint
 from lagbench.data.grid import fields
@@ -626,6 +627,7 @@ def test_an_interrupt_says_how_to_go_on(
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not of_this_turn([0], turns=2), reason="the turn of other commits")
 def test_everything_is_made_at_tiny(
     tmp_path: Path,
     unmeasured: Registry,
