@@ -29,10 +29,13 @@ BROKEN_HEADS = """
   .flatMap(th => [...th.querySelectorAll('span')])
   .filter(span => !span.matches('.metric, .metric *, .sub'))
   .filter(span => span.getClientRects().length > 1)
-  .filter(span => !/[ -]/.test(span.textContent))
+  .filter(span => (span.matches('.muted') && !span.closest('.scores'))
+    || !/[ -]/.test(span.textContent))
   .map(span => span.textContent)
 """
-"""Names in heads of tables that are broken inside a word."""
+"""Names in heads of tables that are broken inside a word, and kinds and units that are
+broken at all outside the table of scores.
+"""
 
 IMAGES_ARE_LOADED = "[...document.images].every(i => i.complete && i.naturalWidth > 0)"
 

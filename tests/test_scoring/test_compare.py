@@ -345,36 +345,14 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
         compare("moving", "persistence", board=entries)
 
 
-def test_an_unknown_entry_is_refused_before_predictions_are_scored(
-    scored: Folders,
-    entries: Path,
-    bench: ScoreBench,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def score_nothing(*_: object, **__: object) -> None:
-        pytest.fail("the predictions were scored")
-
-    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", score_nothing)
-    with pytest.raises(UsageError) as caught:
-        compare(
-            scored["still"] / "predictions.nc",
-            "movin",
-            board=entries,
-            root=bench.root,
-            registry=bench.registry,
-        )
-    assert "'moving'" in str(caught.value.fix)
-
-
-@pytest.mark.parametrize("name", ["ballistic", "baristic"])
-def test_only_references_of_the_data_set_are_offered(
+def refused_before_scoring(
     name: str,
     scored: Folders,
     entries: Path,
     bench: ScoreBench,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A full box has no ballistic predictor; nothing is scored to find that out."""
+) -> UsageError:
+    """Return why predictions are not compared with a name; scoring them fails."""
 
     def score_nothing(*_: object, **__: object) -> None:
         pytest.fail("the predictions were scored")
@@ -388,7 +366,30 @@ def test_only_references_of_the_data_set_are_offered(
             root=bench.root,
             registry=bench.registry,
         )
-    known = str(caught.value.fix).rpartition("known: ")[2]
+    return caught.value
+
+
+def test_an_unknown_entry_is_refused_before_predictions_are_scored(
+    scored: Folders,
+    entries: Path,
+    bench: ScoreBench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refusal = refused_before_scoring("movin", scored, entries, bench, monkeypatch)
+    assert "'moving'" in str(refusal.fix)
+
+
+@pytest.mark.parametrize("name", ["ballistic", "baristic"])
+def test_only_references_of_the_data_set_are_offered(
+    name: str,
+    scored: Folders,
+    entries: Path,
+    bench: ScoreBench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A full box has no ballistic predictor; nothing is scored to find that out."""
+    refusal = refused_before_scoring(name, scored, entries, bench, monkeypatch)
+    known = str(refusal.fix).rpartition("known: ")[2]
     assert "persistence" in known
     assert "ballistic" not in known
 
