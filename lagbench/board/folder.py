@@ -22,6 +22,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lagbench.errors import UsageError
+from lagbench.scoring.boards import require_board
 
 Place = tuple[str, str, str]  # split, size and method
 
@@ -130,19 +131,9 @@ class Folder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
-    def require(
-        self,
-        fix: str = "run it from the root of the repository, or name it: --board FOLDER",
-    ) -> None:
+    def require(self, fix: str | None = None) -> None:
         """Refuse a folder that is no leaderboard."""
-        if not (self.path / SUBMISSIONS).is_dir():
-            raise UsageError(
-                "no leaderboard here",
-                where=str(self.path),
-                expected=f"a folder that holds {SUBMISSIONS}/",
-                got="no such folder",
-                fix=fix,
-            )
+        require_board(self.path, fix=fix)
 
     def require_room(self) -> None:
         """Refuse to begin a leaderboard among other files: its page could replace

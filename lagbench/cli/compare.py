@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -10,7 +9,14 @@ import typer
 from lagbench.scoring.compare import compare
 from lagbench.scoring.tables import comparison_lines, comparison_tables
 
-from .options import JsonFlag, QuietFlag, RootOption, WorkersOption, option
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    ReadBoardOption,
+    RootOption,
+    WorkersOption,
+    option,
+)
 from .output import print_json, print_line, print_tables
 from .validate import ExpectedSplitOption
 
@@ -37,14 +43,7 @@ def compare_command(
         list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
     ] = None,
     split: ExpectedSplitOption = None,
-    board: Annotated[
-        Path | None,
-        option(
-            "--board FOLDER",
-            "Folder of the leaderboard; by default leaderboard here, or else in the "
-            "clone.",
-        ),
-    ] = None,
+    board: ReadBoardOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
     every: Annotated[bool, option("--all", "Show every metric.")] = False,

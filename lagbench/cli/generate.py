@@ -13,11 +13,10 @@ from lagbench.errors import UsageError, format_count, hide_user
 from lagbench.make.generate import GenerationResult, generate
 
 from .options import (
-    DEFAULT_BOARD,
-    BoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
+    ReadBoardOption,
     RootOption,
     ScenariosOption,
     SchedulerOption,
@@ -65,7 +64,7 @@ def generate_command(
             "for those of --split and --size.",
         ),
     ] = None,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -119,7 +118,11 @@ class Place:
 
 
 def _season_places(
-    name: str, board: Path, root: Path | None, split: str | None, size: str | None
+    name: str,
+    board: Path | None,
+    root: Path | None,
+    split: str | None,
+    size: str | None,
 ) -> list[Place]:
     """Return the data sets of a season, or those of a split and size.
 
@@ -130,9 +133,9 @@ def _season_places(
     from lagbench.board.folder import Folder
     from lagbench.board.season import read_season, season_registry, season_root
     from lagbench.board.season_scores import read_scores
+    from lagbench.scoring.boards import find_board
 
-    folder = Folder(board)
-    folder.require()
+    folder = Folder(find_board(board))
     season = read_season(folder, name)
     scores = read_scores(folder, season)
     registry = season_registry(

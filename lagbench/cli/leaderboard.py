@@ -29,6 +29,7 @@ from lagbench.board.show import (
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, format_count
+from lagbench.scoring.boards import find_board
 from lagbench.scoring.references import sizes_with_test_files
 
 from .options import (
@@ -37,6 +38,7 @@ from .options import (
     JsonFlag,
     NewSizeOption,
     QuietFlag,
+    ReadBoardOption,
     RootOption,
     SplitArgument,
     SplitOption,
@@ -224,7 +226,7 @@ def picture_command(
     output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path(
         "cost.svg"
     ),
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw the accuracy of models against their cost as an SVG file."""
@@ -237,7 +239,7 @@ def picture_command(
             got=output,
             fix=f"-o {output.stem or 'cost'}.svg",
         )
-    model = collect(board, only=[(tier.split, tier.name)])
+    model = collect(find_board(board), only=[(tier.split, tier.name)])
     svg = picture(model, tier)
     write_atomically(output, svg.encode(), option="--output")
     print_line(str(output), quiet=quiet)
@@ -276,7 +278,7 @@ def reproduce_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -308,7 +310,7 @@ def reproduce_command(
         )
     with progress_bar(quiet=quiet or as_json) as progress:
         result = reproduce(
-            board,
+            find_board(board),
             entries or (),
             split=split,
             size=size,
@@ -386,7 +388,7 @@ def shift_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -411,7 +413,7 @@ def shift_command(
         )
     with progress_bar(quiet=quiet or as_json) as progress:
         result = score_on_shift(
-            board,
+            find_board(board),
             entries or (),
             split=split,
             size=size,
@@ -462,18 +464,19 @@ def show_command(
             "Show variants, deviations and the first metrics of each data set.",
         ),
     ] = False,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Print the tables of the leaderboard."""
     split = None
     if split_argument or split_option:
         split = choose_split(split_argument, split_option)
-    data_sets = Folder(board).data_sets()
+    folder = find_board(board)
+    data_sets = Folder(folder).data_sets()
     scope = scope_of_tables(metric or (), wide=wide)
     if as_json:
         scope = SCOPE_OF_JSON
-    model = collect(board, only=choose_data_sets(data_sets, split, size), scope=scope)
+    model = collect(folder, only=choose_data_sets(data_sets, split, size), scope=scope)
     if as_json:
         print_json(to_plain(model))
         return
@@ -483,11 +486,11 @@ def show_command(
         return
     if data_sets:
         print_line(
-            f"{board}: all entries were scored on earlier tasks; "
+            f"{folder}: all entries were scored on earlier tasks; "
             "submit predictions for the present task: lagbench submit"
         )
     else:
         print_line(
-            f"{board}: no entries yet; make the first: "
+            f"{folder}: no entries yet; make the first: "
             "lagbench submit predictions.nc --from meta.yaml"
         )

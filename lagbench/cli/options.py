@@ -85,6 +85,13 @@ SchedulerOption = Annotated[
 ]
 DEFAULT_BOARD = Path("leaderboard")
 BoardOption = Annotated[Path, option("--board FOLDER", "Folder of the leaderboard.")]
+ReadBoardOption = Annotated[
+    Path | None,
+    option(
+        "--board FOLDER",
+        "Folder of the leaderboard; by default leaderboard here, or else in the clone.",
+    ),
+]
 JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]
 QuietFlag = Annotated[bool, option("--quiet -q", "Print errors only.")]
 

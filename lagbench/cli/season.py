@@ -29,12 +29,14 @@ from lagbench.board.season_table import (
 )
 from lagbench.errors import ChecksFailedError, UsageError, format_count
 from lagbench.figures.tables import Table
+from lagbench.scoring.boards import find_board
 
 from .options import (
     DEFAULT_BOARD,
     BoardOption,
     JsonFlag,
     QuietFlag,
+    ReadBoardOption,
     RootOption,
     option,
 )
@@ -148,7 +150,7 @@ def run_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -164,6 +166,7 @@ def run_command(
     4: blind scenarios are missing, or not those of the season
     5: out of memory or disk
     """
+    board = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = run_season(
             board,
@@ -215,12 +218,12 @@ def show_command(
     as_markdown: Annotated[
         bool, option("--markdown", "Print the table as Markdown, for a page.")
     ] = False,
-    board: BoardOption = DEFAULT_BOARD,
+    board: ReadBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Print public and blind skill of a season, and their gap."""
+    board = find_board(board)
     folder = Folder(board)
-    folder.require()
     season = read_season(folder, name)
     scores = read_scores(folder, season)
     if scores is None:

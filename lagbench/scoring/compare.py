@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.data.local import locate, locate_split, suggest_split_of
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
     ChecksFailedError,
     DataError,
@@ -36,6 +36,7 @@ from lagbench.references.table import REFERENCES, references_of
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
 
+from .boards import find_board, no_board
 from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
@@ -51,14 +52,7 @@ SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""
 
 SCORES = "scores"
-SUBMISSIONS = "submissions"
-"""Folders of a leaderboard, see :mod:`lagbench.board.folder`."""
-
-DEFAULT_BOARDS = (
-    Path("leaderboard"),
-    Path(__file__).resolve().parents[2] / "leaderboard",
-)
-"""The leaderboard in the working folder, and that of a clone."""
+"""The folder of score files in a leaderboard, see :mod:`lagbench.board.folder`."""
 
 Place = tuple[str, ...]
 """Split, size and method of an entry."""
@@ -274,9 +268,10 @@ def compare(
     entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)
-    first = _find_entry(first, entries)
+    splits = (registry or load()).splits
+    first = _find_entry(first, entries, splits)
     if not is_bare:
-        second = _find_entry(second, entries)
+        second = _find_entry(second, entries, splits)
 
     # before anything is scored
     _check_files(first)
@@ -373,21 +368,12 @@ def list_entries(board: str | Path | None) -> dict[Place, Path]:
     Raises:
         UsageError: the named folder is no leaderboard.
     """
-    folders: tuple[Path, ...] = DEFAULT_BOARDS
-    if board is not None:
-        folders = (Path(board),)
-    for folder in folders:
-        if (folder / SCORES).is_dir():
-            break
-    else:
-        if board is not None and not (folder / SUBMISSIONS).is_dir():
-            raise UsageError(
-                "no leaderboard here",
-                where=f"--board {board}",
-                expected=f"a folder that holds {SCORES}/",
-                got="a folder without it" if folder.is_dir() else "no such folder",
-                fix="name the folder of a leaderboard, or leave the option out",
-            )
+    try:
+        folder = find_board(board)
+    except UsageError:
+        # without a leaderboard, files are compared still
+        if board is not None:
+            raise
         return {}
 
     entries: dict[Place, Path] = {}
@@ -398,17 +384,22 @@ def list_entries(board: str | Path | None) -> dict[Place, Path]:
     return entries
 
 
-def _find_entry(source: str | Path, entries: Mapping[Place, Path]) -> str | Path:
+def _find_entry(
+    source: str | Path, entries: Mapping[Place, Path], splits: Collection[str]
+) -> str | Path:
     """Return the score file of an entry named as split/size/method, else the source.
 
     Raises:
-        UsageError: the name of an entry without its data set.
+        UsageError: the name of an entry without its data set, or of none; or there is
+            no leaderboard.
     """
     if os.path.lexists(source):
         return source
     place = Path(source).parts
     if len(place) == 3 and place in entries:
         return entries[place]
+    if len(place) == 3 and place[0] in splits:
+        raise _no_such_entry(place, entries)
     data_sets = []
     for split, size, method in entries:
         if (method,) == place:
@@ -422,6 +413,21 @@ def _find_entry(source: str | Path, entries: Mapping[Place, Path]) -> str | Path
             fix=f"name one of {', '.join(data_sets)}",
         )
     return source
+
+
+def _no_such_entry(place: Place, entries: Mapping[Place, Path]) -> UsageError:
+    """Return the error for the name of an entry that the leaderboard does not have."""
+    if not entries:
+        return no_board()
+    name = "/".join(place)
+    names = ["/".join(known) for known in entries if known[0] == place[0]]
+    return UsageError(
+        "no such entry",
+        where="the leaderboard",
+        expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
+        got=ascii(name),
+        fix=suggest_name(name, names),
+    )
 
 
 def _check_files(source: str | Path) -> None:

@@ -131,6 +131,11 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (["leaderboard", "build"], 2, "no leaderboard here"),
         (["leaderboard", "check"], 2, "--board FOLDER"),
         (["leaderboard", "show"], 2, "no leaderboard here"),
+        (["leaderboard", "reproduce", "--all"], 2, "no leaderboard here"),
+        (["leaderboard", "shift", "--all"], 2, "no leaderboard here"),
+        (["leaderboard", "picture", "cavity"], 2, "no leaderboard here"),
+        (["compare", "cavity/mini/gns", "persistence"], 2, "no leaderboard here"),
+        (["season", "show", "trial"], 2, "no leaderboard here"),
     ],
 )
 def test_errors_have_their_codes(
@@ -139,15 +144,40 @@ def test_errors_have_their_codes(
     code: int,
     message: str,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One message on stderr, no traceback, the code of docs/scoring.md, nothing
     written.
     """
+    monkeypatch.setattr("lagbench.scoring.boards.DEFAULT_BOARDS", (Path("none"),))
     result = run(*words)
     assert result.exit_code == code, result.output
     assert message in " ".join(result.stderr.split())
     assert "Traceback" not in result.output
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def clone_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The leaderboard of a clone, which is not the working folder."""
+    board = tmp_path / "clone" / "leaderboard"
+    (board / "submissions").mkdir(parents=True)
+    boards = (Path("leaderboard"), board)
+    monkeypatch.setattr("lagbench.scoring.boards.DEFAULT_BOARDS", boards)
+    return board
+
+
+def test_the_board_of_the_clone_is_found_elsewhere(
+    run: Run, clone_board: Path, tmp_path: Path
+) -> None:
+    """A leaderboard in the working folder comes before it."""
+    shown = run("leaderboard", "show")
+    assert shown.exit_code == 0
+    assert str(clone_board) in shown.stdout
+    again = run("leaderboard", "reproduce", "cavity/mini/gns")
+    assert "no such entry" in again.stderr
+    (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
+    assert str(clone_board) not in run("leaderboard", "show").stdout
 
 
 def test_the_page_of_docs_is_true(run: Run) -> None:

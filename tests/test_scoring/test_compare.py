@@ -324,6 +324,7 @@ def entries(scored: Folders, bench: ScoreBench, tmp_path: Path) -> Path:
     board = tmp_path / "board"
     folder = board / "scores" / bench.size.split / bench.size.name
     folder.mkdir(parents=True)
+    (board / "submissions").mkdir()
     scores = scored["straight"] / "scores.nc"
     shutil.copy(scores, folder / "moving.nc")
     return board
@@ -343,6 +344,9 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     assert metric.side == "better"
     with pytest.raises(UsageError, match=name):
         compare("moving", "persistence", board=entries)
+    with pytest.raises(UsageError, match="no such entry") as caught:
+        compare(f"{name}s", "persistence", board=entries)
+    assert f"did you mean '{name}'" in str(caught.value)
 
 
 def refused_before_scoring(
