@@ -31,8 +31,9 @@ if TYPE_CHECKING:
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
 
+_WORD = re.compile(r"\S+")
 # The scheme before it is only looked back at: a search through a long text is linear.
-_USER_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-])(:/+)[^\s/]*@")
+_HOST_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-]):/+([^/]*)")
 
 SPLIT_NAMED = "SPLIT or --split"
 """Where a user names a split, for messages."""
@@ -105,12 +106,39 @@ class LagbenchError(Exception):
 def hide_user(text: str, mark: str = "...@") -> str:
     """Return a text with a mark for the users and passwords of the addresses in it.
 
-    Messages are printed, logged and sent to others.
+    Messages are printed, logged and sent to others. A password may hold any characters
+    but blanks, so after a user with a colon all is hidden up to the last ``@``.
 
-    >>> hide_user("ftp://ann:secret@host/data does not answer")
+    >>> hide_user("ftp://ann:se/cret@host/data does not answer")
     'ftp://...@host/data does not answer'
     """
-    return _USER_OF_ADDRESS.sub(rf"\1{mark}", text)
+    if "@" not in text:
+        return text
+    return _WORD.sub(lambda word: _hide_user_in_word(word[0], mark), text)
+
+
+def _hide_user_in_word(word: str, mark: str) -> str:
+    """Return a text without blanks with a mark for the users of its addresses.
+
+    Each character is looked at a few times only, however long the text is.
+    """
+    last = word.rfind("@")
+    parts = []
+    end = 0
+    for match in _HOST_OF_ADDRESS.finditer(word, 0, last + 1):
+        host = match[1]
+        begin = match.start(1)
+        parts.append(word[end:begin])
+        end = begin
+        if ":" in host and not host.startswith("["):
+            parts.append(mark)
+            end = last + 1
+            break
+        if "@" in host:
+            parts.append(mark)
+            end = begin + host.rfind("@") + 1
+    parts.append(word[end:])
+    return "".join(parts)
 
 
 def escape_unprintable(text: str) -> str:

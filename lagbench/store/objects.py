@@ -28,6 +28,7 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     WorkFailedError,
+    hide_user,
     require,
 )
 
@@ -186,16 +187,15 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
 
 def _short_address(url: str) -> str:
     """Return an address for a message: its beginning, without user and password."""
-    scheme, mark, rest = url.partition("://")
-    host, slash, path = rest.partition("/")
-    shown = f"{scheme}{mark}{host.rpartition('@')[2]}{slash}{path}"
-    return shown[:LONGEST_SHOWN]
+    return hide_user(url, mark="")[:LONGEST_SHOWN]
 
 
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
     parts = urllib.parse.urlsplit(url)
-    if "@" in parts.netloc:
+    port = parts.netloc.rpartition("]")[2].partition(":")[2]
+    has_slash_in_password = "@" in url and not re.fullmatch(r"[0-9]*", port)
+    if "@" in parts.netloc or has_slash_in_password:
         # the message and the manifest would show it
         msg = "a user or a password before its host"
         raise ValueError(msg)
@@ -496,6 +496,9 @@ def _store_errors(url: str) -> Iterator[None]:
 def _translate_error(error: Exception, url: str) -> LagbenchError:
     """Return the error of ours that an exception of a file system means."""
     message = f"{type(error).__name__}: {str(error)[:300]}"
+    if hide_user(url) != url:
+        # a library may show a part of the password
+        message = type(error).__name__
     if isinstance(error, ImportError):
         return UsageError(
             "this kind of address needs another package",
