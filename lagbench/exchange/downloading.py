@@ -40,7 +40,11 @@ from lagbench.store.archive import (
 )
 from lagbench.store.copy import object_address, parse_manifest, refuse_foreign_hashes
 from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios, fetch_text
-from lagbench.store.objects import NotInStoreError, StoreUnreachableError
+from lagbench.store.objects import (
+    NotInStoreError,
+    StoreUnreachableError,
+    check_address,
+)
 from lagbench.store.publication import Publication, publish
 from lagbench.work.progress import Meter, Progress
 
@@ -109,8 +113,8 @@ def download(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario, or no store is known and
-            nothing may be simulated.
+        UsageError: unknown split, size, subset or scenario; the named store has no
+            address of a store; or no store is known and nothing may be simulated.
         DataError: the store sent what is no data or has another length or content, see
             :mod:`lagbench.store.objects`; the file is gone, all that were right stay.
         WorkFailedError: the connection kept breaking, the disk is full, no store
@@ -190,8 +194,14 @@ def _check_connections(count: int) -> None:
 
 
 def _list_stores(mirror: str | None, split: Split, size: Size) -> list[str]:
-    """Return the URLs of stores in the order in which they are asked."""
-    if mirror:
+    """Return the URLs of stores in the order in which they are asked.
+
+    Raises:
+        UsageError: the named store has no address of a store. Otherwise the data would
+            be simulated without it, or need no store.
+    """
+    if mirror is not None:
+        check_address(mirror)
         return [mirror]
     return [*split.mirrors, *list_releases(size)]
 

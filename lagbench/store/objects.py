@@ -135,24 +135,49 @@ def open_object(url: str, offset: int, *, hint: str) -> Answer:
     return _open_fsspec(url, offset, hint)
 
 
+def check_address(url: str) -> None:
+    """Refuse what is no address of a store, before any store is asked.
+
+    Raises:
+        UsageError: an unknown kind of address, or no host.
+    """
+    if url.startswith(HTTP):
+        _require_http_address(url)
+    else:
+        _require_scheme(url)
+
+
+def _require_http_address(url: str) -> str:
+    """Return an HTTP address with unusual characters encoded."""
+    try:
+        return _percent_encode(url)
+    except ValueError as error:
+        raise _no_address(url, error) from error
+
+
+def _no_address(url: str, error: Exception) -> UsageError:
+    return UsageError(
+        "not the address of a store",
+        where=_short_address(url),
+        expected="http://host/path",
+        got=str(error),
+        fix=STORE_HINT,
+    )
+
+
 def _open_http(url: str, offset: int, hint: str) -> Answer:
     headers = {"User-Agent": "lagbench", "Accept-Encoding": "identity"}
     if offset:
         headers["Range"] = f"bytes={offset}-"
+    address = _require_http_address(url)
     try:
-        request = urllib.request.Request(_percent_encode(url), headers=headers)
+        request = urllib.request.Request(address, headers=headers)
         response = _OPENER.open(request, timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         with closing(error):
             raise _status_error(error, url, offset, hint) from None
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
-        raise UsageError(
-            "not the address of a store",
-            where=_short_address(url),
-            expected="http://host/path",
-            got=str(error),
-            fix=STORE_HINT,
-        ) from error
+        raise _no_address(url, error) from error
     except (OSError, http.client.HTTPException) as error:
         unreachable = StoreUnreachableError(
             "the store does not answer",
@@ -429,6 +454,30 @@ def _bucket_of(url: str) -> str:
     return url.split("//", 1)[1].split("/")[0]
 
 
+def _require_scheme(url: str) -> str:
+    """Return the scheme of an address that fsspec knows.
+
+    Raises:
+        UsageError: fsspec does not know it, or there is none.
+    """
+    import fsspec  # type: ignore[import-untyped]
+
+    scheme, mark, _ = url.partition("://")
+    if mark and scheme in fsspec.available_protocols():
+        return scheme
+    fix = STORE_HINT
+    if not mark and os.path.isdir(url):
+        fix = f"a folder has an address, too: {Path(url).resolve().as_uri()}"
+    raise UsageError(
+        "no such kind of address",
+        where=_short_address(url),
+        expected="http://host/path, s3://bucket/prefix, or another that fsspec knows; "
+        "file:///path for a folder",
+        got=ascii(hide_user(scheme)[:LONGEST_SHOWN]),
+        fix=fix,
+    )
+
+
 def _file_system(url: str) -> tuple[Any, str]:
     """Return the file system of an address, and the address within it.
 
@@ -436,18 +485,9 @@ def _file_system(url: str) -> tuple[Any, str]:
     """
     if url.startswith(S3):
         require("s3fs", extra="s3")
-    import fsspec  # type: ignore[import-untyped]
+    import fsspec
 
-    scheme = url.split("://", 1)[0]
-    if scheme not in fsspec.available_protocols():
-        raise UsageError(
-            "no such kind of address",
-            where=_short_address(url),
-            expected="s3://bucket/prefix, or another that fsspec knows; "
-            "file:///path for a folder",
-            got=ascii(scheme[:LONGEST_SHOWN]),
-            fix=STORE_HINT,
-        )
+    scheme = _require_scheme(url)
     # Another endpoint or other credentials are another system, also within one process.
     settings = []
     for item in os.environ.items():

@@ -146,7 +146,7 @@ MISTAKES = {
     "a template of a misspelt split": "template cavitty -o x.nc",
     "a template in a folder": "template curl-noise --size tiny -o .",
     "a mirror that is none": (
-        "download curl-noise --size tiny --from nowhere --root new --no-generate"
+        "download curl-noise --size tiny --from nowhere --root new"
     ),
     "no connection": (
         "download curl-noise --size tiny --from file:///x --connections 0"

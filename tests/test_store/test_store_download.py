@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SIZE, SPLIT
 from exchange_readers import straight_runs
 from faulty_server import Mirror, serving
 from numpy.testing import assert_array_equal
@@ -377,6 +378,27 @@ def test_what_is_no_address(here: Path, address: str) -> None:
     with pytest.raises(UsageError) as caught:
         download("own", root=here, mirror=address, or_generate=False)
     assert str(caught.value.where).startswith(address)
+
+
+@pytest.mark.parametrize("address", ["nowhere", "", "htp://host/data", "http:///data"])
+def test_what_is_no_address_is_told_where_no_file_is_missing(
+    address: str, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Neither data that are there nor a simulation hide the mistake."""
+    for root in (generated.root, tmp_path):
+        with pytest.raises(UsageError):
+            download(SPLIT, SIZE, root=root, mirror=address)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_address_of_a_folder_is_told(
+    here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "store").mkdir()
+    with pytest.raises(UsageError) as caught:
+        download("own", root=here, mirror="store")
+    assert (tmp_path / "store").as_uri() in str(caught.value)
 
 
 def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
