@@ -191,6 +191,7 @@ class Metric:
                 got="none",
                 fix="add perfect=, as in perfect=1.0",
             )
+        object.__setattr__(self, "of", tuple(self.of))
         if not self.of:
             object.__setattr__(self, "of", (self.name,))
 
@@ -296,7 +297,7 @@ class Metric:
             where=f"{package}, {self.name}, {place}",
             expected=expected,
             got=f"{type(got).__name__}: {got!r:.60}",
-            fix="mend or uninstall the package that adds it",
+            fix="mend it, or leave it out: uninstall the package that adds it",
         )
         error.metric_name = self.name  # type: ignore[attr-defined]
         return error
@@ -372,6 +373,12 @@ def metric(
         )
 
     return make_metric
+
+
+def observable(function: Callable[..., float]) -> Metric:
+    """Return the metric of a bare function of a frame pair: shown, and not judged."""
+    decorate = metric(unit="?", source="none", family="own")
+    return decorate(function)
 
 
 def _first_paragraph(docstring: str) -> str:

@@ -7,7 +7,7 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
@@ -26,7 +26,8 @@ from lagbench.errors import (
 )
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
-from .metric import Metric
+from .frame import FramePair
+from .metric import Metric, observable
 
 GROUP = "lagbench.metrics"
 """Entry-point group that adds metrics."""
@@ -166,8 +167,68 @@ def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
+def own_metrics(
+    values: Iterable[Metric | Callable[[FramePair], float]],
+) -> tuple[Metric, ...]:
+    """Return metrics that a user hands over in Python, without a package.
+
+    A function of a frame pair becomes an observable, which is shown and not judged. It
+    has the name of the function, and as summary the first paragraph of its docstring.
+
+    Raises:
+        UsageError: a value is neither a metric nor a function; its name is taken, or no
+            name for a metric; or it follows from statistics that nothing measures.
+    """
+    if isinstance(values, Metric) or callable(values):
+        values = (values,)
+    metrics = []
+    table = available()
+    for value in values:
+        if isinstance(value, Metric):
+            own = value
+        elif hasattr(value, "__name__"):
+            own = observable(value)
+        else:
+            raise UsageError(
+                "a value is no metric",
+                where="metrics",
+                expected="lagbench.metrics.Metric, or a named function of a frame pair",
+                got=f"{type(value).__name__}: {value!r:.60}",
+                fix="write the function first: see docs/extending.md",
+            )
+        if own.name in table:
+            raise UsageError(
+                "another metric has the name",
+                where="metrics",
+                expected="a name of its own for each metric",
+                got=own.name,
+                fix="rename the function, or give Metric another name=",
+            )
+        table[own.name] = own
+        metrics.append(own)
+    for own in metrics:
+        _check_statistics(own, table)
+    return tuple(metrics)
+
+
+def _check_statistics(own: Metric, table: Mapping[str, Metric]) -> None:
+    """Refuse a metric that follows from statistics which no metric measures."""
+    for name in own.of:
+        if name not in table or table[name].statistic is None:
+            statistics = [
+                name for name, metric in table.items() if metric.statistic is not None
+            ]
+            raise UsageError(
+                f"metric {own.name!r} follows from what no metric measures",
+                where="of",
+                expected="names of metrics with a statistic",
+                got=ascii(name),
+                fix=suggest_name(name, statistics),
+            )
+
+
 def select(
-    names: Iterable[str] | None = None,
+    names: Iterable[str | Metric] | None = None,
     *,
     extras: Collection[str] = (),
     known: Mapping[str, Metric] | None = None,
@@ -175,15 +236,15 @@ def select(
     """Return metrics with the metrics whose statistics they need, in the table's order.
 
     Args:
-        names: names of metrics; by default all without an extra, or with one of
-            ``extras``.
+        names: names of metrics, and metrics that are not installed; by default all
+            without an extra, or with one of ``extras``.
         extras: extras whose metrics are taken by default.
         known: the table of metrics; all that are installed by default.
 
     Raises:
         UsageError: no metric has one of the names.
     """
-    table = available() if known is None else known
+    table = dict(available() if known is None else known)
     if names is None:
         names = []
         for metric in table.values():
@@ -191,7 +252,12 @@ def select(
                 names.append(metric.name)
 
     needed: set[str] = set()
-    for name in names:
+    for choice in names:
+        if isinstance(choice, Metric):
+            name = choice.name
+            table[name] = choice
+        else:
+            name = choice
         if name not in table:
             raise UsageError(
                 f"no metric {name!r}",

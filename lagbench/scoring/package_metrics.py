@@ -11,7 +11,7 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import Severity, ValidationIssue, quote
 
-FIX = "mend or uninstall the package that adds it"
+FIX = "mend it, or leave it out: uninstall the package that adds it"
 
 
 class PackageMetricError(WorkFailedError):
@@ -20,7 +20,7 @@ class PackageMetricError(WorkFailedError):
     def __init__(self, metric: str, *, where: str, got: str) -> None:
         self.metric = metric  # its name
         super().__init__(
-            f"the metric {metric} of another package failed",
+            f"the metric {metric} failed, which is none of lagbench",
             where=where,
             expected="a number",
             got=got,

@@ -133,7 +133,8 @@ class ScenarioJob:
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
     info: FileInfo  # content of its headers
-    metrics: tuple[str, ...]  # names of the metrics
+    # names of the metrics, and metrics of the user that are not installed
+    metrics: tuple[str | Metric, ...]
     references: tuple[str, ...] = ()  # names of the references to measure beside it
     has_preview: bool = False  # whether to take the preview
 

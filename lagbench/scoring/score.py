@@ -14,8 +14,9 @@ from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.frame import FramePair
 from lagbench.metrics.metric import Metric
-from lagbench.metrics.table import available, ranking_metric, select
+from lagbench.metrics.table import available, own_metrics, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import CLASSICAL, NAIVE
@@ -61,6 +62,7 @@ def score(
     workers: int | None = None,
     scheduler: str | None = None,
     extras: Collection[str] = (),
+    metrics: Collection[Metric | Callable[[FramePair], float]] = (),
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
     registry: Registry | None = None,
@@ -79,6 +81,10 @@ def score(
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
         extras: extras whose metrics are measured too, as in ("transport",).
+        metrics: metrics of your own that are measured too: functions of a
+            :class:`~lagbench.metrics.FramePair`, or a
+            :class:`~lagbench.metrics.Metric` where a direction and a unit are to be
+            stated. They are measured in this process.
         progress: called with the state of the work.
         examined: called with the result of the validation, before anything is raised
             for it.
@@ -93,15 +99,20 @@ def score(
 
     Raises:
         UsageError: predictions for another split; an extra that brings no metrics, or
-            that is not installed; scores of another method lie where these would go.
+            that is not installed; what is no metric, or workers for one of your own;
+            scores of another method lie where these would go.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing
             or damaged.
         WorkFailedError: a worker or the cluster was lost, the disk is full, or the
-            folder cannot be written to, which is seen before the work.
+            folder cannot be written to, which is seen before the work; or a metric of
+            your own failed.
     """
-    metrics = _select_metrics(extras)
+    own = own_metrics(metrics)
+    if own:
+        workers = _one_worker(workers, scheduler)
+    measured_metrics = select((*_select_metrics(extras), *own))
     path = Path(predictions).absolute()
     expected_split = None
     if split is not None:
@@ -157,7 +168,8 @@ def score(
             scheduler=scheduler,
             meter=Meter(progress),
         ),
-        metrics,
+        measured_metrics,
+        own=own,
     )
     card = _make_card(
         measurement,
@@ -182,21 +194,50 @@ class Measurement:
     failures: Sequence[ValidationIssue]  # of metrics of other packages
 
 
+def _one_worker(workers: int | None, scheduler: str | None) -> int:
+    """Return the number of workers for functions that no other process can import.
+
+    Raises:
+        UsageError: more of them are asked for.
+    """
+    if scheduler is not None or (workers or 1) > 1:
+        got = f"workers={workers}"
+        if scheduler is not None:
+            got = f"scheduler={scheduler!r}"
+        raise UsageError(
+            "metrics of your own are measured in this process",
+            where="metrics",
+            expected="one worker and no scheduler",
+            got=got,
+            fix="leave it out, or install the metrics as a package: see "
+            "docs/extending.md",
+        )
+    return 1
+
+
 def _measure(
-    score_all: Callable[..., list[ScenarioScores]], metrics: tuple[Metric, ...]
+    score_all: Callable[..., list[ScenarioScores]],
+    metrics: tuple[Metric, ...],
+    *,
+    own: Collection[Metric],
 ) -> Measurement:
     """Score all scenarios; a metric of another package that fails is left out.
 
     Args:
         score_all: :func:`score_scenarios` without its metrics.
         metrics: the metrics to measure.
+        own: those of them that are not installed; they are not left out.
     """
+    own_names = {metric.name for metric in own}
     failures = []
     while True:
         try:
-            outcomes = score_all(metrics=tuple(metric.name for metric in metrics))
+            names = _names_or_metrics(metrics, own_names)
+            outcomes = score_all(metrics=names)
             tallies, scores = _aggregate(outcomes, metrics)
         except PackageMetricError as error:
+            if error.metric in own_names:
+                raise
             # measured again without it: its column is left out, the others are whole
             metrics = drop_metric(metrics, error.metric)
             failures.append(describe_failure(error))
@@ -204,6 +245,16 @@ def _measure(
         return Measurement(
             outcomes=outcomes, tallies=tallies, scores=scores, failures=failures
         )
+
+
+def _names_or_metrics(
+    metrics: Sequence[Metric], own_names: Collection[str]
+) -> tuple[str | Metric, ...]:
+    """Return the names of installed metrics, and the others themselves."""
+    listed: list[str | Metric] = []
+    for metric in metrics:
+        listed.append(metric if metric.name in own_names else metric.name)
+    return tuple(listed)
 
 
 def _make_card(
@@ -372,7 +423,7 @@ def score_scenarios(
     path: Path,
     info: FileInfo,
     *,
-    metrics: tuple[str, ...],
+    metrics: tuple[str | Metric, ...],
     references: tuple[str, ...],
     workers: int | None,
     scheduler: str | None,
@@ -384,7 +435,7 @@ def score_scenarios(
         task: the test subset.
         path: a predictions.nc that has been validated.
         info: content of its headers.
-        metrics: names of the metrics.
+        metrics: names of the metrics, and metrics that are not installed.
         references: names of the references to measure beside it.
         workers: worker processes; None: one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.

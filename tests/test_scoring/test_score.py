@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
+from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.published_scores import read_scores
+from lagbench.scoring.score_file_checks import read_published_scores
 from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
@@ -396,3 +401,128 @@ def test_predictions_for_another_split_are_refused(
     assert caught.value.expected == "fluid"
     card = bench.evaluate(path, split=bench.size.split)
     assert card.skill is not None
+
+
+def mean_height(pair: FramePair) -> float:
+    """Mean height of the prediction [length]."""
+    return float(pair.prediction.position[:, 1].mean())
+
+
+def fall(pair: FramePair) -> float:
+    """Return how far the prediction is below the truth."""
+    return float(-pair.position_error[:, 1].mean())
+
+
+FALL = Metric(
+    name="fall",
+    family="own",
+    unit="length",
+    direction=Direction.TARGET,
+    perfect=0.0,
+    source="own",
+    summary="mean height that is lost",
+    statistic=fall,
+)
+
+
+def test_own_metrics_are_measured_without_a_package(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """A function is an observable of its name; a metric states more.
+
+    Whoever reads the files later does not have them, and reads all others.
+    """
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    card = bench.score(path, metrics=[mean_height, FALL])
+    truth = bench.truth(bench.size.subsets["test"][0])
+    last = truth[bench.size.task.input_frames - 1]
+    assert card.submission["mean_height"].values[0] == pytest.approx(last[:, 1].mean())
+    assert card.submission["mean_height"].metric.direction is Direction.NONE
+    assert card.submission["fall"].metric.unit == "length"
+    assert "fall" in set(card.to_dataframe()["metric"])
+    plain = bench.evaluate(path)
+    assert set(card.submission) - set(plain.submission) == {"mean_height", "fall"}
+    for file in card.files:
+        read = read_scores if file.suffix == ".json" else read_published_scores
+        assert "fall" not in read(file).scores[SUBMISSION]
+
+
+def test_one_own_metric_needs_no_list(bench: ScoreBench, tmp_path: Path) -> None:
+    path = bench.submit(tmp_path / "predictions.nc", right)
+    card = bench.evaluate(path, metrics=FALL)
+    assert card.submission["fall"].mean == 0.0
+
+
+def test_an_own_metric_may_follow_from_others(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    doubled = replace(
+        FALL,
+        name="doubled",
+        statistic=None,
+        of=["fall"],  # type: ignore[arg-type] # a list is as good as a tuple
+        series=lambda values: 2.0 * values,
+    )
+    card = bench.evaluate(path, metrics=[FALL, doubled])
+    fallen = card.submission["fall"].mean
+    assert card.submission["doubled"].mean == pytest.approx(2.0 * fallen)
+
+
+@pytest.mark.parametrize(
+    ("metrics", "options"),
+    [
+        ([3], {}),
+        (["vorticity_rmse"], {}),
+        ([lambda pair: 0.0], {}),
+        ([replace(FALL, name="position_rmse")], {}),
+        ([FALL, FALL], {}),
+        ([replace(FALL, statistic=None, of=("nothing",))], {}),
+        ([FALL], {"workers": 2}),
+        ([FALL], {"scheduler": "tcp://localhost:1"}),
+    ],
+)
+def test_what_is_no_own_metric_is_refused(
+    bench: ScoreBench,
+    tmp_path: Path,
+    metrics: list[object],
+    options: dict[str, object],
+) -> None:
+    """Nothing is scored before."""
+    with pytest.raises(UsageError) as caught:
+        bench.evaluate(tmp_path / "none.nc", metrics=metrics, **options)
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+
+
+def test_an_own_metric_that_fails_is_told(bench: ScoreBench, tmp_path: Path) -> None:
+    """The error is raised from that of the function; no warning hides it."""
+
+    def broken(pair: FramePair) -> float:
+        return pair.truth.positions  # type: ignore[attr-defined, no-any-return]
+
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    with pytest.raises(WorkFailedError, match="broken") as caught:
+        bench.evaluate(path, metrics=[broken])
+    assert isinstance(caught.value.__cause__, AttributeError)
+    assert "scenario" in str(caught.value.where)
+
+
+def test_the_own_metric_of_the_docs_is_measured(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """The example of docs/extending.md runs as it stands; its scorer is the bench."""
+    page = Path(__file__).parents[2] / "docs" / "extending.md"
+    found = re.search(
+        r"```python\n(import numpy as np\n\nimport lagbench\n.*?)```",
+        page.read_text(),
+        re.DOTALL,
+    )
+    assert found is not None
+    program, call = found[1].split("\ncard = ")
+    names: dict[str, Any] = {}
+    exec(program, names)
+    assert "metrics=[mean_height_error]" in call
+    path = bench.submit(tmp_path / "predictions.nc", right)
+    card = bench.evaluate(path, metrics=[names["mean_height_error"]])
+    assert card.submission["mean_height_error"].mean == 0.0
