@@ -441,14 +441,20 @@ def edge_features(
     else:
         way = box.displacement(receiver_position, sender_position)
     displacement = way / radius
-    # The gradient of a norm is NaN at 0, where two particles coincide; that of this
-    # root is 0.
-    squares = displacement**2
+    distance = safe_length(displacement)
+    return torch.cat([displacement, distance], dim=-1)
+
+
+def safe_length(vector: Tensor) -> Tensor:
+    """Return the lengths of vectors, shape [..., 1] from [..., axis].
+
+    The gradient of a norm is NaN at 0, where two particles coincide; here it is 0.
+    """
+    squares = vector**2
     square = squares.sum(dim=-1, keepdim=True)
     is_positive = square > 0.0
     radicand = torch.where(is_positive, square, 1.0)
-    distance = radicand.sqrt() * is_positive
-    return torch.cat([displacement, distance], dim=-1)
+    return radicand.sqrt() * is_positive
 
 
 class NodeFeatures(nn.Module):

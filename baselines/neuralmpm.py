@@ -38,6 +38,7 @@ from .augmentation import (
     velocity_towards_path,
 )
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
+from .forcing import require_force
 from .neuralmpm_accelerations import (
     Accelerations,
     FieldAccelerations,
@@ -255,17 +256,8 @@ class NeuralMPM(Baseline):
         """
         if not self.options.body_force:
             return None
-        if given.body_force is None:
-            raise DataError(
-                "no force drives the flow",
-                where=f"{self.info.split} {self.info.size}",
-                expected="body_force in each scenario file",
-                got="none",
-                fix="train without it: --set model.body_force=false",
-            )
         last_frame = given.frames - 1
-        per_square_second = given.body_force[:, last_frame:]
-        return per_square_second * self.info.frame_interval**2
+        return require_force(given, self.info)[:, last_frame:]
 
     def _scaled_viscosity(self, given: Batch) -> Tensor:
         """Return the logarithm of the viscosity of each window, shape [window, 1].

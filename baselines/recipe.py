@@ -211,6 +211,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "viscosity": False,
         "shift": False,
         "body_force": False,
+        "obstacle": False,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

@@ -40,6 +40,7 @@ from .baseline import (
     check_moving_walls,
     last_velocities,
 )
+from .forcing import ForcingFeatures
 from .graph import (
     NodeFeatures,
     Standardisation,
@@ -73,17 +74,35 @@ class ParticleState:
     # shape [window, frame, 4, 2]; beyond them the last one stays. None where walls rest
     # or the model does not see them.
     wall_velocity: Tensor | None
+    # force on layers along y in the coming frames, the next one first
+    # [length/frame^2], shape [window, frame, layer, axis]; beyond them the last one
+    # stays. None where the model does not see it.
+    body_force: Tensor | None = None
+    # centre and radius of each window's obstacle [length], shape [window, axis + 1];
+    # None where the model does not see it
+    obstacle: Tensor | None = None
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
         later_velocities = self.velocity[:, 1:]
         velocities = torch.cat([later_velocities, velocity.unsqueeze(1)], dim=1)
-        walls = self.wall_velocity
-        if walls is not None and walls.shape[1] > 1:
-            walls = walls[:, 1:]
         return replace(
-            self, position=position, velocity=velocities, wall_velocity=walls
+            self,
+            position=position,
+            velocity=velocities,
+            wall_velocity=_skip_frame(self.wall_velocity),
+            body_force=_skip_frame(self.body_force),
         )
+
+
+def _skip_frame(forcing: Tensor | None) -> Tensor | None:
+    """Return what drives the flow from the frame after the next on; the last one stays.
+
+    The shape is [window, frame, ...].
+    """
+    if forcing is None or forcing.shape[1] == 1:
+        return forcing
+    return forcing[:, 1:]
 
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")
@@ -247,7 +266,7 @@ class GraphNetworkOptions(Options):
             "symmetry",
         }
     )
-    of_weights = frozenset({"target", "sum_messages"})
+    of_weights = frozenset({"target", "sum_messages", "body_force", "obstacle"})
 
     latent: int = Field(default=128, ge=1)  # width of nodes, edges and hidden layers
     layers: int = Field(default=10, ge=1)  # processor layers
@@ -279,6 +298,11 @@ class GraphNetworkOptions(Options):
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect
     # beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
+    # whether the force per unit mass at a particle in the next frame is a feature
+    body_force: bool = False
+    # whether distance and direction of an obstacle's surface are features; it is seen
+    # as far as a wall
+    obstacle: bool = False
     # training windows are replaced by random ones of these mirror images
     symmetry: Symmetry = Symmetry.NONE
     # connectivity radius [length]; the data set's when None
@@ -334,9 +358,16 @@ class GraphNetwork(Baseline):
             moving_walls=options.wall_velocity,
             periodic=info.box.periodic,
         )
+        self.forcing = ForcingFeatures(
+            info,
+            body_force=options.body_force,
+            obstacle=options.obstacle,
+            force_unit=self.acceleration_std,
+            reach=wall_reach,
+        )
         self.network = EncodeProcessDecode(
             self.operator,
-            node_features=self.features.count,
+            node_features=self.features.count + self.forcing.count,
             edge_features=info.box.dimension + 1,
             outputs=info.box.dimension,
             latent=options.latent,
@@ -349,8 +380,8 @@ class GraphNetwork(Baseline):
 
     @property
     def forcing_seen(self) -> frozenset[str]:
-        """Neither a force nor an obstacle."""
-        return frozenset()
+        """What the options ask for."""
+        return self.forcing.names
 
     @property
     def acceleration_std(self) -> float:
@@ -562,6 +593,8 @@ class GraphNetwork(Baseline):
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
+            body_force=self.forcing.coming_force(given),
+            obstacle=self.forcing.find_obstacle(given),
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
@@ -612,6 +645,12 @@ class GraphNetwork(Baseline):
             next_frame = state.wall_velocity[:, 0]
             walls = next_frame[state.sample]
         node = self.features(state.position, state.velocity, state.material, walls)
+        if self.forcing.count:
+            force = None
+            if state.body_force is not None:
+                force = state.body_force[:, 0]
+            forcing = self.forcing(state.position, state.sample, force, state.obstacle)
+            node = torch.cat([node, forcing], dim=1)
         edge = edge_features(state.position, edge_index, self.radius, self.box)
         output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
         return output

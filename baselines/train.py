@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
@@ -234,16 +234,22 @@ def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:
         return
     names = " and ".join(FORCING[name] for name in unseen)
     keys = " and ".join(unseen)
-    fix = "NeuralMPM sees it"
-    if "body_force" in unseen:
-        fix = "NeuralMPM with model.body_force=true sees it"
-    if "body_force" in unseen and "body_force" in type(model.options).model_fields:
-        fix = "--set model.body_force=true shows it"
     message = (
         f"{model.method} does not see {names} of {size.split} ({keys}): it can only "
-        f"learn the mean effect; {fix}"
+        f"learn the mean effect; {_show_forcing(model, unseen)}"
     )
     warnings.warn(message, UnseenForcingWarning, stacklevel=3)
+
+
+def _show_forcing(model: Baseline, unseen: Sequence[str]) -> str:
+    """Return which option or model shows what drives the flow."""
+    known_options = type(model.options).model_fields
+    if all(name in known_options for name in unseen):
+        settings = [f"--set model.{name}=true" for name in unseen]
+        return f"{' '.join(settings)} shows it"
+    if "body_force" in unseen:
+        return "graph networks and NeuralMPM with model.body_force=true see it"
+    return "graph networks with model.obstacle=true and NeuralMPM see it"
 
 
 def _open_folder(

@@ -182,6 +182,7 @@ recipes:
     ("baseline", "model", "has_warning"),
     [
         ("gns", "{latent: 4, layers: 1}", True),
+        ("gns", "{latent: 4, layers: 1, body_force: true}", False),
         ("neuralmpm", "{cells: 12, width: 8, bundle: 2}", True),
         ("neuralmpm", "{cells: 12, width: 8, bundle: 2, body_force: true}", False),
     ],
@@ -205,7 +206,6 @@ def test_a_training_says_that_its_model_does_not_see_the_force(
     assert bool(messages) == has_warning, messages
     if has_warning:
         assert "does not see the force that drives the flow" in messages[0]
-    if baseline == "neuralmpm" and has_warning:
         assert "--set model.body_force=true" in messages[0]
 
 

@@ -1,0 +1,455 @@
+"""What particles see of the force and of an obstacle, against closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from simple_models import RADIUS, batch, info, network, rolled, swirl
+from torch import Tensor
+from torch.testing import assert_close
+
+import lagbench
+from lagbench.baselines.augmentation import mirror_batch
+from lagbench.baselines.baseline import Batch, DatasetInfo
+from lagbench.baselines.catalogue import find
+from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
+from lagbench.baselines.forcing import ForcingFeatures, force_at, obstacle_features
+from lagbench.baselines.graph import edge_features
+from lagbench.baselines.predict import predict
+from lagbench.baselines.rollout import roll_out, scenario_batch
+from lagbench.baselines.train import UnseenForcingWarning, train
+from lagbench.data.box import Box
+from lagbench.data.local import locate
+from lagbench.errors import DataError, UsageError
+from lagbench.make.generate import GenerationResult
+from lagbench.models.registered import export_safetensors
+from lagbench.tensors import TensorBox
+
+UNIT = (0.0, 1.0)
+BOXES = {
+    "walls": Box.from_bounds([UNIT, UNIT]),
+    "channel": Box.from_bounds([UNIT, UNIT], [True, False]),
+    "periodic": Box.from_bounds([UNIT, UNIT], [True, True]),
+    "cube": Box.from_bounds([UNIT, UNIT, UNIT]),
+    "periodic cube": Box.from_bounds([UNIT, UNIT, UNIT], [True, True, True]),
+}
+
+
+def info_of_box(box: Box) -> DatasetInfo:
+    """Return the figures of a box, with the statistics of two axes for all."""
+    statistics = {}
+    for name, values in info().statistics.items():
+        statistics[name] = (*values, *values)[: box.dimension]
+    axes = [name for name, repeats in zip("xyz", box.periodic, strict=False) if repeats]
+    return info(bounds=box.bounds, periodic=tuple(axes), statistics=statistics)
+
+
+def parabola(height: NDArray[np.float64], force: float, viscosity: float) -> Any:
+    """Return the steady speed of reverse Poiseuille flow in a period of length 1.
+
+    It is f y (H - y) / (2 nu) in the lower half, H = 1/2, and its opposite in the upper
+    (Backer et al. 2005).
+    """
+    half = 0.5
+    place = np.mod(height, 1.0)
+    above = np.where(place < half, place, place - half)
+    sign = np.where(place < half, 1.0, -1.0)
+    return sign * force * above * (half - above) / (2.0 * viscosity)
+
+
+@pytest.mark.parametrize("name", ["periodic", "periodic cube"])
+def test_the_force_is_what_the_parabola_needs(name: str) -> None:
+    """In steady flow it is -nu u'', constant in each half of the box, wherever in the
+    period a particle is counted.
+    """
+    force = 0.03
+    viscosity = 1e-3
+    height = np.array([0.01, 0.2, 0.49, 0.51, 0.75, 0.99, -0.25, 1.25, 1.75])
+    step = 1e-3
+    after = parabola(height + step, force, viscosity)
+    before = parabola(height - step, force, viscosity)
+    curvature = (after - 2.0 * parabola(height, force, viscosity) + before) / step**2
+    needed = -viscosity * curvature
+    assert np.unique(needed.round(6)).tolist() == [-force, force]
+
+    box = BOXES[name]
+    position = torch.full((len(height), box.dimension), 0.3)
+    position[:, 1] = torch.from_numpy(height)
+    sample = torch.tensor([0] * 4 + [1] * 5)
+    layers = torch.zeros(2, 2, box.dimension)
+    layers[:, 0, 0] = force
+    layers[:, 1, 0] = -force
+    acting = force_at(position, sample, layers, TensorBox(box))
+    expected = torch.zeros_like(acting)
+    expected[:, 0] = torch.from_numpy(needed)
+    assert_close(acting, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["walls", "channel", "cube"])
+def test_beyond_a_wall_the_layer_at_the_wall_acts(name: str) -> None:
+    """Three layers between walls, each window with a force of its own."""
+    box = BOXES[name]
+    height = torch.tensor([-0.4, 0.1, 0.34, 0.66, 0.67, 0.9, 1.0, 1.7])
+    layer = [0, 0, 1, 1, 2, 2, 2, 2]
+    position = torch.full((8, box.dimension), 0.5)
+    position[:, 1] = height
+    sample = torch.tensor([0, 0, 0, 0, 1, 1, 1, 1])
+    shape = (2, 3, box.dimension)
+    layers = torch.arange(6.0 * box.dimension).reshape(shape)
+    acting = force_at(position, sample, layers, TensorBox(box))
+    assert torch.equal(acting, layers[sample, layer])
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_the_surface_of_a_circle_or_ball_is_seen_within_the_reach(name: str) -> None:
+    """Particles stand on rays from the centre: their distance to the surface is the
+    length of the ray less the radius, the normal is the ray. Half of the rays leave the
+    box; along periodic axes they enter at the other end.
+    """
+    box = BOXES[name]
+    reach = 0.1
+    radius = 0.05
+    centre = torch.full((box.dimension,), 0.5)
+    centre[0] = 0.95  # near an end of x
+    rng = np.random.default_rng(0)
+    ray = rng.normal(size=(60, box.dimension))
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    gap = rng.uniform(-0.04, 0.16, 60)  # from inside to beyond the reach
+    normal = torch.from_numpy(ray).float()
+    distance = torch.from_numpy(gap).float()[:, None]
+    position = TensorBox(box).wrap(centre + (radius + distance) * normal)
+    one = torch.cat([centre, torch.tensor([radius])])
+    features = obstacle_features(position, one.expand(60, -1), reach, TensorBox(box))
+
+    relative = (distance / reach).clamp(max=1.0)
+    nearness = (1.0 - relative).clamp(max=1.0)
+    expected = torch.cat([relative, nearness * normal], dim=1)
+    assert_close(features, expected, rtol=0.0, atol=1e-5)
+    is_beyond = gap > reach
+    assert is_beyond.any()
+    assert (features[is_beyond, 0] == 1.0).all()
+    assert (features[is_beyond, 1:] == 0.0).all()
+
+
+def test_the_distance_is_that_to_the_nearest_point_of_the_surface() -> None:
+    """Whole numbers: 3, 4 and 5 in the plane, 2, 3, 6 and 7 in space."""
+    plane = TensorBox(BOXES["walls"])
+    position = torch.tensor([[0.3, 0.4]])
+    circle = torch.tensor([[0.0, 0.0, 0.25]])
+    features = obstacle_features(position, circle, 0.5, plane)
+    assert_close(features, torch.tensor([[0.5, 0.5 * 0.6, 0.5 * 0.8]]))
+    cube = TensorBox(BOXES["cube"])
+    position = torch.tensor([[0.2, 0.3, 0.6]])
+    ball = torch.tensor([[0.0, 0.0, 0.0, 0.35]])
+    features = obstacle_features(position, ball, 0.7, cube)
+    parts = torch.tensor([[1.0, 2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0]])
+    assert_close(features, 0.5 * parts)
+
+
+def test_the_centre_of_an_obstacle_has_no_direction_and_no_gradient() -> None:
+    position = torch.tensor([[0.5, 0.5]], requires_grad=True)
+    circle = torch.tensor([[0.5, 0.5, 0.1]])
+    features = obstacle_features(position, circle, 0.2, TensorBox(BOXES["walls"]))
+    assert features.tolist() == [[-0.5, 0.0, 0.0]]
+    features[:, 0].sum().backward()
+    assert position.grad is not None
+    assert position.grad.tolist() == [[0.0, 0.0]]
+
+
+def swirl_in(box: Box, frames: int = 7) -> NDArray[np.float64]:
+    """Return particles that turn about the middle of a box, at one height in space."""
+    plane = swirl(0, frames)
+    if box.dimension == 2:
+        return plane
+    height = np.full((*plane.shape[:2], 1), 0.5)
+    return np.concatenate([plane, height], axis=2)
+
+
+def forced_batch(box: Box) -> Batch:
+    """Return two windows with a force of their own in each frame, and an obstacle."""
+    path = swirl_in(box)
+    plain = batch(path, path[::-1].copy())
+    axes = box.dimension
+    generator = torch.Generator().manual_seed(7)
+    force = 1e-3 * torch.rand((2, 9, 2, axes), generator=generator)
+    obstacle = torch.full((2, axes + 1), 0.4)
+    obstacle[1, 0] = 0.6
+    obstacle[:, -1] = 0.1
+    return replace(plain, body_force=force, obstacle=obstacle)
+
+
+def seeing(box: Box, **options: object) -> Any:
+    """Return an awake graph network of one layer in a box."""
+    figures = info_of_box(box)
+    changes = {
+        "bounds": figures.bounds,
+        "periodic": figures.periodic,
+        "statistics": figures.statistics,
+    }
+    return network(awake=True, layers=1, changes=changes, **options)
+
+
+def node_inputs(model: Any, given: Batch, frames: int) -> list[Tensor]:
+    """Return what the network is given of the nodes in each step of a rollout."""
+    seen: list[Tensor] = []
+    hook = model.network.node_encoder.register_forward_pre_hook(
+        lambda _, values: seen.append(values[0])
+    )
+    rolled(model, given, frames)
+    hook.remove()
+    return seen
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_nodes_see_force_and_obstacle_after_all_else(name: str) -> None:
+    """The force of the next frame, in deviations of accelerations that the weights
+    state; the other features are to the bit those of a network that sees neither.
+    """
+    box = BOXES[name]
+    axes = box.dimension
+    window = forced_batch(box)
+    given = window.part(slice(6))
+    model = seeing(box, body_force=True, obstacle=True)
+    assert model.forcing_seen == {"body_force", "obstacle"}
+    blind = seeing(box)
+    assert blind.forcing_seen == frozenset()
+    (blind_node,) = node_inputs(blind, given, 1)
+    nodes = node_inputs(model, given, 4)
+    plain = blind_node.shape[1]
+    assert nodes[0].shape[1] == plain + axes + axes + 1
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        embedding = blind.features.embedding.weight.clone()
+        model.features.embedding.weight.data.copy_(embedding)
+    (node, *_) = node_inputs(model, given, 1)
+    assert torch.equal(node[:, :plain], blind_node)
+
+    deviations = np.array(model.info.statistics["acceleration_std"])
+    unit = float(np.sqrt(np.mean(deviations**2)))
+    scale = model.info.frame_interval**2 / unit
+    path = rolled(model, given, 3)
+    places = [given.position[:, -1], *path.unbind(1)]
+    assert window.body_force is not None
+    assert window.obstacle is not None
+    box_of_tensors = TensorBox(box)
+    for step, (features, position) in enumerate(zip(nodes, places, strict=True)):
+        frame = min(6 + step, 8)  # the last known one stays
+        force = window.body_force[:, frame]
+        acting = force_at(position, window.sample, force, box_of_tensors)
+        force_seen = features[:, plain : plain + axes]
+        assert_close(force_seen, scale * acting, rtol=1e-5, atol=1e-7)
+        own = window.obstacle[window.sample]
+        reach = 3.0 * RADIUS
+        surface = obstacle_features(position, own, reach, box_of_tensors)
+        assert_close(features[:, plain + axes :], surface, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("matrix", [[-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+@pytest.mark.parametrize("name", ["walls", "periodic", "cube"])
+def test_images_of_a_window_have_images_of_the_features(
+    name: str, matrix: list[float]
+) -> None:
+    """Force and direction turn with the window, the distance stays."""
+    box = BOXES[name]
+    signs = torch.tensor([*matrix, 1.0][: box.dimension])
+    window = forced_batch(box)
+    image = torch.diag(signs).expand(2, box.dimension, box.dimension)
+    mirrored = mirror_batch(window, image, box.bounds)
+    figures = info_of_box(box)
+    see = ForcingFeatures(
+        figures, body_force=True, obstacle=True, force_unit=1e-3, reach=0.2
+    )
+
+    def features(given: Batch) -> Tensor:
+        force = see.coming_force(given)
+        assert force is not None
+        last = given.position[:, -1]
+        return see(last, given.sample, force[:, 0], see.find_obstacle(given))
+
+    expected = features(window) * torch.cat([signs, torch.ones(1), signs])
+    assert_close(features(mirrored), expected, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["body_force", "obstacle"])
+def test_a_model_that_sees_what_is_not_there_says_so(name: str) -> None:
+    box = BOXES["periodic"]
+    model = seeing(box, **{name: True})
+    window = replace(forced_batch(box), **{name: None})
+    with pytest.raises(DataError) as caught:
+        model.start(window.part(slice(6)))
+    assert f"model.{name}=false" in str(caught.value.fix)
+
+
+OLD_OPTIONS = {"latent": 4, "layers": 1, "noise_std": 0.0}
+# Deviation of the output over the particles, by the code that knew neither option.
+OLD_DEVIATIONS = {
+    "gns": (0.0188042, 0.0116549),
+    "supergat": (0.0197916, 0.0126989),
+    "supergat-sd": (0.0198076, 0.0127191),
+    "gat": (0.0187936, 0.0129663),
+    "gatv2": (0.0197797, 0.0137934),
+    "pointnet": (0.0203832, 0.0136419),
+    "transformer": (0.0188321, 0.0131311),
+}
+
+
+@pytest.mark.parametrize("name", OLD_DEVIATIONS)
+def test_weights_without_the_options_give_the_numbers_that_they_gave(
+    name: str, tmp_path: Path
+) -> None:
+    """A header that lacks them means none, in a split with a force too; what drives the
+    flow changes no bit then.
+    """
+    entry = find(name)
+    model = entry.model.build(OLD_OPTIONS, info())
+    options = model.options.model_dump(mode="json")
+    del options["body_force"]
+    del options["obstacle"]
+    path = tmp_path / "weights.pt"
+    weights = filled(model.state_dict())
+    save(path, Checkpoint(baseline=name, options=options, info=info(), weights=weights))
+    restored = restore(load(path))
+    assert restored.forcing_seen == frozenset()
+
+    window = forced_batch(BOXES["walls"]).part(slice(6))
+    unforced = replace(window, body_force=None, obstacle=None)
+    assert torch.equal(rolled(restored, window, 3), rolled(restored, unforced, 3))
+
+    state = restored.start(window)
+    edges = restored.find_edges(state)
+    with torch.no_grad():
+        output, _ = restored.predict(state, edges)
+        # of features and edges that test_features.py compares with closed forms
+        node = restored.features(state.position, state.velocity, state.material)
+        edge = edge_features(state.position, edges, restored.radius, restored.box)
+        expected, _ = restored.network(node, edges, edge)
+    assert torch.equal(output, expected)
+    deviation = output.double().std(dim=0)
+    assert deviation.tolist() == pytest.approx(OLD_DEVIATIONS[name], rel=1e-3)
+
+
+def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return weights of the same names and shapes, filled by a formula."""
+    values = {}
+    for name, value in weights.items():
+        count = torch.arange(1.0, value.numel() + 1.0, dtype=torch.float64)
+        numbers = 0.5 * torch.cos(1.7 * count)
+        values[name] = numbers.reshape(value.shape).float()
+    return values
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("baseline", "split", "option"),
+    [
+        ("gns", "poiseuille", "body_force"),
+        ("gns", "cylinder", "obstacle"),
+        ("supergat", "cylinder", "obstacle"),
+    ],
+)
+def test_a_graph_network_is_trained_scored_and_exported(
+    baseline: str,
+    split: str,
+    option: str,
+    tiny_split: Callable[..., GenerationResult],
+    tmp_path: Path,
+) -> None:
+    """By the recipe of the split it sees what drives the flow, without a warning; the
+    file that an entry carries gives the same rollout.
+    """
+    root = tiny_split(split).root
+    steps = ("training.steps=3", "training.warmup_steps=1", "training.validate_every=0")
+    small = ("model.latent=8", "model.layers=1")
+    trained = train(
+        baseline,
+        split,
+        "tiny",
+        root=root,
+        output=tmp_path / "run",
+        settings=(*steps, *small),
+        device="cpu",
+    )
+    checkpoint = load(trained.weights)
+    assert checkpoint.options[option] is True
+    output = tmp_path / "predictions.nc"
+    predict(trained.weights, output, root=root)
+    assert not lagbench.validate(output, root=root, isolated=False).errors
+    card = lagbench.score(output, root=root)
+    assert card.skill is not None
+    assert np.isfinite(card.skill.value)
+
+    model = restore(checkpoint)
+    path = export_safetensors(model, tmp_path / "m.safetensors", baseline=baseline)
+    exported = restore(load(path))
+    size = locate(split, "tiny", root=root).size
+    scenario = size.path(root, size.subsets["test"][0])
+    given = scenario_batch(scenario, slice(0, size.task.input_frames))
+    (rollout,) = roll_out(model, given, 2)
+    (again,) = roll_out(exported, given, 2)
+    assert torch.equal(again.position, rollout.position)
+
+    with pytest.raises(UsageError) as caught:
+        predict(trained.weights, output, root=root, settings=(f"model.{option}=false",))
+    assert option in str(caught.value.got)
+
+
+@pytest.mark.slow
+def test_weights_that_see_no_force_go_on_without_it(
+    tiny_split: Callable[..., GenerationResult], tmp_path: Path
+) -> None:
+    """Weights of older trainings predict as before, and a training from them warns."""
+    root = tiny_split("poiseuille").root
+    settings = (
+        "training.steps=1",
+        "training.warmup_steps=0",
+        "training.validate_every=0",
+        "model.latent=8",
+        "model.layers=1",
+    )
+    with pytest.warns(UnseenForcingWarning):
+        blind = train(
+            "gns",
+            "poiseuille",
+            "tiny",
+            root=root,
+            output=tmp_path / "blind",
+            settings=(*settings, "model.body_force=false"),
+            device="cpu",
+        )
+    checkpoint = load(blind.weights)
+    options = dict(checkpoint.options)
+    del options["body_force"]
+    del options["obstacle"]
+    old = tmp_path / "old.pt"
+    save(old, replace(checkpoint, options=options))
+    with pytest.warns(UnseenForcingWarning):
+        further = train(
+            "gns",
+            "poiseuille",
+            "tiny",
+            root=root,
+            output=tmp_path / "further",
+            start=old,
+            settings=settings[:3],
+            device="cpu",
+        )
+    assert load(further.weights).options["body_force"] is False
+    with pytest.raises(UsageError) as caught:
+        train(
+            "gns",
+            "poiseuille",
+            "tiny",
+            root=root,
+            output=tmp_path / "more",
+            start=old,
+            settings=(*settings[:3], "model.body_force=true"),
+            device="cpu",
+        )
+    assert "body_force" in str(caught.value.got)
