@@ -8,6 +8,7 @@ import base64
 import io
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -44,6 +45,8 @@ FLAGS = (
     *("--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-pipe"),
 )
 
+MOST_SECONDS = 120.0
+"""A browser that says nothing for so long has failed [s]."""
 
 KEYS = {
     "Enter": (13, "\r"),
@@ -209,6 +212,9 @@ class Browser:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
+            readable, _, _ = select.select([self._in], [], [], MOST_SECONDS)
+            if not readable:
+                raise RuntimeError(f"the browser was silent for {MOST_SECONDS:.0f} s")
             piece = os.read(self._in.fileno(), 1 << 20)
             if not piece:
                 raise RuntimeError("the browser has gone")

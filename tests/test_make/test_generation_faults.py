@@ -165,7 +165,7 @@ def test_two_generations_at_once(
     with ThreadPoolExecutor() as threads:
         with dataset_lock(tmp_path, SPLIT, SIZE, 2):
             second = threads.submit(generate, SPLIT, SIZE, **options)
-            while not told:
+            while not told and not second.done():
                 time.sleep(0.01)
             shutil.copytree(
                 generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True
