@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -235,6 +236,20 @@ def _parse_axes(text: str) -> tuple[str, ...]:
     return tuple(text.split(","))
 
 
+def _next_steps(local_split: LocalSplit) -> Iterator[str]:
+    """Yield the commands that predict with a model of the user, and that train one."""
+    folder = shlex.quote(f"{local_split.folder}/")
+    network = "model: {latent: 32, layers: 2}, training: {steps: 2000}"
+    name = f"{local_split.name}/{local_split.size}"
+    recipe = f"{{format: 1, recipes: {{{name}: {{{network}}}}}}}"
+    file = shlex.quote(f"{local_split.name}-recipe.yaml")
+    yield f"  use it  lagbench template --split {folder} -o predictions.nc"
+    yield "  train   lagbench has no recipe for your data; begin with this one:"
+    yield f"          echo {shlex.quote(recipe)} > {file}"
+    yield f"          lagbench train --baseline gns --split {folder} --recipe {file}"
+    yield "          docs/exchange.md and docs/baselines.md say more about recipes"
+
+
 def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -> None:
     counts = []
     for subset, count in local_split.scenarios.items():
@@ -249,7 +264,7 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
         f"  task    {local_split.input_frames} frames given, "
         f"{local_split.horizon} to predict",
         f"  hash    {local_split.dataset_sha256}",
-        f"  use it  lagbench template --split {local_split.folder}/",
+        *_next_steps(local_split),
     ]
     print_result(local_split, lines, as_json=as_json, quiet=quiet)
     if not quiet:

@@ -7,7 +7,9 @@ from __future__ import annotations
 import functools
 import math
 import re
+import shlex
 import shutil
+import subprocess
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -759,6 +761,29 @@ def test_command(tmp_path: Path, run: Run) -> None:
     refused = run("generate", "--split", target)
     assert refused.exit_code == 2
     assert "cannot be simulated" in refused.output
+
+
+def test_the_next_steps_of_adopted_data_are_commands_that_work(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file of recipes that the hint writes has a recipe for the data."""
+    monkeypatch.chdir(tmp_path)
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    done = run(
+        "adopt", *paths, "-o", "my-data", "--radius", "0.1", "--frame-interval", "0.25"
+    )
+    commands = []
+    for line in done.stdout.splitlines():
+        words = line.split("lagbench ", 1)
+        if "echo " in line:
+            subprocess.run(line, shell=True, check=True)
+        elif len(words) == 2 and "--split" in line:
+            commands.append(shlex.split(words[1]))
+    template, train = commands
+    assert run(*template).exit_code == 0
+    assert (tmp_path / "predictions.nc").exists()
+    refused = run(*train, "--set", "training.steps=none")
+    assert "training.steps" in refused.stderr
 
 
 PLAIN: dict[str, Any] = {
