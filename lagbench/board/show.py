@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
@@ -27,7 +26,6 @@ from .entry import EntryCost, Level
 from .model import Board, BoardRow, OnShift, ReferenceRow, Tab, Value
 
 NOTHING = "-"
-REMARK_WIDTH = 16  # the whole table fits a terminal of 80 characters
 
 
 def choose_data_sets(
@@ -254,11 +252,7 @@ def _format_row(
         row.id if wide else _format_name(tab, row),
         *values,
         seconds,
-        textwrap.fill(
-            ", ".join(_remarks_on(row, wide=wide)),
-            REMARK_WIDTH,
-            break_long_words=False,
-        ),
+        ", ".join(_remarks_on(row, wide=wide)),
     )
 
 

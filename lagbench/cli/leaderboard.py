@@ -58,6 +58,8 @@ from .output import (
 from .progress import progress_bar
 from .solver_bench import bench_apart
 
+REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
+
 
 def build_command(
     board: BoardOption = DEFAULT_BOARD,
@@ -481,7 +483,11 @@ def show_command(
         print_json(to_plain(model))
         return
 
-    print_tables(tables(model, metric or (), wide=wide), is_narrow=True)
+    print_tables(
+        tables(model, metric or (), wide=wide),
+        is_narrow=True,
+        last_column=REMARK_WIDTH,
+    )
     if model.tabs:
         return
     if data_sets:

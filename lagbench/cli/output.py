@@ -103,17 +103,24 @@ def print_errors(result: ValidationResult) -> None:
         typer.echo("\n".join(lines), err=True)
 
 
-def split_table(table: Table, width: int = WIDTH, *, gap: int = GAP) -> Iterator[Table]:
+def split_table(
+    table: Table,
+    width: int = WIDTH,
+    *,
+    gap: int = GAP,
+    last_column: int = LAST_COLUMN,
+) -> Iterator[Table]:
     """Yield a table in blocks that are no wider than a width.
 
-    Columns have so many spaces between them as ``gap`` says.
+    Columns have so many spaces between them as ``gap`` says. The last column may shrink
+    to ``last_column`` characters.
 
     Each block begins with the key columns, which say what a row is. The first block has
     the title.
     """
     columns = list(zip(table.columns, *table.rows, strict=True))
     column_widths = [_column_width(column) for column in columns]
-    column_widths[-1] = min(column_widths[-1], LAST_COLUMN)
+    column_widths[-1] = min(column_widths[-1], last_column)
     key_width = sum(column_widths[: table.keys]) + gap * table.keys
 
     # numbers of the columns of each block, without the key columns
@@ -144,12 +151,20 @@ def _column_width(cells: Iterable[str]) -> int:
     return max(len(line) for line in lines)
 
 
-def print_tables(tables: Iterable[Table], *, is_narrow: bool = False) -> None:
+def print_tables(
+    tables: Iterable[Table], *, is_narrow: bool = False, last_column: int = LAST_COLUMN
+) -> None:
     """Print tables, each in blocks that fit."""
     gap = NARROW_GAP if is_narrow else GAP
     for table in tables:
-        for block in split_table(table, gap=gap):
-            print_table(block.title, block.columns, block.rows, is_narrow=is_narrow)
+        for block in split_table(table, gap=gap, last_column=last_column):
+            print_table(
+                block.title,
+                block.columns,
+                block.rows,
+                is_narrow=is_narrow,
+                last_column=last_column,
+            )
 
 
 def print_table(
@@ -158,10 +173,12 @@ def print_table(
     rows: Iterable[Sequence[object]],
     *,
     is_narrow: bool = False,
+    last_column: int = LAST_COLUMN,
 ) -> None:
     """Print a table on stdout.
 
-    Only the last column wraps. Columns of numbers are set flush right. A narrow table
+    Only the last column wraps: it takes the width that is left, but ``last_column``
+    characters at least. Columns of numbers are set flush right. A narrow table
     has two spaces between columns instead of three.
     """
     cells = [[str(cell) for cell in row] for row in rows]
@@ -189,7 +206,9 @@ def print_table(
 
     # On a narrow terminal long lines run on to the next: a number cut short would be
     # worse.
-    width = max(_output_width(), _least_width(columns, cells))
+    gap = NARROW_GAP if is_narrow else GAP
+    least_width = _least_width(columns, cells, gap=gap, last_column=last_column)
+    width = max(_output_width(), least_width)
     Console(width=width).print(table, "")
 
 
@@ -201,12 +220,18 @@ def _output_width() -> int:
     return PIPE_WIDTH
 
 
-def _least_width(columns: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+def _least_width(
+    columns: Sequence[str],
+    cells: Sequence[Sequence[str]],
+    *,
+    gap: int,
+    last_column: int,
+) -> int:
     widths = []
     for column in zip(columns, *cells, strict=True):
         widths.append(max(map(len, column)))
-    widths[-1] = min(widths[-1], LAST_COLUMN)
-    return sum(widths) + GAP * len(widths)
+    widths[-1] = min(widths[-1], last_column)
+    return sum(widths) + gap * len(widths)
 
 
 def _to_plain(value: object) -> object:

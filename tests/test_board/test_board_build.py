@@ -448,8 +448,7 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
     assert damped[0] == str(rank)
     assert damped[5] == "0.5"
     for row in table.rows:
-        lines = row[-1].split("\n")
-        assert max(map(len, lines)) <= 17
+        assert "\n" not in row[-1]
     (wide,) = tables(board, wide=True)
     wide_rows = {row[1]: row for row in wide.rows}
     score = wide_rows["damped"][3]

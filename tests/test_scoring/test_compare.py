@@ -857,6 +857,50 @@ def test_wide_tables_come_in_blocks() -> None:
     assert tuple(second_row) == rows[1][1:]
 
 
+REMARK = "reproduced, 2 of 20 scenarios, hybrid"
+
+
+@pytest.fixture
+def print_remarks(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[[int, int], list[str]]:
+    """A function that prints columns and a remark on a terminal, and returns lines."""
+
+    def print_on_terminal(width: int, columns: int) -> list[str]:
+        monkeypatch.setenv("COLUMNS", str(width))
+        is_terminal = property(lambda _: True)
+        monkeypatch.setattr("rich.console.Console.is_terminal", is_terminal)
+        names = [f"column-{number}" for number in range(columns)]
+        row = ("gns", *(["1.0"] * columns), REMARK)
+        table = Table("", ("row", *names, "remarks"), (row,))
+        output.print_tables([table], is_narrow=True, last_column=16)
+        printed = capsys.readouterr().out
+        return re.sub(r"\x1b\[[0-9;]*m", "", printed).splitlines()
+
+    return print_on_terminal
+
+
+@pytest.mark.parametrize(
+    ("width", "columns"),
+    [(80, 2), (120, 5), (80, 6)],
+)
+def test_a_remark_takes_the_width_that_is_left(
+    width: int, columns: int, print_remarks: Callable[[int, int], list[str]]
+) -> None:
+    """It stands on one line where there is room, also in a block of its own."""
+    lines = print_remarks(width, columns)
+    assert any(REMARK in line for line in lines)
+    assert max(map(len, lines)) <= width
+
+
+def test_a_remark_wraps_where_little_room_is_left(
+    print_remarks: Callable[[int, int], list[str]],
+) -> None:
+    lines = print_remarks(80, 5)
+    assert any("reproduced, 2 of" in line for line in lines)
+    assert max(map(len, lines)) <= 80
+
+
 @pytest.mark.filterwarnings("default:package mine")
 def test_metrics_that_cannot_be_loaded(
     run: Callable[..., Result],
