@@ -35,7 +35,7 @@ def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
             labels.append(str(getattr(header, name)))
         _require_equal(name, labels)
     provenances = [header.provenance for header in headers]
-    _require_equal("training", _shared_trainings(provenances))
+    _require_equal("training", _different_trainings(provenances))
 
     seeds = tuple(header.seed for header in headers)
     for seed in seeds:
@@ -77,22 +77,23 @@ def _require_equal(name: str, values: Sequence[str]) -> None:
     )
 
 
-def _shared_trainings(
+def _different_trainings(
     provenances: Sequence[TrainingProvenance | None],
 ) -> list[str]:
-    """Return in words the part of each training that seeds of a method share.
+    """Return the trainings in words, one for all that may be seeds of one method.
 
     Empty where no training is known as data: words of people are not compared.
     """
     if not any(provenances):
         return []
-    trainings = []
+    trainings: dict[str, str] = {}
     for provenance in provenances:
-        if provenance is None:
-            trainings.append("a training in words")
-        else:
-            trainings.append(provenance.shared_by_seeds().describe())
-    return trainings
+        shared = whole = "a training in words"
+        if provenance is not None:
+            shared = provenance.shared_by_seeds().describe()
+            whole = provenance.describe()
+        trainings.setdefault(shared, whole)
+    return list(trainings.values())
 
 
 def require_extendable(
@@ -211,9 +212,9 @@ def _labels_to_compare(
     if "parameters" not in meta.model_fields_set and header.parameters is not None:
         yield "parameters", entry.parameters, header.parameters
     if "training" not in meta.model_fields_set:
-        trainings = _shared_trainings([entry.provenance, header.provenance])
-        if trainings:
-            yield "training", trainings[0], trainings[1]
+        trainings = _different_trainings([entry.provenance, header.provenance])
+        if len(trainings) > 1:
+            yield "training", *trainings
 
 
 def _format_seeds(seeds: Iterable[int | None]) -> str:

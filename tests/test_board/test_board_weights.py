@@ -794,3 +794,25 @@ def test_each_seed_has_its_own_step_and_start(
     assert entry.name == "My model"
     assert entry.command == "make both"
     assert len(entry.predictions) == 2
+
+
+def test_trainings_that_differ_are_named_with_their_steps(own: BoardBench) -> None:
+    """Two recipes are refused, and each is shown as its file states it."""
+    trainings = [
+        "cavity tiny train, recipe cavity/tiny, step 6",
+        "cavity tiny train, recipe cavity/tiny-long, step 8",
+    ]
+    paths = []
+    for seed, (method, training) in enumerate(
+        zip((nearer, still), trainings, strict=True)
+    ):
+        path = own.predict(method, "mine", seed=seed, training=training)
+        paths.append(path)
+    with pytest.raises(UsageError) as together:
+        own.submit(*paths)
+    own.submit(paths[0])
+    with pytest.raises(UsageError) as added:
+        own.submit(paths[1], add=True)
+    for training in trainings:
+        assert training in str(together.value)
+        assert training in str(added.value)
