@@ -584,7 +584,12 @@ def _make_row(
     references: Sequence[ReferenceScores],
     solver_time: float | None,
 ) -> BoardRow:
-    against = _against_classical(method, references, verified, solver_time=solver_time)
+    costs = _compare_costs(method, references, verified, solver_time=solver_time)
+    against = None
+    is_cheapest = False
+    if costs is not None:
+        against = _against_classical(method, references, costs)
+        is_cheapest = costs.method < min(costs.solvers.values())
     rank = None
     is_tied = False
     p = math.nan
@@ -606,6 +611,7 @@ def _make_row(
         solver=None if against is None else against.reference,
         values=method.values,
         losses=method.losses,
+        is_cheapest=is_cheapest,
         seed_means=tuple(seed.mean for seed in method.seeds),
         curves=method.curves,
         energy=method.energy,
@@ -635,14 +641,22 @@ def _naive_scores(
     return scores
 
 
-def _against_classical(
+@dataclass(frozen=True, kw_only=True)
+class ComparedCosts:
+    """What a frame costs a method and the classical solvers, on one machine [s]."""
+
+    method: float
+    solvers: Mapping[str, float]  # by name; those with a score, at least one
+
+
+def _compare_costs(
     method: ScoredMethod,
     references: Sequence[ReferenceScores],
     verified: Verification | None,
     *,
     solver_time: float | None,
-) -> AgainstClassical | None:
-    """Return the score over that of the best classical solver that costs no more.
+) -> ComparedCosts | None:
+    """Return the costs of a method and of the classical solvers on one machine.
 
     Costs that we measured in one run are compared as they are; a cost that the entry
     states is brought to the machine of the references by the time of our solver on
@@ -650,30 +664,48 @@ def _against_classical(
     """
     if not method.is_current:
         return None
+    solvers = _classical(references, method.ranking)
     costs = {}
-    solvers = {}
-    for reference in references:
-        if reference.name in CLASSICAL and method.ranking in reference.scores:
-            solvers[reference.name] = reference.scores[method.ranking]
-            costs[reference.name] = reference.seconds_per_frame
+    for name, reference in solvers.items():
+        if not math.isnan(reference.seconds_per_frame):
+            costs[name] = reference.seconds_per_frame
     seconds = None
     if verified is not None and verified.cost is not None and verified.cost.classical:
         seconds = verified.cost.seconds_per_frame
-        costs = {**verified.cost.classical}
+        timed = verified.cost.classical
+        costs = {name: timed[name] for name in solvers if name in timed}
     elif method.entry.cost is not None:
         seconds = seconds_where_measured(
             seconds_per_frame=method.entry.cost.seconds_per_frame,
             solver_seconds=method.entry.cost.solver_seconds_per_frame,
             solver_seconds_here=solver_time,
         )
-    if seconds is None:
+    if seconds is None or not costs:
         return None
-    timed_solvers = {}
-    for name, score in solvers.items():
-        if name in costs:
-            timed_solvers[name] = score
+    return ComparedCosts(method=seconds, solvers=costs)
+
+
+def _classical(
+    references: Sequence[ReferenceScores], ranking: str
+) -> dict[str, ReferenceScores]:
+    """Return the classical solvers that have a score in the ranking metric, by name."""
+    solvers = {}
+    for reference in references:
+        if reference.name in CLASSICAL and ranking in reference.scores:
+            solvers[reference.name] = reference
+    return solvers
+
+
+def _against_classical(
+    method: ScoredMethod, references: Sequence[ReferenceScores], costs: ComparedCosts
+) -> AgainstClassical | None:
+    """Return the score over that of the best classical solver that costs no more."""
+    scores = {}
+    for name, reference in _classical(references, method.ranking).items():
+        if name in costs.solvers:
+            scores[name] = reference.scores[method.ranking]
     return compute_against_classical(
-        method.seeds, timed_solvers, seconds=costs, seconds_per_frame=seconds
+        method.seeds, scores, seconds=costs.solvers, seconds_per_frame=costs.method
     )
 
 

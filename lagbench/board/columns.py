@@ -329,8 +329,8 @@ ENTRY_COLUMNS = (
         key="cost_source",
         label="time taken by",
         form="text",
-        meaning="Measured: we timed all rows in one run on one core. Self-reported: "
-        "the submitter states it.",
+        meaning="Measured: we timed it on one core, an entry in one run with the "
+        "simulator and the classical solvers. Self-reported: the submitter states it.",
         read=source_of_cost,
     ),
     Column(

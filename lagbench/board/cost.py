@@ -1,9 +1,10 @@
-"""Accuracy against cost: time of a frame and error of entries, references, solver.
+"""Accuracy against cost: time of a frame and error of entries, references, simulator.
 
-Both axes are logarithmic. Costs of reference predictors and solver are processor time
-on one core of the machine that measured them; an entry's own time is brought there by
-its speed-up over the solver, where it states one. The figure needs no script; dots are
-links or can be focused, and say in words what they show.
+Both axes are logarithmic. Costs of reference predictors and simulator are processor
+time on one core of the machine that measured them. The time of an entry, measured or
+stated, is brought there by its speed-up over the simulator, where one is known. The
+figure needs no script; dots are links or can be focused, and say in words what they
+show.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
 from lagbench.references.table import REFERENCES
 
+from .columns import cost_of
 from .entry import EntryCost
 from .model import Board, Tab
 
@@ -74,10 +76,10 @@ class CostPoint:
 
 
 def points_of(tab: Tab) -> list[CostPoint]:
-    """Return active entries that state a cost, then reference predictors."""
+    """Return active entries of known cost, then reference predictors."""
     points = []
     for row in tab.rows:
-        cost = row.entry.cost
+        cost = cost_of(row)
         if not row.active or cost is None or tab.ranking not in row.values:
             continue
         point = CostPoint(
@@ -148,7 +150,7 @@ def draw(
         height=HEIGHT,
     )
     if solver:
-        plot.upright(solver, "the solver itself")
+        plot.upright(solver, "the simulator")
     front = find_front(points)
     front_times = [point.seconds for point in front]
     front_errors = [point.error for point in front]
@@ -164,7 +166,7 @@ def draw(
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:
-        description += f"; the solver itself takes {text(solver)} s per frame"
+        description += f"; the simulator takes {text(solver)} s per frame"
     return plot.svg(title, f"{description}.")
 
 
@@ -199,13 +201,13 @@ def cost_figure(tab: Tab) -> Markup:
         "Further left is cheaper, further down more accurate; the line joins the "
         "methods that no other beats in both. The full grey line joins the classical "
         "solvers: an entry below it is more accurate than every solver of its cost. "
-        "The upright line is the time of the solver itself. Costs of entries are "
-        "self-reported, brought to the machine of "
-        "the solver by their speed-up."
+        "The upright line is the time of the simulator that made the data. Costs of "
+        "entries are measured or self-reported, as the table says, and brought to the "
+        "machine of the reference predictors by the simulator's time on both."
     )
     if any(point.kind == "classical" for point in points):
         caption += " Filled grey dots are classical solvers, hollow ones naive."
-    silent_count = sum(row.active and row.entry.cost is None for row in tab.rows)
+    silent_count = sum(row.active and cost_of(row) is None for row in tab.rows)
     if silent_count == 1:
         caption += " 1 entry states no cost."
     elif silent_count:

@@ -98,6 +98,12 @@ class ReferenceRow:
     cost: EntryCost | None = None
     on_shift: OnShift | None = None
 
+    @property
+    def is_slow(self) -> bool:
+        """Whether it is a solver that costs more than the simulator of the data."""
+        speed_up = None if self.cost is None else self.cost.speed_up
+        return self.kind is Kind.CLASSICAL and speed_up is not None and speed_up < 1.0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardRow:
@@ -130,6 +136,8 @@ class BoardRow:
     on_shift: OnShift | None = None  # of the seeds whose models lie on the board
     # ranking metric, NaN where undefined, shape [seed, scenario]
     losses: Floats | None = None
+    # whether every classical solver costs more per frame; False where a cost is unknown
+    is_cheapest: bool = False
 
     @property
     def id(self) -> str:

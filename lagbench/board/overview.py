@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +11,32 @@ from lagbench.figures.html import text
 from lagbench.metrics.significance import rank_ranges
 from lagbench.references.predictor import Kind
 
-from .model import Board, BoardRow, Floats, Tab
+from .columns import cost_of
+from .model import Board, BoardRow, Floats, ReferenceRow, Tab, Value
 
 LEARNS = (Kind.LEARNED, Kind.HYBRID)
 """Kinds of entries of which the board asks whether learning pays."""
+
+
+class Verdict(enum.Enum):
+    """Whether the most accurate model of a data set beats the solvers of its cost."""
+
+    PAYS = enum.auto()  # the interval of the ratio lies below 1
+    OPEN = enum.auto()  # it contains 1, or there is none
+    DOES_NOT_PAY = enum.auto()
+    NO_SOLVER = enum.auto()  # every classical solver costs more
+
+
+SUMMARIES = {
+    Verdict.PAYS: "Learning pays on {names}: the most accurate model has less error "
+    "than the best classical solver that costs no more per frame.",
+    Verdict.OPEN: "Whether learning pays is open on {names}.",
+    Verdict.DOES_NOT_PAY: "Learning does not pay on {names}: a classical solver that "
+    "costs no more has less error than the most accurate model.",
+    Verdict.NO_SOLVER: "No classical solver is as cheap as the most accurate model on "
+    "{names}.",
+}
+"""What is said of the data sets of a size by verdict, in this order."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,9 +77,17 @@ class SizeOverview:
     # those with a place by mean skill; behind them those that did not run everything
     methods: tuple[MethodOverview, ...]
 
+    @property
+    def has_places(self) -> bool:
+        """Whether any method has a place."""
+        return any(method.rank is not None for method in self.methods)
+
 
 def make_overviews(board: Board) -> tuple[SizeOverview, ...]:
-    """Return an overview of each size that the board has."""
+    """Return an overview of each size that the board has.
+
+    Sizes at which a method has a place come first.
+    """
     tabs_by_size: dict[str, list[Tab]] = {}
     for tab in board.tabs:
         tabs_by_size.setdefault(tab.size.name, []).append(tab)
@@ -66,6 +97,7 @@ def make_overviews(board: Board) -> tuple[SizeOverview, ...]:
         overviews.append(
             SizeOverview(size=size, tabs=tuple(tabs), methods=tuple(methods))
         )
+    overviews.sort(key=lambda overview: not overview.has_places)
     return tuple(overviews)
 
 
@@ -182,80 +214,250 @@ def _relative_losses(
     return losses
 
 
-def conclude(tab: Tab) -> str:
-    """Return the sentence about whether learning pays; empty where nothing tells.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Conclusion:
+    """What a data set says about learning: how its most accurate model compares."""
 
-    It speaks of all active entries that learn, variants too.
+    tab: Tab
+    row: BoardRow  # the most accurate model: an active entry that learns, of known cost
+    verdict: Verdict
+
+    @property
+    def measure(self) -> str:
+        """The ratio in words, as in "0.86×"; empty where there is none."""
+        if self.row.against_classical is None:
+            return ""
+        return _format_ratio(self.row.against_classical)
+
+
+def judge(tab: Tab) -> Conclusion | None:
+    """Return what a data set says about learning; None where no cost is known.
+
+    The most accurate model decides, as in docs/results.md. Variants count; entries
+    whose weights fail a gate take part in no claim.
     """
     best = None
-    for row in tab.rows:
-        ratio = row.against_classical
-        if not row.active or row.entry.kind not in LEARNS or ratio is None:
+    for row in _models_of(tab):
+        if row.against_classical is None and not row.is_cheapest:
             continue
-        least = math.inf
-        if best is not None and best.against_classical is not None:
-            least = best.against_classical.mean
-        if ratio.mean < least:
+        if best is None or _error_of(row, tab) < _error_of(best, tab):
             best = row
-    name = f"{tab.size.split} {tab.size.name}"
-    if best is None or best.against_classical is None:
-        return ""
-    ratio = best.against_classical
-    measure = f"{text(ratio.mean, 2)}× the error of {best.solver}"
+    if best is None:
+        return None
+    return Conclusion(tab=tab, row=best, verdict=_verdict_on(best.against_classical))
+
+
+def _verdict_on(ratio: Value | None) -> Verdict:
+    """Return the verdict of a ratio; open where it has no interval."""
+    if ratio is None:
+        return Verdict.NO_SOLVER
+    if ratio.high < 1.0:
+        return Verdict.PAYS
     if ratio.low > 1.0:
-        return (
-            f"Learning does not pay on {name}: no learned entry is more accurate than "
-            "the best classical solver that costs no more per frame (nearest: "
-            f"{best.entry.name}, {measure})."
-        )
-    if ratio.high >= 1.0:
-        return (
-            f"Whether learning pays on {name} is open: {best.entry.name} has "
-            f"{measure}, the best classical solver that costs no more per frame, and "
-            "the interval contains 1."
-        )
+        return Verdict.DOES_NOT_PAY
+    return Verdict.OPEN
+
+
+def _models_of(tab: Tab) -> list[BoardRow]:
+    """Return the active entries that learn and fail no gate."""
+    models = []
+    for row in tab.rows:
+        learns = row.entry.kind in LEARNS
+        if row.active and learns and not row.failed_gates:
+            models.append(row)
+    return models
+
+
+def _error_of(row: BoardRow | ReferenceRow, tab: Tab) -> float:
+    """Return the mean of the ranking metric; infinite where there is none."""
+    if tab.ranking not in row.values or math.isnan(row.values[tab.ranking].mean):
+        return math.inf
+    return row.values[tab.ranking].mean
+
+
+def _format_ratio(ratio: Value) -> str:
+    return f"{text(ratio.mean, 2)}×"
+
+
+def _compare(row: BoardRow, ratio: Value) -> str:
+    """Return a ratio with its interval and its solver, in words."""
+    interval = ""
+    if not math.isnan(ratio.low + ratio.high):
+        interval = f" (95 %: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
     return (
-        f"Learning pays on {name}: {best.entry.name} has {measure}, the best classical "
-        "solver that costs no more per frame."
+        f"{_format_ratio(ratio)}{interval} the error of {row.solver}, the best "
+        "classical solver that costs no more per frame"
     )
 
 
-def summarise(overview: SizeOverview) -> str:
-    """Return who leads over all data sets, and by how much; empty without a leader."""
+def conclude(tab: Tab) -> str:
+    """Return the sentences about whether learning pays; empty where nothing tells."""
+    conclusion = judge(tab)
+    if conclusion is None:
+        return ""
+    data_set = f"{tab.size.split} {tab.size.name}"
+    row = conclusion.row
+    model = f"{row.entry.name}, the most accurate model"
+    if any(_error_of(other, tab) < _error_of(row, tab) for other in _models_of(tab)):
+        model += " of known cost"
+    ratio = row.against_classical
+    if ratio is None:
+        sentences = [
+            f"On {data_set} no classical solver is as cheap as {model}.",
+            *_place_among_solvers(row, tab),
+        ]
+    else:
+        sentences = [_state_verdict(conclusion.verdict, data_set, model, row, ratio)]
+    if conclusion.verdict is Verdict.PAYS:
+        cost = cost_of(row)
+        if cost is not None and cost.speed_up is not None and cost.speed_up < 1.0:
+            sentences.append(
+                f"A frame costs it {text(1.0 / cost.speed_up, 2)} times as much as it "
+                "costs the simulator that made the data."
+            )
+    else:
+        sentences += _name_exception(tab)
+    return " ".join(sentences)
+
+
+def _state_verdict(
+    verdict: Verdict, data_set: str, model: str, row: BoardRow, ratio: Value
+) -> str:
+    comparison = f"{model}, has {_compare(row, ratio)}"
+    if verdict is Verdict.PAYS:
+        return f"Learning pays on {data_set}: {comparison}."
+    if verdict is Verdict.DOES_NOT_PAY:
+        return f"Learning does not pay on {data_set}: {comparison}."
+    reason = "the interval contains 1"
+    if math.isnan(ratio.low + ratio.high):
+        reason = "there are too few scenarios for an interval"
+    return f"Whether learning pays on {data_set} is open: {comparison}, and {reason}."
+
+
+def _place_among_solvers(row: BoardRow, tab: Tab) -> list[str]:
+    """Return which classical solvers have a greater or less mean error than a model."""
+    behind = []
+    ahead = []
+    for reference in sorted(tab.references, key=lambda other: _error_of(other, tab)):
+        if reference.kind is not Kind.CLASSICAL or tab.ranking not in reference.values:
+            continue
+        if _error_of(reference, tab) > _error_of(row, tab):
+            behind.append(reference.name)
+        else:
+            ahead.append(reference.name)
+    sentences = []
+    if behind:
+        sentences.append(f"Its mean error is less than that of {join_names(behind)}.")
+    if ahead:
+        sentences.append(f"That of {join_names(ahead)} is less than the model's.")
+    return sentences
+
+
+def _name_exception(tab: Tab) -> list[str]:
+    """Return the model that beats the solvers of its cost, where another one decides.
+
+    Of several the most accurate one.
+    """
+    best = None
+    for row in _models_of(tab):
+        if _verdict_on(row.against_classical) is not Verdict.PAYS:
+            continue
+        if best is None or _error_of(row, tab) < _error_of(best, tab):
+            best = row
+    if best is None or best.against_classical is None:
+        return []
+    comparison = _compare(best, best.against_classical)
+    return [f"Yet {best.entry.name}, which is less accurate, has {comparison}."]
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names in words.
+
+    >>> join_names(["cavity", "fluid", "cylinder"])
+    'cavity, fluid and cylinder'
+    """
+    if len(names) == 1:
+        return names[0]
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def summarise(overview: SizeOverview) -> list[str]:
+    """Return who leads over all data sets of a size, and where learning pays."""
+    sentences = [_name_leader(overview)]
+    data_sets: dict[Verdict, list[str]] = {}
+    for tab in overview.tabs:
+        conclusion = judge(tab)
+        if conclusion is None:
+            continue
+        data_set = tab.size.split
+        if conclusion.measure:
+            data_set += f" ({conclusion.measure})"
+        data_sets.setdefault(conclusion.verdict, []).append(data_set)
+    for verdict, words_of_verdict in SUMMARIES.items():
+        if verdict in data_sets:
+            names = join_names(data_sets[verdict])
+            sentences.append(words_of_verdict.format(names=names))
+    return sentences
+
+
+def _name_leader(overview: SizeOverview) -> str:
+    """Return who leads over all data sets of a size, and by how much."""
     ranked = []
     for method in overview.methods:
         if method.rank is not None:
             ranked.append(method)
+    data_sets = count_data_sets(overview)
     if not ranked:
-        return ""
+        return f"No method has a skill on {data_sets} of size {overview.size}."
     leader = ranked[0]
+    skill = text(leader.mean_skill)
+    if len(ranked) == 1:
+        return (
+            f"{leader.name} is the only method with a skill on {data_sets}. Its mean "
+            f"skill is {skill}."
+        )
+    second = ranked[1]
     sentence = (
-        f"{leader.name} leads over {_count_sets(len(overview.tabs))} with a mean skill "
-        f"of {text(leader.mean_skill)}"
+        f"{leader.name} has the greatest mean skill over {data_sets}: {skill}. Next is "
+        f"{second.name} with {text(second.mean_skill)}."
     )
-    if len(ranked) > 1:
-        second = ranked[1]
-        sentence += f"; next is {second.name} with {text(second.mean_skill)}"
-    return f"{sentence}."
+    if leader.rank_range is not None and leader.rank_range[1] > 1:
+        sentence += (
+            f" Drawn again, {leader.name} has rank {leader.rank_range[0]} to "
+            f"{leader.rank_range[1]} (95 %)."
+        )
+    return sentence
 
 
-def _count_sets(count: int) -> str:
-    if count == 1:
-        return "1 data set"
-    return f"{count} data sets"
+def count_data_sets(overview: SizeOverview) -> str:
+    """Return how many data sets a size has, in words."""
+    count = len(overview.tabs)
+    return "the only data set" if count == 1 else f"all {count} data sets"
 
 
-def find_hero(board: Board) -> tuple[Tab, BoardRow] | None:
-    """Return the data set whose film stands first, and its best entry.
+def find_hero(overviews: Sequence[SizeOverview]) -> tuple[Tab, BoardRow] | None:
+    """Return the data set whose film stands first, and the row of it.
 
-    Data sets whose best entry has skill come first, then those with the most materials,
-    then those with the most skill. Variants count.
+    The film is of the first method of the first table that has one: a row in sight. Of
+    its data sets those with skill come first, then those with the most materials, then
+    those with the most skill.
     """
+    for overview in overviews:
+        for method in overview.methods:
+            film = _find_film(method, overview.tabs)
+            if film is not None:
+                return film
+    return None
+
+
+def _find_film(
+    method: MethodOverview, tabs: Sequence[Tab]
+) -> tuple[Tab, BoardRow] | None:
     best: tuple[Tab, BoardRow] | None = None
     most = (False, 0, -math.inf)
-    for tab in board.tabs:
-        row = _find_best(tab)
-        if row is None or tab.truth is None:
+    for tab in tabs:
+        row = method.rows.get(tab.id)
+        if row is None or row.pictures is None or tab.truth is None:
             continue
         materials = len(set(tab.truth.material.tolist()))
         skill = -math.inf
@@ -265,18 +467,4 @@ def find_hero(board: Board) -> tuple[Tab, BoardRow] | None:
         if best is None or merit > most:
             most = merit
             best = tab, row
-    return best
-
-
-def _find_best(tab: Tab) -> BoardRow | None:
-    """Return the active row with the least error that has pictures."""
-    best = None
-    least = math.inf
-    for row in tab.rows:
-        if not row.active or row.pictures is None or tab.ranking not in row.values:
-            continue
-        error = row.values[tab.ranking].mean
-        if best is None or error < least:
-            best = row
-            least = error
     return best

@@ -42,18 +42,20 @@ from .columns import (
 from .cost import cost_figure
 from .encoding import decode, encode
 from .entry import Level
-from .model import Board, BoardRow, Tab
+from .model import Board, BoardRow, ReferenceRow, Tab
 from .overview import (
     MethodOverview,
     SizeOverview,
     conclude,
+    count_data_sets,
     find_hero,
+    join_names,
     make_overviews,
     summarise,
 )
 from .page_data import page_data
 from .table import draw_table, fold_button
-from .table_view import LABELS, TableView, make_table
+from .table_view import LABELS, SLOW, TableView, make_table
 
 SCRIPTS = (
     "data",
@@ -89,11 +91,16 @@ is the one that mkdocs makes in a clone. Links to missing files are left out.
 """
 
 TAKE_PART = """\
-lagbench generate --split cavity --size mini       # the data, bit for bit
-lagbench predict weights.pt -o predictions.nc      # or write the file yourself
-lagbench submit predictions.nc --from meta.yaml    # scores, and adds the entry
-lagbench leaderboard check --base origin/main      # what the pull request must pass
-lagbench leaderboard reproduce SPLIT/SIZE/METHOD   # anybody can repeat a score"""
+# the data, bit for bit
+lagbench generate --split cavity --size mini
+# or write the file yourself
+lagbench predict weights.pt -o predictions.nc
+# scores, and adds the entry
+lagbench submit predictions.nc --from meta.yaml
+# what the pull request must pass
+lagbench leaderboard check --base origin/main
+# anybody can repeat a score
+lagbench leaderboard reproduce SPLIT/SIZE/METHOD"""
 """Commands by which a reader takes part."""
 
 FOOT = (
@@ -103,12 +110,21 @@ FOOT = (
 )
 
 OVERVIEW_WORDS = (
-    "Size mini is what a laptop makes in minutes, full is larger. Skill is 0 for the "
-    "best naive baseline, which learns nothing, and 1 for a perfect prediction. “0.9× "
-    "classical” is the error beside that of the best classical solver that costs no "
-    "more per frame: below 1, learning pays. A rank such as 2–4 names the places that "
-    "a method takes when the test scenarios are drawn again (95 %). Variants of a "
-    "method are folded behind it, without a rank."
+    "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
+    "prediction. “0.9×” is the error beside that of the best classical solver that "
+    "costs no more per frame: below 1, learning pays. The question is open where the "
+    "95 % interval contains 1. Ranks count entries only: classical solvers and "
+    "baselines have none."
+)
+
+OVERVIEW_NOTES = (
+    "Size mini is what a laptop makes in minutes, full is larger.",
+    "A cell has the skill, the rank on this data set, and the error beside that of the "
+    "best classical solver that costs no more per frame. The last one is missing where "
+    "the cost is unknown, or every classical solver costs more.",
+    "A rank such as 2–4 names the places that a method takes when the test scenarios "
+    "are drawn again (95 %). Variants of a method are folded behind it, without a "
+    "rank.",
 )
 
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
@@ -127,12 +143,14 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     views = []
     for tab in board.tabs:
         views.append(make_table(tab, board.metrics))
-    data, arrays = page_data(views, find_hero(board))
+    overviews = make_overviews(board)
+    hero = find_hero(overviews)
+    data, arrays = page_data(views, hero)
 
     link_tags = []
     for label, address in links.items():
         link_tags.append(tag("a", label, href=address))
-    sections = [draw_overview(board)]
+    sections = [draw_overview(overviews)]
     for view in views:
         sections.append(draw_section(view, board.metrics))
     foot = []
@@ -145,7 +163,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
         "script": script,
         "links": join(link_tags),
         "intro": draw_intro(board),
-        "hero": draw_hero(board),
+        "hero": draw_hero() if hero else Markup(""),
         "navigation": draw_navigation(board),
         "sections": join(sections, "\n"),
         "empty": draw_empty(board),
@@ -297,15 +315,13 @@ def _count(count: int, singular: str, plural: str) -> str:
     return f"{count} {plural}"
 
 
-def draw_hero(board: Board) -> Markup:
+def draw_hero() -> Markup:
     """Return the place of the film above the fold, which the script fills."""
-    if find_hero(board) is None:
-        return Markup("")
     return tag(
         "figure",
         id="hero",
         class_="scripted",
-        aria_label="The truth beside the leader",
+        aria_label="The truth beside a model",
     )
 
 
@@ -350,23 +366,21 @@ def draw_empty(board: Board) -> Markup:
     return tag("section", *parts, class_="empty", id="take-part")
 
 
-def draw_overview(board: Board) -> Markup:
+def draw_overview(overviews: Sequence[SizeOverview]) -> Markup:
     """Return one table per size: a row per method, by mean skill over all data sets."""
-    if not board.tabs:
+    if not overviews:
         return Markup("")
     parts = [
         tag("h2", "All data sets"),
         tag("p", OVERVIEW_WORDS, class_="facts"),
     ]
-    for overview in make_overviews(board):
+    for overview in overviews:
+        items = [tag("li", sentence) for sentence in summarise(overview)]
         parts.append(tag("h3", overview.size))
-        sentences = [summarise(overview)]
-        for tab in overview.tabs:
-            sentences.append(conclude(tab))
-        items = [tag("li", sentence) for sentence in sentences if sentence]
-        if items:
-            parts.append(tag("ul", *items, class_="verdicts"))
+        parts.append(tag("ul", *items, class_="verdicts"))
         parts.append(_overview_table(overview))
+    notes = [tag("p", note) for note in OVERVIEW_NOTES]
+    parts.append(tag("div", *notes, class_="notes"))
     return tag("section", *parts, id="overview", class_="tab")
 
 
@@ -392,10 +406,10 @@ def _overview_table(overview: SizeOverview) -> Markup:
             complete += lines
     bodies.append(tag("tbody", *complete))
     if incomplete:
-        words_of_group = "Not on all data sets, so without a place"
+        words_of_group = _explain_missing_places(overview)
         heading = tag(
             "th",
-            words_of_group,
+            tag("span", words_of_group),
             colspan=len(headings),
             scope="rowgroup",
             class_="group",
@@ -419,23 +433,23 @@ def _overview_table(overview: SizeOverview) -> Markup:
     )
 
 
+def _explain_missing_places(overview: SizeOverview) -> str:
+    """Return why the methods of the second group have no place."""
+    data_sets = count_data_sets(overview)
+    if overview.has_places:
+        return f"Without a place: not on {data_sets}"
+    return (
+        f"Nobody has a place yet: a place needs a skill on {data_sets} of this size. "
+        "The rank on one data set stands in its column."
+    )
+
+
 def _overview_lines(method: MethodOverview, overview: SizeOverview) -> list[Markup]:
     """Return the line of a method, and those of its variants, folded away."""
     lines = [_overview_line(method, overview)]
     for variant in method.variants:
         lines.append(_overview_line(variant, overview, variant_of=method.method))
     return lines
-
-
-def _name_some(names: Sequence[str]) -> str:
-    """Return names in words: of more than three the first two and how many follow.
-
-    >>> _name_some(["cavity", "fluid", "poiseuille", "cavity-3d"])
-    'cavity, fluid and 2 more'
-    """
-    if len(names) <= 3:
-        return ", ".join(names)
-    return f"{names[0]}, {names[1]} and {len(names) - 2} more"
 
 
 def _overview_line(
@@ -451,7 +465,11 @@ def _overview_line(
         button = fold_button(method.method, len(method.variants))
         name.append(button)
     if method.missing:
-        skill = tag("span", f"not on {_name_some(method.missing)}", class_="ci gaps")
+        data_set_count = len(overview.tabs)
+        present_count = data_set_count - len(method.missing)
+        share = f"on {present_count} of {data_set_count}"
+        title = f"not on {', '.join(method.missing)}"
+        skill = tag("span", share, class_="ci gaps", title=title)
     else:
         skill = tag("span", text(method.mean_skill), class_="n")
     cells = [
@@ -483,7 +501,7 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row.rank is not None:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
     if row.against_classical is not None:
-        remarks.append(f"{text(row.against_classical.mean, 2)}× classical")
+        remarks.append(f"{text(row.against_classical.mean, 2)}×")
     parts = []
     if row.skill is not None:
         parts.append(tag("span", text(row.skill.mean), class_="n"))
@@ -504,6 +522,7 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         aria_label="Scores",
         tabindex=0,
     )
+    conclusion = conclude(tab)
     notes = []
     for note in _notes(tab):
         notes.append(tag("p", note))
@@ -511,9 +530,10 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
         tag("p", _describe_task(tab, metrics), class_="facts"),
-        tag("p", conclude(tab), class_="verdict") if conclude(tab) else "",
+        tag("p", conclusion, class_="verdict") if conclusion else "",
         tag("ul", *_tiles(view, metrics), class_="tiles"),
         _tools(view),
+        tag("p", _describe_ranks(view), class_="facts"),
         table,
         tag("div", *notes, class_="notes"),
         tag("div", cost_figure(tab), class_="figures"),
@@ -536,6 +556,22 @@ def _describe_task(tab: Tab, metrics: Mapping[str, Metric]) -> str:
         f"{len(tab.frames)}. Ranked by {words(tab.ranking)} over the horizon, {better} "
         f"is better. Data set version {size.version}, SHA-256 {sha256[:12]}…"
     )
+
+
+def _describe_ranks(view: TableView) -> str:
+    """Return what has a rank, and which reference predictors stand before rank 1."""
+    ahead = []
+    for line in view.lines:
+        if isinstance(line.row, ReferenceRow):
+            ahead.append(line.name)
+        elif line.row.rank == 1:
+            break
+    else:
+        ahead = []
+    sentence = "Ranks count entries only. Shaded rows are reference predictors"
+    if not ahead:
+        return f"{sentence}, without a rank."
+    return f"{sentence}, without a rank: {join_names(ahead)} would stand before rank 1."
 
 
 def _tiles(view: TableView, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
@@ -680,6 +716,9 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         f"{claim} Shaded rows are reference predictors, never ranked: naive baselines, "
         "which predict without learning and without equations, and classical solvers."
     )
+    if any(reference.is_slow for reference in tab.references):
+        label, meaning = SLOW
+        yield join([tag("strong", label), ": ", meaning])
     yield escaped(
         "Mean over test scenarios and seeds; below it the 95 % interval, of both "
         "resampled together. ↓ lower, ↑ higher, ◎ closer to the perfect value is "
@@ -689,8 +728,10 @@ def _notes(tab: Tab) -> Iterator[Markup]:
     yield escaped(
         "Budget, parameters and hardware are self-reported: submitters state them and "
         "nobody computes them again. So are times, except where the column says "
-        "measured: then we timed all rows in one run on one core. A speed-up below 1× "
-        "means slower than the simulator that made the data."
+        "measured: then we timed the entry, the simulator that made the data and the "
+        "classical solvers in one run on one core, and “÷ classical” compares these "
+        "times. Those of the shaded rows are of another run. A speed-up below 1× means "
+        "slower than the simulator."
     )
     raised: set[str] = set()
     for row in tab.rows:

@@ -23,6 +23,7 @@ ARROWS = {
     Direction.NONE: "",
 }
 REPORTED = "Self-reported: stated by the submitter, computed again by nobody."
+REFERENCE_MEANING = "A reference predictor: ranks count entries only."
 REPORTED_MARK = "self\u2011reported"
 
 
@@ -43,7 +44,7 @@ def draw_table(view: TableView) -> Markup:
         _heading(
             "rank",
             tag("span", "#", class_="metric"),
-            "Best to worst rank by the ranking metric, in 95 % of the resamples",
+            "Best to worst rank among entries, in 95 % of the resamples",
             class_="rank",
         ),
         _heading(
@@ -109,8 +110,8 @@ def _draw_line(view: TableView, line: Line) -> Markup:
     if isinstance(row, ReferenceRow):
         return tag(
             "tr",
-            tag("td", "", class_="rank"),
-            _reference_heading(row),
+            tag("td", "ref.", class_="rank", title=REFERENCE_MEANING),
+            _reference_heading(line, row),
             *cells,
             class_="reference",
             data_reference=line.id,
@@ -176,11 +177,9 @@ def _draw_rank(row: BoardRow) -> Markup:
     return join([rank, tag("span", "≈", class_="tied", title=meaning)])
 
 
-def _reference_heading(row: ReferenceRow) -> Markup:
-    parts = [
-        tag("span", row.name, class_="name"),
-        tag("span", str(row.kind), class_="flag"),
-    ]
+def _reference_heading(line: Line, row: ReferenceRow) -> Markup:
+    parts = [tag("span", row.name, class_="name")]
+    parts += [_draw_chip(chip) for chip in line.chips]
     if row.definition:
         parts.append(tag("span", row.definition, class_="sub"))
     return tag("th", *parts, scope="row", class_="method")
@@ -203,7 +202,8 @@ def _entry_heading(tab: Tab, line: Line, row: BoardRow) -> Markup:
 
 
 def _draw_chip(chip: Chip) -> Markup:
-    return tag("span", chip.label, class_=f"flag {chip.kind}", title=chip.meaning)
+    class_ = f"flag {chip.kind}".strip()
+    return tag("span", chip.label, class_=class_, title=chip.meaning or None)
 
 
 def _draw_link(label: str, address: str) -> Markup:

@@ -65,6 +65,13 @@ LABELS: Mapping[str, tuple[str, str]] = {
 }
 """Label and meaning of flags and warnings on the page."""
 
+SLOW = (
+    "slower than simulator",
+    "A frame costs this solver more than the simulator that made the data. It shows "
+    "which error a solver reaches, and saves no time.",
+)
+"""Label and meaning of the mark beside a classical solver of a high cost."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
@@ -284,7 +291,12 @@ def describe_verification(verified: Verification) -> str:
 def _make_line(row: TableRow, place: int, cells: Mapping[str, Cell]) -> Line:
     if isinstance(row, ReferenceRow):
         return Line(
-            row=row, place=place, cells=cells, chips=(), byline=row.definition, links=()
+            row=row,
+            place=place,
+            cells=cells,
+            chips=tuple(_chips_of_reference(row)),
+            byline=row.definition,
+            links=(),
         )
     entry = row.entry
     parts = [", ".join(entry.authors), entry.affiliation]
@@ -317,6 +329,14 @@ def _links_of(entry: Entry) -> Iterator[tuple[str, str]]:
         if len(models) == 1:
             label = "weights"
         yield label, path.as_posix()
+
+
+def _chips_of_reference(row: ReferenceRow) -> Iterator[Chip]:
+    """Yield the marks beside the name of a reference predictor."""
+    yield Chip(kind="", label=str(row.kind), meaning="")
+    if row.is_slow:
+        label, meaning = SLOW
+        yield Chip(kind="", label=label, meaning=meaning)
 
 
 def chips_of(row: BoardRow) -> Iterator[Chip]:

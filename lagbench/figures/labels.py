@@ -13,8 +13,9 @@ from dataclasses import dataclass
 DOT_REACH = 7.0  # half the side of the square that a dot takes
 ASCENT = 11.0
 DESCENT = 3.0
-CAPITAL_WIDTH = 9.0
-LETTER_WIDTH = 6.4
+# of the largest size in which a style sheet writes labels
+CAPITAL_WIDTH = 10.0
+LETTER_WIDTH = 7.2
 
 # Shift of a label from the middle of its dot, and the share of it that lies to the
 # left. Labels above and below clear the dots that stand in one row with theirs.

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from lagbench.__main__ import app
 from lagbench.board.cost import CostPoint, draw, find_front, points_of
+from lagbench.board.entry import MeasuredCost, Verification
 from lagbench.board.model import Tab
 from lagbench.data.registry import load
 from lagbench.figures.chart import close_logarithmic
@@ -69,6 +70,18 @@ def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
             assert here[name] == pytest.approx(0.02 / speed_up)
     assert silent
     assert silent.isdisjoint(raw)
+
+
+def test_measured_costs_count_before_stated_ones(tab: Tab) -> None:
+    """The figure has the costs of the table."""
+    first_row, *others = tab.rows
+    measured = MeasuredCost.model_construct(
+        seconds_per_frame=0.5, machine="a machine", solver=0.25, classical={}
+    )
+    verified = Verification.model_construct(cost=measured, reproduced=(), blind=None)
+    row = replace(first_row, verified=verified)
+    with_measured = replace(tab, rows=(row, *others), solver_seconds=0.02)
+    assert seconds_by_name(with_measured)[row.entry.name] == pytest.approx(0.04)
 
 
 def test_the_front_holds_what_no_other_beats() -> None:
@@ -220,7 +233,7 @@ def test_axes_end_past_their_values() -> None:
 
 
 def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
-    """Without any entry the floors stand there, and what the solver itself takes."""
+    """Without any entry the floors stand there, and what the simulator takes."""
     board = tmp_path / "board"
     (board / "submissions").mkdir(parents=True)
     target = tmp_path / "cost.svg"
@@ -233,6 +246,6 @@ def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
     size = load().size("cavity", "mini")
     for name in shipped(size) or {}:
         assert name in svg
-    assert "the solver itself" in svg
+    assert "the simulator" in svg
     assert (solver_seconds(size) or 0.0) > 0.0
     assert not re.search("<script|href=", svg)

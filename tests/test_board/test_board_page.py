@@ -7,6 +7,7 @@ import hashlib
 import math
 import re
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,7 @@ from lagbench.board.model import Board, BoardRow, Tab
 from lagbench.board.overview import conclude, find_hero, make_overviews
 from lagbench.board.page import render, same_page
 from lagbench.board.table_view import MOST_REASONS, Cell, make_table
+from lagbench.references.predictor import Kind
 
 HOSTILE = (
     "</script><script>console.error(1)</script>"
@@ -220,7 +222,67 @@ def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
     ]
     means = [method.mean_skill for method in overview.methods]
     assert means == pytest.approx([0.45, 0.3, 0.99])
-    assert "not on fluid" in render(whole_board)
+    overview_text = text_of_overview(render(whole_board))
+    assert "on 1 of 2" in overview_text
+    assert "Without a place: not on all 2 data sets" in overview_text
+
+
+def text_of_overview(page: str) -> str:
+    """Return the text of the section of all data sets."""
+    sections = read_html(page).named("section")
+    (overview,) = [one for one in sections if one.attributes.get("id") == "overview"]
+    return " ".join(overview.text.split())
+
+
+def board_with(board: Board, methods: Mapping[tuple[str, str], Sequence[str]]) -> Board:
+    """Return a board on which each data set has some methods, best first."""
+    tabs = []
+    for (split, size), names in methods.items():
+        tab = make_board(((split, size),)).tabs[0]
+        rows = []
+        for number, name in enumerate(names):
+            row = row_of(board, name, name.lower(), rank=number + 1)
+            rows.append(replace(row, pictures=tab.rows[number].pictures))
+        tabs.append(replace(tab, rows=tuple(rows)))
+    return replace(board, tabs=tuple(tabs))
+
+
+def test_a_size_without_places_says_why(board: Board) -> None:
+    """It stands behind the sizes that have places."""
+    split_board = board_with(
+        board,
+        {
+            ("cavity", "full"): ["Alone"],
+            ("fluid", "full"): ["Other"],
+            ("cavity", "mini"): ["Both"],
+            ("fluid", "mini"): ["Both"],
+        },
+    )
+    overviews = make_overviews(split_board)
+    assert [overview.size for overview in overviews] == ["mini", "full"]
+    assert [overview.has_places for overview in overviews] == [True, False]
+    shown = text_of_overview(render(split_board))
+    assert "Both is the only method with a skill on all 2 data sets" in shown
+    assert "No method has a skill on all 2 data sets of size full" in shown
+    assert "Nobody has a place yet: a place needs a skill on all 2 data sets" in shown
+
+
+def test_the_first_film_is_of_a_row_in_sight(board: Board) -> None:
+    """It is of the first method of the first table, whatever leads on a data set."""
+    split_board = board_with(
+        board,
+        {
+            ("cavity", "full"): ["Alone"],
+            ("fluid", "full"): ["Other"],
+            ("cavity", "mini"): ["Leader", "Both"],
+            ("fluid", "mini"): ["Both"],
+        },
+    )
+    overviews = make_overviews(split_board)
+    hero = find_hero(overviews)
+    assert hero is not None
+    _, row = hero
+    assert row.entry.name == "Both" == overviews[0].methods[0].name
 
 
 def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
@@ -268,6 +330,7 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
         (0.8, 1.5, 1.9, "Whether learning pays on cavity full is open"),
         (0.8, 0.9, 1.1, "Whether learning pays on cavity full is open"),
         (0.4, 0.5, 0.6, "Learning pays on cavity full"),
+        (math.nan, 0.5, math.nan, "Whether learning pays on cavity full is open"),
     ],
 )
 def test_a_sentence_says_whether_learning_pays(
@@ -277,17 +340,154 @@ def test_a_sentence_says_whether_learning_pays(
     high: float,
     beginning: str,
 ) -> None:
-    """It follows from the best ratio of any active entry that learns."""
-    row = board.tabs[0].rows[0]
-    rmse = row.values["position_rmse"]
-    value = replace(rmse, mean=ratio, low=low, high=high)
-    worse = replace(value, mean=9.0, high=10.0)
-    learned = replace(row, solver="projection", against_classical=value)
-    worse_learned = replace(row, solver="projection", against_classical=worse)
-    tab = first_tab(board, worse_learned, learned)
-    assert conclude(tab).startswith(beginning)
-    without_ratio = first_tab(board, row)
-    assert conclude(without_ratio) == ""
+    """It follows from the ratio of the most accurate model, and states it."""
+    tab = first_tab(
+        board, compared(board, "Model", error=1.0, ratio=(low, ratio, high))
+    )
+    sentence = conclude(tab)
+    assert sentence.startswith(beginning)
+    assert "Model, the most accurate model, has" in sentence
+    assert f"{ratio:.2f}×".replace("1.50", "1.5") in sentence
+    assert ("(95 %: " in sentence) is not math.isnan(low)
+    assert conclude(first_tab(board, board.tabs[0].rows[0])) == ""
+
+
+def compared(
+    board: Board,
+    name: str,
+    *,
+    error: float,
+    ratio: tuple[float, float, float] | None,
+    **changes: Any,
+) -> BoardRow:
+    """Return a row with an error, and its ratio to a solver with low and high end."""
+    row = row_of(board, name, name.lower(), **changes)
+    tab = board.tabs[0]
+    value = replace(row.values[tab.ranking], mean=error)
+    against = None
+    if ratio is not None:
+        low, mean, high = ratio
+        against = replace(value, mean=mean, low=low, high=high)
+    return replace(
+        row,
+        values={**row.values, tab.ranking: value},
+        solver="projection",
+        against_classical=against,
+    )
+
+
+DEAR = (1.2, 1.5, 1.9)  # ratios to a solver: low end, value, high end
+GOOD = (0.4, 0.5, 0.6)
+
+
+def test_the_most_accurate_model_decides_whether_learning_pays(board: Board) -> None:
+    """A less accurate one that beats the solvers of its cost is named behind it."""
+    accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
+    cheap = compared(board, "Cheap", error=2.0, ratio=GOOD)
+    sentences = conclude(first_tab(board, cheap, accurate))
+    assert sentences.startswith("Learning does not pay on cavity full: Accurate, ")
+    assert "Yet Cheap, which is less accurate, has 0.50×" in sentences
+
+
+def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
+    """The sentence says that a better one is left out."""
+    silent = compared(board, "Silent", error=0.5, ratio=None)
+    accurate = compared(board, "Accurate", error=1.0, ratio=GOOD)
+    sentences = conclude(first_tab(board, silent, accurate))
+    assert "Accurate, the most accurate model of known cost, has" in sentences
+
+
+def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
+    """The mark on their row says so."""
+    under_trained = compared(
+        board, "Young", error=0.5, ratio=GOOD, failed_gates=("bias",)
+    )
+    accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
+    sentences = conclude(first_tab(board, under_trained, accurate))
+    assert "Young" not in sentences
+    assert conclude(first_tab(board, under_trained)) == ""
+
+
+def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
+    """Return a tab with classical solvers of some errors as references."""
+    references = []
+    for name, error in errors.items():
+        reference = tab.references[0]
+        value = replace(reference.values[tab.ranking], mean=error)
+        solver = replace(
+            reference,
+            name=name,
+            kind=Kind.CLASSICAL,
+            values={**reference.values, tab.ranking: value},
+        )
+        references.append(solver)
+    return replace(tab, references=tuple(references))
+
+
+def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> None:
+    """There is no ratio then."""
+    row = compared(board, "Model", error=1.0, ratio=None, is_cheapest=True)
+    tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
+    assert conclude(tab) == (
+        "On cavity full no classical solver is as cheap as Model, the most accurate "
+        "model. Its mean error is less than that of mid and coarse. That of fine is "
+        "less than the model's."
+    )
+    shown = text_of_overview(page_of(board, tab))
+    assert "No classical solver is as cheap as the most accurate model on" in shown
+
+
+def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
+    board: Board,
+) -> None:
+    """The simulator made the data: nobody would save time."""
+    row = compared(board, "Model", error=1.0, ratio=GOOD)
+    for speed_up, is_told in ((0.5, True), (2.0, False)):
+        cost = EntryCost(
+            seconds_per_frame=1.0, device="a", solver_seconds_per_frame=speed_up
+        )
+        sentences = conclude(first_tab(board, with_entry(row, cost=cost)))
+        assert ("A frame costs it 2 times as much" in sentences) is is_told
+
+
+def test_slow_solvers_are_marked(board: Board) -> None:
+    """A classical solver that costs more than the simulator has a mark, with words."""
+    tab = with_solvers(board.tabs[0], {"fast": 1.0, "slow": 2.0})
+    references = []
+    for reference, seconds in zip(tab.references, (1.0, 3.0), strict=True):
+        cost = EntryCost(
+            seconds_per_frame=seconds, device="a", solver_seconds_per_frame=2.0
+        )
+        references.append(replace(reference, cost=cost))
+    page = page_of(board, replace(tab, references=tuple(references)))
+    lines = reference_lines(page)
+    assert "slower than simulator" in lines["slow"]
+    assert "slower than simulator" not in lines["fast"]
+    assert "costs this solver more than the simulator that made the data" in page
+
+
+def reference_lines(page: str) -> dict[str, str]:
+    """Return the text of the lines of reference predictors by name."""
+    lines = {}
+    for line in read_html(page).named("tr"):
+        name = line.attributes.get("data-reference")
+        if name:
+            lines[name] = line.text
+    return lines
+
+
+def test_ranks_count_entries_only(board: Board) -> None:
+    """The page says so above the table, with the references before rank 1."""
+    first_row = board.tabs[0].rows[0]
+    error = first_row.values[board.tabs[0].ranking].mean
+    errors = {"better": 0.5 * error, "worse": 2.0 * error}
+    page = page_of(board, with_solvers(board.tabs[0], errors))
+    assert "Ranks count entries only." in page
+    assert "better would stand before rank 1" in page
+    assert reference_lines(page)["better"].startswith("ref.")
+    assert "would stand before rank 1" not in page_of(
+        board, with_solvers(board.tabs[0], {"worse": 2.0 * error})
+    )
 
 
 def test_variants_have_no_film(board: Board) -> None:
@@ -331,9 +531,10 @@ def test_every_tab_has_a_film(board: Board) -> None:
     assert picture_first([], most=1) == []
 
 
-def test_the_first_film_is_of_several_materials(board: Board) -> None:
+def test_the_first_film_is_of_several_materials() -> None:
     """It has all particles that are known, with a key; links say how to take part."""
-    hero = find_hero(board)
+    board = make_board((("cavity", "mini"), ("fluid", "mini")))
+    hero = find_hero(make_overviews(board))
     assert hero is not None
     tab, row = hero
     assert tab.size.split == "fluid"  # the sample has four materials there
@@ -346,8 +547,9 @@ def test_the_first_film_is_of_several_materials(board: Board) -> None:
     assert materials == ["liquid", "jelly", "snow", "rope"]
 
 
-def test_the_first_film_shows_skill_where_there_is_any(board: Board) -> None:
-    """A data set of many materials stands back while its best entry has no skill."""
+def test_the_first_film_shows_skill_where_there_is_any() -> None:
+    """A data set of many materials stands back while the method has no skill there."""
+    board = make_board((("cavity", "mini"), ("fluid", "mini")))
     tabs = []
     for tab in board.tabs:
         rows = []
@@ -357,7 +559,7 @@ def test_the_first_film_shows_skill_where_there_is_any(board: Board) -> None:
                 row = replace(row, skill=replace(row.skill, mean=-0.1))
             rows.append(row)
         tabs.append(replace(tab, rows=tuple(rows)))
-    hero = find_hero(replace(board, tabs=tuple(tabs)))
+    hero = find_hero(make_overviews(replace(board, tabs=tuple(tabs))))
     assert hero is not None
     assert hero[0].size.split == "cavity"
 

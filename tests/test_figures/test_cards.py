@@ -8,8 +8,10 @@ import hashlib
 import importlib.util
 import json
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,11 +23,17 @@ from rotating_disc import write_swirl
 
 from lagbench.data import registry
 from lagbench.data.layout import PICTURES, dataset_folder
-from lagbench.data.manifest import Manifest, build_manifest, describe_file
+from lagbench.data.manifest import (
+    Manifest,
+    build_manifest,
+    describe_file,
+    read_or_empty,
+)
 from lagbench.data.registry import Size
 from lagbench.figures.tables import escape, markdown
 from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
+from lagbench.make.generate import GenerationResult
 
 STATISTICS = {
     "position_mean": (0.5, 0.25),
@@ -183,6 +191,32 @@ def test_every_picture_of_the_card_is_there(folder: Path) -> None:
         picture = (folder / target).read_bytes()
         assert len(picture) < 300_000
         assert picture.startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("as_shipped")
+def test_estimates_hold_the_bytes_of_a_real_card(
+    tmp_path: Path, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """What is on disk beside the scenarios, pictures included, takes less than the
+    estimate, and not much less. Pictures of three dimensions have the most bytes.
+    """
+    split = "cavity-3d"
+    generated = tiny_split(split)
+    root = tmp_path / "root"
+    shutil.copytree(generated.root, root)
+    size = registry.load().size(split, "tiny")
+    manifest = read_or_empty(size, root)
+    write(root, size, manifest)
+
+    real = 0
+    for path in size.folder(root).rglob("*"):
+        if path.is_file() and path.suffix != ".nc":
+            real += path.stat().st_size
+    scenarios = [entry.scenario for entry in manifest.files]
+    files = sum(size.file_bytes(scenario) for scenario in scenarios)
+    estimate = size.data_set_bytes(scenarios) - files
+    assert real < estimate < 4 * real
 
 
 def written_cards(root: Path, size: Size, manifest: Manifest) -> dict[Path, bytes]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 
 from lagbench.board.build import collect
+from lagbench.board.model import Tab
+from lagbench.board.overview import Verdict, judge
+from lagbench.references.predictor import Kind
 from studies.result_tables import verdict_on_learning
 from studies.thesis.split_results import BOARD, Sources, SplitResults
 
@@ -12,7 +15,7 @@ from studies.thesis.split_results import BOARD, Sources, SplitResults
 @pytest.mark.slow
 def test_learning_is_judged_as_the_leaderboard_judges_it() -> None:
     """The ratio to the classical solver of every committed entry is that of the page:
-    both take the costs that were measured in one run.
+    both take the costs that were measured in one run. So is the verdict.
     """
     tabs = collect(BOARD).tabs
     compared = 0
@@ -28,7 +31,25 @@ def test_learning_is_judged_as_the_leaderboard_judges_it() -> None:
                 continue
             assert against.value == pytest.approx(row.against_classical.mean, rel=1e-6)
             compared += 1
+        _require_same_verdict(tab, results)
     assert compared > 40
+
+
+def _require_same_verdict(tab: Tab, results: SplitResults) -> None:
+    """Compare the page's verdict on a data set with that of the results."""
+    conclusion = judge(tab)
+    assert conclusion is not None
+    words = {
+        Verdict.PAYS: "Learning pays on",
+        Verdict.OPEN: "the question is open",
+        Verdict.DOES_NOT_PAY: "Learning does not pay on",
+        Verdict.NO_SOLVER: "no classical solver is as cheap as the best model",
+    }
+    verdict = verdict_on_learning([results])
+    for own_verdict, words_of_verdict in words.items():
+        is_own = own_verdict is conclusion.verdict
+        assert (words_of_verdict in verdict) is is_own, tab.id
+    assert results.best(Kind.LEARNED, Kind.HYBRID) == conclusion.row.id
 
 
 def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats() -> (

@@ -1,6 +1,6 @@
-// Above the fold: the truth beside a leader; on the overview that of the data set with the most materials.
+// Above the fold: the truth beside the leader of a tab; on the overview beside the first method of the first table.
 
-const hero = { holder: document.getElementById("hero"), isWanted: !quiet.matches, film: null, tab: null };
+const hero = { holder: document.getElementById("hero"), isWanted: !quiet.matches, film: null, shown: null };
 
 /** Return the tab of the first film. */
 function heroTab() {
@@ -9,25 +9,27 @@ function heroTab() {
 
 /** Show the film of a tab; on the overview the first one. */
 function setHero(tab) {
-  const next = tab ?? heroTab();
-  if (hero.holder && next !== hero.tab) drawHero(next);
+  const shownTab = tab ?? heroTab();
+  const isFirst = Boolean(shownTab) && shownTab === heroTab() && (!tab || leaderOf(tab)?.id === BOARD.hero.entry);
+  const shown = `${shownTab?.id} ${isFirst}`;
+  if (!hero.holder || shown === hero.shown) return;
+  hero.shown = shown;
+  drawHero(shownTab, isFirst);
 }
 
 /** Return what the film of a tab shows: the first film has all particles that are known. */
-function heroFilm(tab, leader) {
-  if (tab !== heroTab()) return filmOf(tab, leader);
+function heroFilm(tab, leader, isFirst) {
+  if (!isFirst) return filmOf(tab, leader);
   const { frames, material, films } = BOARD.hero;
   return { frames, materials: material, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
 }
 
-function drawHero(tab) {
+function drawHero(tab, isFirst) {
   hero.film?.stop();
-  const isFirst = Boolean(tab) && tab === heroTab();
   const leader = isFirst ? tab.rows.find((row) => row.id === BOARD.hero.entry) : tab && leaderOf(tab);
   const isShown = isFirst || Boolean(leader?.pictures);
-  const content = isShown ? heroFilm(tab, leader) : null;
+  const content = isShown ? heroFilm(tab, leader, isFirst) : null;
   const isOfOneMaterial = new Set(content?.materials).size === 1;
-  hero.tab = tab;
   hero.film = isShown ? new Film(content, { pixels: 440, rest: 1.2, ended: nextHero }) : null;
   hero.holder.hidden = !isShown;
   if (!isShown) return;
