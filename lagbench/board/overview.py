@@ -18,7 +18,7 @@ LEARNS = (Kind.LEARNED, Kind.HYBRID)
 """Kinds of entries of which the board asks whether learning pays."""
 
 
-class Verdict(enum.Enum):
+class LearningVerdict(enum.Enum):
     """Whether the most accurate model of a data set beats the solvers of its cost."""
 
     PAYS = enum.auto()  # the interval of the ratio lies below 1
@@ -28,12 +28,12 @@ class Verdict(enum.Enum):
 
 
 SUMMARIES = {
-    Verdict.PAYS: "Learning pays on {names}: the most accurate model has less error "
+    LearningVerdict.PAYS: "Learning pays on {names}: the most accurate model has less error "
     "than the best classical solver that costs no more per frame.",
-    Verdict.OPEN: "Whether learning pays is open on {names}.",
-    Verdict.DOES_NOT_PAY: "Learning does not pay on {names}: a classical solver that "
+    LearningVerdict.OPEN: "Whether learning pays is open on {names}.",
+    LearningVerdict.DOES_NOT_PAY: "Learning does not pay on {names}: a classical solver that "
     "costs no more has less error than the most accurate model.",
-    Verdict.NO_SOLVER: "No classical solver is as cheap as the most accurate model on "
+    LearningVerdict.NO_SOLVER: "No classical solver is as cheap as the most accurate model on "
     "{names}.",
 }
 """What is said of the data sets of a size by verdict, in this order."""
@@ -220,7 +220,7 @@ class Conclusion:
 
     tab: Tab
     row: BoardRow  # the most accurate model: an active entry that learns, of known cost
-    verdict: Verdict
+    verdict: LearningVerdict
 
     @property
     def measure(self) -> str:
@@ -247,15 +247,15 @@ def judge(tab: Tab) -> Conclusion | None:
     return Conclusion(tab=tab, row=best, verdict=_verdict_on(best.against_classical))
 
 
-def _verdict_on(ratio: Value | None) -> Verdict:
+def _verdict_on(ratio: Value | None) -> LearningVerdict:
     """Return the verdict of a ratio; open where it has no interval."""
     if ratio is None:
-        return Verdict.NO_SOLVER
+        return LearningVerdict.NO_SOLVER
     if ratio.high < 1.0:
-        return Verdict.PAYS
+        return LearningVerdict.PAYS
     if ratio.low > 1.0:
-        return Verdict.DOES_NOT_PAY
-    return Verdict.OPEN
+        return LearningVerdict.DOES_NOT_PAY
+    return LearningVerdict.OPEN
 
 
 def _models_of(tab: Tab) -> list[BoardRow]:
@@ -308,7 +308,7 @@ def conclude(tab: Tab) -> str:
         ]
     else:
         sentences = [_state_verdict(conclusion.verdict, data_set, model, row, ratio)]
-    if conclusion.verdict is Verdict.PAYS:
+    if conclusion.verdict is LearningVerdict.PAYS:
         cost = cost_of(row)
         if cost is not None and cost.speed_up is not None and cost.speed_up < 1.0:
             sentences.append(
@@ -321,12 +321,12 @@ def conclude(tab: Tab) -> str:
 
 
 def _state_verdict(
-    verdict: Verdict, data_set: str, model: str, row: BoardRow, ratio: Value
+    verdict: LearningVerdict, data_set: str, model: str, row: BoardRow, ratio: Value
 ) -> str:
     comparison = f"{model}, has {_compare(row, ratio)}"
-    if verdict is Verdict.PAYS:
+    if verdict is LearningVerdict.PAYS:
         return f"Learning pays on {data_set}: {comparison}."
-    if verdict is Verdict.DOES_NOT_PAY:
+    if verdict is LearningVerdict.DOES_NOT_PAY:
         return f"Learning does not pay on {data_set}: {comparison}."
     reason = "the interval contains 1"
     if math.isnan(ratio.low + ratio.high):
@@ -360,7 +360,7 @@ def _name_exception(tab: Tab) -> list[str]:
     """
     best = None
     for row in _models_of(tab):
-        if _verdict_on(row.against_classical) is not Verdict.PAYS:
+        if _verdict_on(row.against_classical) is not LearningVerdict.PAYS:
             continue
         if best is None or _error_of(row, tab) < _error_of(best, tab):
             best = row
@@ -384,7 +384,7 @@ def join_names(names: Sequence[str]) -> str:
 def summarise(overview: SizeOverview) -> list[str]:
     """Return who leads over all data sets of a size, and where learning pays."""
     sentences = [_name_leader(overview)]
-    data_sets: dict[Verdict, list[str]] = {}
+    data_sets: dict[LearningVerdict, list[str]] = {}
     for tab in overview.tabs:
         conclusion = judge(tab)
         if conclusion is None:

@@ -6,7 +6,7 @@ import pytest
 
 from lagbench.board.build import collect
 from lagbench.board.model import Tab
-from lagbench.board.overview import Verdict, judge
+from lagbench.board.overview import LearningVerdict, judge
 from lagbench.references.predictor import Kind
 from studies.result_tables import verdict_on_learning
 from studies.thesis.split_results import BOARD, Sources, SplitResults
@@ -40,10 +40,10 @@ def _require_same_verdict(tab: Tab, results: SplitResults) -> None:
     conclusion = judge(tab)
     assert conclusion is not None
     words = {
-        Verdict.PAYS: "Learning pays on",
-        Verdict.OPEN: "the question is open",
-        Verdict.DOES_NOT_PAY: "Learning does not pay on",
-        Verdict.NO_SOLVER: "no classical solver is as cheap as the best model",
+        LearningVerdict.PAYS: "Learning pays on",
+        LearningVerdict.OPEN: "the question is open",
+        LearningVerdict.DOES_NOT_PAY: "Learning does not pay on",
+        LearningVerdict.NO_SOLVER: "no classical solver is as cheap as the best model",
     }
     verdict = verdict_on_learning([results])
     for own_verdict, words_of_verdict in words.items():
