@@ -28,13 +28,18 @@ class LearningVerdict(enum.Enum):
 
 
 SUMMARIES = {
-    LearningVerdict.PAYS: "Learning pays on {names}: the most accurate model has less error "
-    "than the best classical solver that costs no more per frame.",
+    LearningVerdict.PAYS: (
+        "Learning pays on {names}: the most accurate model has less error than the "
+        "best classical solver that costs no more per frame."
+    ),
     LearningVerdict.OPEN: "Whether learning pays is open on {names}.",
-    LearningVerdict.DOES_NOT_PAY: "Learning does not pay on {names}: a classical solver that "
-    "costs no more has less error than the most accurate model.",
-    LearningVerdict.NO_SOLVER: "No classical solver is as cheap as the most accurate model on "
-    "{names}.",
+    LearningVerdict.DOES_NOT_PAY: (
+        "Learning does not pay on {names}: a classical solver that costs no more has "
+        "less error than the most accurate model."
+    ),
+    LearningVerdict.NO_SOLVER: (
+        "No classical solver is as cheap as the most accurate model on {names}."
+    ),
 }
 """What is said of the data sets of a size by verdict, in this order."""
 
