@@ -65,8 +65,8 @@ def export_onnx(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: torch, onnx or onnxruntime is missing, a force drives the flow, the
-            model cannot be traced, or its file predicts something else.
+        UsageError: torch, onnx or onnxruntime is missing, the model cannot be traced,
+            or its file predicts something else.
         UnreadableFileError: the file holds what an entry may not carry.
     """
     check_installed("onnx", extra="onnx")
@@ -74,24 +74,19 @@ def export_onnx(
         split, subset="test", size=size, root=root, future=0, registry=registry
     )
     window = collate([data[data.starts[0]]])
-    if window.body_force is not None:
-        raise UsageError(
-            "an ONNX model is not given the force that drives the flow",
-            where=f"export_onnx, {split}",
-            expected="a split without a body force",
-            got="body_force",
-            fix="hand in weights.pt or safetensors, see docs/submitting.md",
-        )
     frames = window.frames
     inputs: dict[str, Tensor] = {
         "position": window.position.transpose(0, 1).contiguous(),
         "material": window.material,
     }
     if window.wall_velocity is not None:
-        walls = window.wall_velocity[0]
-        inputs["wall_velocity"] = torch.cat([walls, walls[-1:]])[: frames + 1]
+        inputs["wall_velocity"] = _one_frame_more(window.wall_velocity[0], frames)
     if window.viscosity is not None:
         inputs["viscosity"] = window.viscosity[0]
+    if window.body_force is not None:
+        inputs["body_force"] = _one_frame_more(window.body_force[0], frames)
+    if window.obstacle is not None:
+        inputs["obstacle"] = window.obstacle[0]
     wrapped = _Exported(
         step, modules, history=history or frames, input_names=tuple(inputs)
     )
@@ -106,6 +101,14 @@ def export_onnx(
     finally:
         temporary.unlink(missing_ok=True)
     return target
+
+
+def _one_frame_more(forcing: Tensor, frames: int) -> Tensor:
+    """Return what drives the flow towards the given frames and the next one.
+
+    The shape is [frame, ...]. Where the next one is not known, the last one repeats.
+    """
+    return torch.cat([forcing, forcing[-1:]])[: frames + 1]
 
 
 def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
@@ -129,8 +132,7 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
             raise UsageError(
                 "the model cannot be exported",
                 where="export_onnx",
-                expected=f"a step that reads {names} only: an ONNX model is given "
-                "neither body_force nor obstacle",
+                expected=f"a step that reads {names} only, which this data set has",
                 got=f"{type(error).__name__}: {reason}",
                 fix="name its networks: modules=[net]; use operations that ONNX has",
             ) from error
@@ -226,15 +228,23 @@ class _Exported(nn.Module):
         walls = None
         if "wall_velocity" in given:
             walls = given["wall_velocity"][-self.history - 1 :][None]
+        force = None
+        if "body_force" in given:
+            force = given["body_force"][-self.history - 1 :][None]
         viscosity = None
         if "viscosity" in given:
             viscosity = given["viscosity"][None]
+        obstacle = None
+        if "obstacle" in given:
+            obstacle = given["obstacle"][None]
         values: dict[str, Any] = {
             "position": position[-self.history :].transpose(0, 1),
             "sample": torch.zeros_like(material),
             "material": material,
             "wall_velocity": walls,
             "viscosity": viscosity,
+            "body_force": force,
+            "obstacle": obstacle,
             "scenario": torch.zeros(1, dtype=torch.int64),
             "frame": torch.zeros(1, dtype=torch.int64),
         }

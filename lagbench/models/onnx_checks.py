@@ -52,6 +52,8 @@ SIGNATURE = {
     "periodic": (("bool",), 1),
     "wall_velocity": (("float32", "float64"), 3),
     "viscosity": (("float32", "float64"), 0),
+    "body_force": (("float32", "float64"), 3),
+    "obstacle": (("float32", "float64"), 1),
     "edges": (("int64",), 2),
 }
 """Inputs that a model may have, by name: element types and number of axes."""

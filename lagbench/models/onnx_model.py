@@ -138,6 +138,11 @@ class OnnxModel:
             "wall_velocity": given.walls / self.size.frame_interval,
             "viscosity": np.asarray(given.viscosity, np.float64),
         }
+        if given.body_force is not None:
+            per_square_second = given.body_force / self.size.frame_interval**2
+            arrays["body_force"] = per_square_second
+        if given.obstacle is not None:
+            arrays["obstacle"] = given.obstacle
         packed_arrays = {}
         for name, array in arrays.items():
             packed_arrays[name] = pack(array)

@@ -20,6 +20,9 @@ from .onnx_checks import OUTPUT, examine
 if sys.platform != "win32":
     import resource
 
+BY_FRAME = ("wall_velocity", "body_force")
+"""Inputs that are given for each frame, those to predict included."""
+
 MOST_DISTANCE = 10.0
 """Farthest that a particle may be from the middle of the box [length], as in a file of
 predictions.
@@ -78,8 +81,9 @@ def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         request: ``path`` of the model, ``frames`` to predict, arrays of the scenario
-            (position, material, bounds, periodic, wall_velocity for all frames,
-            viscosity) and the connectivity ``radius``.
+            (position, material, bounds, periodic, viscosity, wall_velocity for all
+            frames, and body_force for all frames and obstacle where there are such) and
+            the connectivity ``radius``.
 
     Returns:
         ``position``, shape [frame, particle, axis] [length]; ``seconds``, the processor
@@ -161,13 +165,15 @@ def _advance(
         value: NDArray[Any]
         if name == "position":
             value = window
-        elif name == "wall_velocity":
+        elif name in BY_FRAME and name in given:
             # on the way to each frame of the window, and to the next one
-            value = given["wall_velocity"][done : done + len(window) + 1]
+            value = given[name][done : done + len(window) + 1]
         elif name == "edges":
             value = find_edges(window[-1], radius, given["bounds"], given["periodic"])
-        else:
+        elif name in given:
             value = given[name]
+        else:
+            raise ValueError(f"the input {name}, which this data set does not have")
         values[name] = np.asarray(value, np.dtype(type_name), order="C")
     (output,) = session.run([OUTPUT], values)
     if output.ndim != 3 or output.shape[1:] != window.shape[1:] or len(output) == 0:
