@@ -10,6 +10,9 @@ centre and radius of the obstacle. The force is that of the way to the next fram
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,6 +28,7 @@ __all__ = [
     "force_at",
     "obstacle_features",
     "require_force",
+    "root_mean_square",
 ]
 
 
@@ -135,6 +139,12 @@ class ForcingFeatures(nn.Module):
             features = obstacle_features(position, own_obstacle, self.reach, self.box)
             parts.append(features)
         return torch.cat(parts, dim=1)
+
+
+def root_mean_square(deviations: Sequence[float]) -> float:
+    """Return the deviation of one component, from those along each axis."""
+    variance = np.mean(np.square(deviations))
+    return float(np.sqrt(variance))
 
 
 def coming_force(given: Batch, info: DatasetInfo) -> Tensor:

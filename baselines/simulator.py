@@ -21,7 +21,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Self
 
-import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -40,7 +39,7 @@ from .baseline import (
     check_moving_walls,
     last_velocities,
 )
-from .forcing import ForcingFeatures
+from .forcing import ForcingFeatures, root_mean_square
 from .graph import (
     NodeFeatures,
     Standardisation,
@@ -386,9 +385,7 @@ class GraphNetwork(Baseline):
     @property
     def acceleration_std(self) -> float:
         """Deviation of true accelerations, of one component [length/frame^2]."""
-        deviations = self.info.statistics["acceleration_std"]
-        variance = np.mean(np.square(deviations))
-        return float(np.sqrt(variance))
+        return root_mean_square(self.info.statistics["acceleration_std"])
 
     @property
     def _grid_box(self) -> Box:

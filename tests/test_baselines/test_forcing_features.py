@@ -345,6 +345,109 @@ def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return values
 
 
+FRAME_OPTIONS: dict[str, dict[str, object]] = {
+    "mlp": {"widths": [6]},
+    "lstm": {"latent": 4, "decoder": [4]},
+    "lstm-mlp": {"latent": 4, "decoder": [4]},
+}
+# Deviation of the next state's positions, by the code that knew neither option.
+OLD_POSITION_DEVIATIONS = {
+    "mlp": (0.516565, 0.512492),
+    "lstm": (0.492446, 0.491787),
+    "lstm-mlp": (0.485983, 0.485343),
+}
+
+
+@pytest.mark.parametrize("name", FRAME_OPTIONS)
+def test_frame_models_without_the_options_give_the_numbers_that_they_gave(
+    name: str, tmp_path: Path
+) -> None:
+    entry = find(name)
+    model = entry.model.build(FRAME_OPTIONS[name], info())
+    options = model.options.model_dump(mode="json")
+    del options["body_force"]
+    del options["obstacle"]
+    path = tmp_path / "weights.pt"
+    weights = filled(model.state_dict())
+    save(path, Checkpoint(baseline=name, options=options, info=info(), weights=weights))
+    restored: Any = restore(load(path))
+    assert restored.forcing_seen == frozenset()
+    window = restored.start(forced_batch(BOXES["walls"]).part(slice(6)))
+    assert window.body_force is None
+    assert window.obstacle is None
+    assert restored.network_inputs(window) is window.state
+    with torch.no_grad():
+        state = restored.next_state(window)
+    x, y, _, _ = state.double().std(dim=(0, 1)).tolist()
+    assert (x, y) == pytest.approx(OLD_POSITION_DEVIATIONS[name], rel=1e-3)
+
+
+@pytest.mark.parametrize("name", FRAME_OPTIONS)
+@pytest.mark.parametrize("place", ["channel", "periodic cube"])
+@pytest.mark.parametrize("given_frames", [2, 6])
+def test_frame_models_see_the_force_towards_the_frame_after_each_state(
+    name: str, place: str, given_frames: int
+) -> None:
+    """In training and in each frame of a rollout, and the obstacle from each state;
+    where two frames are given, a second one repeats.
+    """
+    box = BOXES[place]
+    axes = box.dimension
+    figures = info_of_box(box)
+    options = FRAME_OPTIONS[name] | {
+        "body_force": True,
+        "obstacle": True,
+        "material": True,
+    }
+    model: Any = find(name).model.build(options, figures)
+    assert model.forcing_seen == {"body_force", "obstacle"}
+    window = forced_batch(box)
+    assert window.body_force is not None
+    assert window.obstacle is not None
+    deviations = np.array(figures.statistics["acceleration_std"])
+    unit = float(np.sqrt(np.mean(deviations**2)))
+    scale = figures.frame_interval**2 / unit
+    tensor_box = TensorBox(box)
+
+    def check(inputs: Tensor, states: Any, last_frame: int) -> None:
+        """Compare the features of consecutive states, the last of one frame."""
+        assert inputs.shape[3] == 2 * axes + 1 + axes + axes + 1
+        positions = model.frame_state.position(states.state)
+        frames = range(last_frame - model.inputs + 1, last_frame + 1)
+        for row, frame in enumerate(frames):
+            following = min(max(frame, 0) + 1, 8)
+            for number in range(2):
+                position = positions[number, row]
+                sample = torch.full((len(position),), number)
+                force = window.body_force[:, following]
+                acting = scale * force_at(position, sample, force, tensor_box)
+                own = window.obstacle[sample]
+                reach = 3.0 * RADIUS
+                surface = obstacle_features(position, own, reach, tensor_box)
+                seen = inputs[number, row, :, 2 * axes + 1 :]
+                expected = torch.cat([acting, surface], dim=1)
+                assert_close(seen, expected, rtol=1e-4, atol=1e-5)
+
+    state = model.start(window.part(slice(given_frames)))
+    with torch.no_grad():
+        for step in range(5):
+            check(model.network_inputs(state), state, given_frames - 1 + step)
+            state, _ = model.advance(state)
+
+    inputs: list[Any] = []
+    next_state = model.next_state
+
+    def record(states: Any) -> Tensor:
+        inputs.append(states)
+        predicted: Tensor = next_state(states)
+        return predicted
+
+    model.next_state = record
+    model(window.part(slice(model.history + 1)))
+    (states,) = inputs
+    check(model.network_inputs(states), states, model.history - 1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("baseline", "split", "option"),
@@ -352,21 +455,25 @@ def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
         ("gns", "poiseuille", "body_force"),
         ("gns", "cylinder", "obstacle"),
         ("supergat", "cylinder", "obstacle"),
+        ("mlp", "cylinder", "obstacle"),
+        ("lstm", "poiseuille", "body_force"),
     ],
 )
-def test_a_graph_network_is_trained_scored_and_exported(
+def test_a_model_that_sees_them_is_trained_scored_and_exported(
     baseline: str,
     split: str,
     option: str,
     tiny_split: Callable[..., GenerationResult],
     tmp_path: Path,
 ) -> None:
-    """By the recipe of the split it sees what drives the flow, without a warning; the
-    file that an entry carries gives the same rollout.
+    """By the recipe of the split a graph network sees what drives the flow, without a
+    warning; the file that an entry carries gives the same rollout.
     """
     root = tiny_split(split).root
     steps = ("training.steps=3", "training.warmup_steps=1", "training.validate_every=0")
-    small = ("model.latent=8", "model.layers=1")
+    small: tuple[str, ...] = (f"model.{option}=true",)
+    if baseline in ("gns", "supergat"):
+        small = ("model.latent=8", "model.layers=1")
     trained = train(
         baseline,
         split,
