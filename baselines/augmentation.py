@@ -278,6 +278,7 @@ def _mirror_force(force: Tensor, matrix: Tensor) -> Tensor:
             "a force acts on layers along y, which cannot change places with an axis",
             where="symmetry",
             expected="none or mirror",
+            got="a rotation",
             fix="use symmetry: mirror",
         )
     image = _multiply(matrix[:, None, None], force)

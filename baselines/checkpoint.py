@@ -124,6 +124,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
             raise UsageError(
                 "a file of safetensors holds weights only",
                 where=str(path),
+                expected="weights without the state of an optimiser",
                 got="the state of an optimiser too",
                 fix="save the weights without it",
             )
@@ -146,6 +147,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
             raise WorkFailedError(
                 "cannot write there",
                 where=str(path),
+                expected="a folder that you may write to, on a disk with space",
                 got=str(error).split("\n")[0][:200],
                 fix="free disk space, or name a folder that you may write to: --output",
             ) from error
@@ -283,7 +285,11 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         entry = find(checkpoint.baseline)
     except UsageError as error:
         raise UsageError(
-            error.what, where=where, fix="install the package that adds it"
+            error.what,
+            where=where,
+            expected=error.expected,
+            got=error.got,
+            fix="install the package that adds it",
         ) from error
     try:
         model = entry.model.build(checkpoint.options, checkpoint.info)
@@ -293,6 +299,7 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         raise UnreadableFileError(
             f"option {key!r} of the model does not fit",
             where=where,
+            expected=f"options of {checkpoint.baseline}",
             got=detail["msg"],
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
         ) from None
@@ -308,7 +315,9 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         raise UnreadableFileError(
             "no model can be built from it",
             where=where,
+            expected=f"options of {checkpoint.baseline}",
             got=f"{type(error).__name__}: {reason}",
+            fix="train anew with this version of lagbench",
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()
@@ -328,7 +337,11 @@ def load_weights(
             infinite.append(name)
     if infinite:
         raise UnreadableFileError(
-            "weights are not finite", where=where, got=", ".join(infinite[:3])
+            "weights are not finite",
+            where=where,
+            expected="finite numbers",
+            got=", ".join(infinite[:3]),
+            fix="train anew, or take an earlier checkpoint",
         )
     try:
         model.load_state_dict(dict(weights))
@@ -336,7 +349,9 @@ def load_weights(
         raise UnreadableFileError(
             "the weights do not fit the model",
             where=where,
+            expected=f"weights of {type(model).__name__} with the options of the file",
             got=" ".join(str(error).split())[:300],
+            fix="train anew with this version of lagbench",
         ) from None
 
 
@@ -381,6 +396,7 @@ def check_data(
         raise DataError(
             f"{trained.split}, which the model was trained on, is not there",
             where=where,
+            expected="its data, or its description",
             got=f"in {root}",
             fix="name its folder: --root",
         ) from error

@@ -99,7 +99,11 @@ def explain_memory_errors(hint: str) -> Iterator[None]:
         if not is_full and "can't allocate memory" not in str(error):
             raise
         raise WorkFailedError(
-            "out of memory", got=str(error).split("\n")[0][:200], fix=hint
+            "out of memory",
+            where="memory of the device",
+            expected="room for the model and its batch",
+            got=str(error).split("\n")[0][:200],
+            fix=hint,
         ) from error
 
 

@@ -92,6 +92,7 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
             where="model.materials",
             expected=f"some of {list(range(MATERIALS))}",
             got=list(options.materials),
+            fix="name each material once: --set model.materials",
         )
     if options.average and options.symmetry is Symmetry.NONE:
         raise UsageError(

@@ -52,6 +52,7 @@ class Optimisation:
                 "a model without parameters",
                 where=type(model).__qualname__,
                 expected="one that learns",
+                got="no parameters",
                 fix="write its predictions without a training: "
                 "lagbench.submission.write",
             )
@@ -96,7 +97,13 @@ class Optimisation:
                 weighted.append(term.reshape(()) * weight)
         names = ", ".join(checked_terms)
         if not weighted:
-            raise WorkFailedError("every term of the loss has weight 0", got=names)
+            raise WorkFailedError(
+                "every term of the loss has weight 0",
+                where="model.loss",
+                expected="a term with a weight above 0",
+                got=names,
+                fix="raise one of them, as in --set model.loss.acceleration=1",
+            )
         total = torch.stack(weighted).sum()
         if not total.requires_grad:
             raise UsageError(
@@ -171,6 +178,7 @@ class Optimisation:
         return WorkFailedError(
             "the loss is not finite",
             where=f"step {self.step + 1}",
+            expected="finite terms",
             got=f"NaN or infinite: {', '.join(broken)}",
             fix="lower training.learning_rate or set training.clip=1;"
             " checkpoint.pt holds the last good weights",

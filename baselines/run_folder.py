@@ -103,7 +103,8 @@ class RunFolder:
                 UsageError(
                     "the folder holds a training with another recipe",
                     where=str(self.path),
-                    expected=first_difference(asked, logged),
+                    expected="the recipe of the training that lies there",
+                    got=first_difference(asked, logged),
                     fix="name another folder with --output, or train anew with --fresh",
                 ),
             ),

@@ -539,6 +539,7 @@ class GraphNetwork(Baseline):
             raise UsageError(
                 "an operator's loss has the name of one of ours",
                 where=f"{self.operator.__qualname__}.forward",
+                expected="a name of its own",
                 got=", ".join(sorted(repeated)),
                 fix="rename it",
             )

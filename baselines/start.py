@@ -171,6 +171,8 @@ def _load_and_hash(file: Path) -> tuple[Checkpoint, str]:
             raise UnreadableFileError(
                 "the file changed while it was read",
                 where=str(file),
+                expected="a file that stays as it is",
+                got="another one",
                 fix="start from a copy",
             )
     return checkpoint, sha256

@@ -225,7 +225,11 @@ class StableVAR(Fitted):
         rows = LaggedRows(sequences, lags=1)
         if not rows.rows:
             raise WorkFailedError(
-                "nothing to fit", expected="scenarios of 3 frames or more", got="none"
+                "nothing to fit",
+                where="scenarios of train",
+                expected="scenarios of 3 frames or more",
+                got="none",
+                fix="take longer scenarios for train",
             )
         mean, drift, variance = self._moments(rows)
         rank = self.directions.shape[1]
@@ -308,7 +312,11 @@ def solve(blocks: LaggedRows) -> LeastSquares:
     first_block = next(iter(blocks), None)
     if first_block is None:
         raise WorkFailedError(
-            "nothing to fit", expected="scenarios longer than the lags", got="no rows"
+            "nothing to fit",
+            where="scenarios of train",
+            expected="scenarios longer than the lags",
+            got="no rows",
+            fix="take longer scenarios for train, or fewer lags",
         )
     x, y = first_block
     regressor_count = x.shape[1]
@@ -409,7 +417,13 @@ def _factor(
     size = len(matrix)
     diagonal = matrix.diagonal()
     if not np.isfinite(diagonal).all():
-        raise WorkFailedError("values are not finite", where="rows to fit")
+        raise WorkFailedError(
+            "values are not finite",
+            where="rows to fit",
+            expected="finite positions",
+            got="NaN or infinite",
+            fix="check the data: lagbench verify",
+        )
     largest = _largest_eigenvalue(partial(blas.dsymv, 1.0, matrix), size)
 
     rounding_floor = size * np.finfo(np.float64).eps
@@ -427,7 +441,13 @@ def _factor(
         condition = float(np.sqrt(largest * largest_inverse))
         divide_in_place = partial(divide, overwrite_b=True)
         return divide_in_place, condition, floor
-    raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
+    raise WorkFailedError(
+        "the Gram matrix has no Cholesky factor",
+        where="rows to fit",
+        expected="rows that determine a fit",
+        got="a singular matrix",
+        fix="take more or longer scenarios for train",
+    )
 
 
 def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float:

@@ -111,6 +111,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             where=where,
             expected="an InitialState",
             got=type(state).__name__,
+            fix="return an InitialState: docs/extending.md",
         )
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:

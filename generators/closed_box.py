@@ -139,4 +139,5 @@ class ClosedBox(Driver[ClosedBoxParameters]):
                 f"{', '.join(WALLS)}",
                 expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}",
                 got=f"speeds up to {largest_speeds}",
+                fix="correct what initial_state returns: docs/extending.md",
             )

@@ -155,6 +155,7 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
             where=f"{_place_of(size)}, parameter {field.name}",
             expected=expected,
             got=repr(value),
+            fix="correct it in the file of the split",
         )
 
 

@@ -147,6 +147,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             where=f"datasets.yaml, {size.split} {size.name}",
             expected=f"lattice_x * lattice_y = particles = {size.particles}",
             got=f"{columns} * {rows} = {columns * rows}",
+            fix="correct the number of particles in the file of the split",
         )
     position = fill_grid(
         rng, columns, rows, low=low, high=high, jitter=size.value("jitter")

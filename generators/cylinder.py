@@ -222,4 +222,5 @@ def _check_counts(size: Size, solid_count: int, lattice_count: int) -> None:
             where=f"datasets.yaml, {size.split} {size.name}",
             expected=f"particles, obstacle_particles = {expected}",
             got=stated,
+            fix="correct the number of particles in the file of the split",
         )

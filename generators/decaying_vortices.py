@@ -55,6 +55,7 @@ def particles_per_side(size: Size) -> int:
             where=f"datasets.yaml, {size.split} {size.name}",
             expected=f"lattice to the power {dimension} = particles = {size.particles}",
             got=side**dimension,
+            fix="correct the number of particles in the file of the split",
         )
     return side
 

@@ -168,6 +168,7 @@ class FullBox(Driver[FullBoxParameters]):
                 expected=f"shape [..., {shape[0]}, {shape[1]}], speeds up to dx/(2 dt)"
                 f" = {speed_bound:.6g}, zeros along periodic axes",
                 got=f"shape {speeds.shape}, speeds up to {speeds.max():.6g}",
+                fix="correct what initial_state returns: docs/extending.md",
             )
 
     def _check_force(self, index: int, state: InitialState) -> None:
@@ -180,6 +181,7 @@ class FullBox(Driver[FullBoxParameters]):
                 where=f"scenario {index}, body_force",
                 expected=f"finite, shape [frame, {layer_count}, {self.dimension}]",
                 got=f"shape [frame, {force.shape[0]}, {force.shape[1]}]",
+                fix="correct what initial_state returns: docs/extending.md",
             )
 
     def _check_obstacle(self, index: int, state: InitialState) -> None:
@@ -194,6 +196,7 @@ class FullBox(Driver[FullBoxParameters]):
                 where=f"scenario {index}, obstacle",
                 expected=f"{count} particles",
                 got=f"{got} particles",
+                fix="correct what initial_state returns: docs/extending.md",
             )
         if state.obstacle is not None:
             self._check_place(index, state.obstacle)
@@ -226,6 +229,7 @@ class FullBox(Driver[FullBoxParameters]):
             where=f"scenario {index}, obstacle",
             expected=expected,
             got=got,
+            fix="correct what initial_state returns: docs/extending.md",
         )
 
     def _check_stream(self, index: int, state: InitialState) -> None:
@@ -247,6 +251,7 @@ class FullBox(Driver[FullBoxParameters]):
                 expected=f"fringe_rate above 0, and a velocity of {self.dimension} "
                 f"components up to dx/dt = {speed_bound:.6g}",
                 got=f"fringe_rate {self.parameters.fringe_rate:g}, stream {stream}",
+                fix="correct what initial_state returns: docs/extending.md",
             )
 
 

@@ -213,7 +213,13 @@ def _checked_manifest(size: Size, root: Path) -> Manifest:
     folder = dataset_folder(root, size.split, size.name, size.major)
     manifest = read_manifest(root, size.split, size.name, size.major)
     if manifest is None:
-        raise DataError("the data set has no manifest", where=str(folder))
+        raise DataError(
+            "the data set has no manifest",
+            where=str(folder),
+            expected="a manifest of generated data",
+            got="none",
+            fix="generate it first: lagbench generate",
+        )
 
     train_paths = []
     for entry in manifest.files:
@@ -223,6 +229,8 @@ def _checked_manifest(size: Size, root: Path) -> Manifest:
             raise DataError(
                 "a file is not the one that the manifest describes",
                 where=str(path),
+                expected="the file of the manifest",
+                got="another file, or none",
                 fix=f"lagbench generate {options}",
             )
         if entry.subset == "train":

@@ -304,6 +304,7 @@ def _output_errors() -> Iterator[None]:
         raise WorkFailedError(
             "cannot write there",
             where=error.filename or "standard output, or another output file",
+            expected="space on the disk",
             got=error.strerror,
             fix="free disk space",
         ) from error

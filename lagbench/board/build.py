@@ -305,6 +305,7 @@ def _read_method(
             "an entry lies in another place than it says",
             where=str(path),
             expected=str(entry.yaml_path),
+            got=str(path),
             fix=CHECKS["place"].fix,
         )
     size = _size_of(entry, registry, where=board.path / path)
@@ -396,6 +397,7 @@ def _form_scores(
             "a score file lacks metrics that every score file has",
             where=str(board.path / entry.score_paths[0]),
             expected=", ".join(missing),
+            got="no values of them",
             fix="score the predictions again: lagbench submit",
         )
     return scores
@@ -422,7 +424,11 @@ def _size_of(entry: Entry, registry: Registry, *, where: Path) -> Size:
                 "that are known"
             )
         raise DataError(
-            error.what, where=str(where), expected=error.expected, fix=fix
+            error.what,
+            where=str(where),
+            expected=error.expected,
+            got=error.got,
+            fix=fix,
         ) from error
 
 

@@ -265,6 +265,8 @@ class Folder:
                 raise UsageError(
                     "a leaderboard holds no links",
                     where=str(self.path / link),
+                    expected="a folder or a file",
+                    got="a symbolic link",
                     fix="put the folder or file itself in its place",
                 )
 

@@ -35,6 +35,7 @@ def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
         raise UnreadableFileError(
             "the gates cannot be read",
             where=str(path),
+            expected="the JSON that studies.gates writes",
             got=error,
             fix="write them anew: python -m studies.gates",
         ) from error

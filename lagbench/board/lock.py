@@ -34,12 +34,14 @@ def board_lock(folder: Folder, *, timeout: float = LONGEST_WAIT) -> Iterator[Non
             "another process writes to this leaderboard",
             where=str(folder.path),
             expected=f"its end within {timeout:g} s",
+            got="it still writes",
             fix="submit again when it has ended",
         ) from None
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",
             where=str(error.filename or folder.path),
+            expected="a folder that you may write to, on a disk with space",
             got=error.strerror or error,
             fix="free disk space, or name a folder that you may write to: --board",
         ) from error

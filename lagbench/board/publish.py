@@ -89,6 +89,8 @@ def publish(
         raise UsageError(
             "the entry changed while the files were scored",
             where=str(entry_path(draft.place)),
+            expected="the entry as it was before",
+            got="another one",
             fix="submit again; what others added meanwhile stays",
         )
 

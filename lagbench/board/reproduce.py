@@ -226,7 +226,13 @@ def open_model(
         DataError: it was trained on other data.
     """
     if prediction.weights is None:
-        raise UsageError("the seed has no model", where=str(entry.yaml_path))
+        raise UsageError(
+            "the seed has no model",
+            where=str(entry.yaml_path),
+            expected="a model of every seed beside the entry",
+            got="none",
+            fix="its submitter may add one: lagbench submit --weights",
+        )
     path = folder.path / prediction.weights.path
     place = Path(prediction.weights.path)
     if not is_unchanged(folder, place, prediction.weights.sha256):
@@ -234,6 +240,7 @@ def open_model(
             "the model is not the one that the entry names",
             where=str(path),
             expected=f"SHA-256 {prediction.weights.sha256[:16]}",
+            got="another file, or none",
             fix="lagbench leaderboard check",
         )
     if path.suffix == ".onnx":

@@ -39,7 +39,13 @@ def compare(
     before = score(METRICS[metric], submitted)
     after = score(METRICS[metric], reproduced)
     if before is None or after is None:
-        raise ChecksFailedError("the ranking metric has no value", where=metric)
+        raise ChecksFailedError(
+            "the ranking metric has no value",
+            where=metric,
+            expected="values before and after",
+            got="scenarios without a value",
+            fix="score the predictions again: lagbench submit --replace",
+        )
     scale = np.maximum(np.abs(before.values), np.finfo(np.float32).tiny)
     relative = np.abs(after.values - before.values) / scale
     difference = abs(after.mean - before.mean) / max(

@@ -223,6 +223,7 @@ def read_season(folder: Folder, name: str) -> Season:
         raise ChecksFailedError(
             "the file of a season does not fit",
             where=str(file),
+            expected="the layout of season.yaml",
             got=format_issues(issues),
             fix="restore the file that `lagbench season close` wrote",
         )
@@ -326,6 +327,8 @@ def close(
             raise UsageError(
                 "no entry has a model to freeze",
                 where=str(folder.path),
+                expected="entries with models",
+                got="predictions only, or other splits and sizes",
                 fix="lagbench submit --weights puts models beside entries",
             )
         content = {
@@ -341,7 +344,9 @@ def close(
             raise UsageError(
                 "the options of the season do not fit",
                 where="NAME or --source",
+                expected="letters, digits and single hyphens; a source in one line",
                 got=format_issues(issues),
+                fix="correct the option",
             )
         season = with_seeds(season)
         write_season(folder, season)
@@ -355,6 +360,7 @@ def _check_options(name: str, scenarios: int) -> None:
             where="--scenarios",
             expected=f"{FEWEST_SCENARIOS} to {MOST_SCENARIOS}",
             got=scenarios,
+            fix=f"give a number from {FEWEST_SCENARIOS} on",
         )
     if Path(name).name != name or name.startswith("."):
         raise UsageError(
@@ -362,6 +368,7 @@ def _check_options(name: str, scenarios: int) -> None:
             where="NAME",
             expected="small letters, digits and single hyphens, as in spring-2027",
             got=ascii(name)[:80],
+            fix="name it otherwise",
         )
 
 
@@ -370,6 +377,8 @@ def _require_open(folder: Folder, name: str) -> None:
         raise UsageError(
             "the season is closed already, and its models stay frozen",
             where=str(folder.path / season_path(name)),
+            expected="a season that is not closed",
+            got="one with frozen models",
             fix="choose another name; with --value, give the random value that it "
             "waits for",
         )
@@ -390,6 +399,7 @@ def _freeze(
             where=f"{size.split} {size.name}",
             expected=f"ids below {FIRST_SCENARIO}",
             got=max(size.scenarios),
+            fix="leave it out: --split, --size",
         )
     metric = ranking_metric(size)
     naive_scores = {}
@@ -401,6 +411,8 @@ def _freeze(
         raise UsageError(
             "no naive predictor was measured on the data set",
             where=f"{size.split} {size.name}",
+            expected="measured scores of a naive predictor",
+            got="none",
             fix="leave it out: --split, --size; or measure: python -m "
             "lagbench.scoring.measure_references",
         )
@@ -446,6 +458,7 @@ def _frozen_models(folder: Folder, entry: Entry) -> tuple[FrozenModel, ...]:
                 "the model is not the one that the entry names",
                 where=str(folder.path / weights.path),
                 expected=f"SHA-256 {weights.sha256[:16]}",
+                got="another file, or none",
                 fix="lagbench leaderboard check",
             )
         models.append(FrozenModel(seed=prediction.seed, sha256=weights.sha256))
@@ -469,6 +482,7 @@ def reveal(board: str | Path, name: str, value: str) -> Season:
                 where=str(folder.path / season_path(name)),
                 expected="a season that was closed with --source",
                 got=f"value {season.value!a}" if season.value else "no source",
+                fix="leave --value out: lagbench season run scores the models",
             )
         revealed, issues = examine(Season, season.model_dump() | {"value": value})
         if revealed is None or not value.strip():
@@ -477,6 +491,7 @@ def reveal(board: str | Path, name: str, value: str) -> Season:
                 where="--value",
                 expected="a text of one line, as the source publishes it",
                 got=format_issues(issues) if issues else "an empty text",
+                fix="copy it from the source once more",
             )
         revealed = with_seeds(revealed)
         write_season(folder, revealed)

@@ -135,6 +135,8 @@ def run_season(
         raise ChecksFailedError(
             "the season was not run yet: there is nothing to compare with",
             where=str(folder.path / season_path(name, SEASON_SCORES)),
+            expected="the scores of an earlier run",
+            got="no such file",
             fix=f"lagbench season run {name}",
         )
     data_root = resolve_root(root)
@@ -254,6 +256,7 @@ class _SeasonRun:
                 "the naive predictor of the season was not measured on the data",
                 where=f"{data_set.split} {data_set.size}",
                 expected=f"{data_set.reference}, {data_set.metric}",
+                got="no such scores",
                 fix="check out the commit that closed the season",
             )
         return values_of(reference.scores[data_set.metric])
@@ -306,6 +309,7 @@ class _SeasonRun:
                     where=str(path),
                     expected=expected,
                     got=seed,
+                    fix="remove the blind data, then: lagbench generate --season NAME",
                 )
 
     def _score_reference(
@@ -348,6 +352,8 @@ class _SeasonRun:
                 "the ranking metric has no value",
                 where=str(entry.score_paths[index]),
                 expected=data_set.metric,
+                got="scenarios without a value",
+                fix="lagbench leaderboard check says what is wrong with the entry",
             )
         wanted = dict(list(hashes.items())[: frozen.scenarios])
         # entries may share a model and still predict otherwise
@@ -423,6 +429,7 @@ class _SeasonRun:
             "the frozen model is no longer on the board",
             where=str(path),
             expected=f"seed {model.seed}, a model with SHA-256 {model.sha256[:16]}",
+            got="no such model beside the entry",
             fix="check out the commit that closed the season",
         )
 
@@ -446,6 +453,8 @@ class _SeasonRun:
                         "the ranking metric has no value",
                         where=f"{name}, scenario {scenario}",
                         expected=metric,
+                        got="no finite value",
+                        fix="see whether the data are sound: lagbench verify",
                     )
                 row[place] = round_digits(value.mean, DIGITS)
                 data = json.dumps(self._saved, indent=1, sort_keys=True).encode()

@@ -84,6 +84,7 @@ def read_scores(folder: Folder, season: Season) -> SeasonScores | None:
         raise ChecksFailedError(
             "the scores of a season do not fit",
             where=str(file),
+            expected="the layout of scores.yaml",
             got=format_issues(issues),
             fix=f"lagbench season run {season.season} --again",
         )

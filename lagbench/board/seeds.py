@@ -170,6 +170,7 @@ def _require_unchanged_files(folder: Folder, entry: Entry) -> None:
                 "a score file of the entry is not the one that it names",
                 where=str(folder.path / path),
                 expected=f"SHA-256 {file.sha256[:16]}",
+                got="another file, or none",
                 fix=f"restore it, as `git checkout` does, {SUBMIT_ANEW}",
             )
     for prediction in entry.predictions:
@@ -181,6 +182,7 @@ def _require_unchanged_files(folder: Folder, entry: Entry) -> None:
                 "weights of the entry are not those that it names",
                 where=str(folder.path / weights.path),
                 expected=f"SHA-256 {weights.sha256[:16]}",
+                got="another file, or none",
                 fix=f"restore them, as `git checkout` does, {SUBMIT_ANEW}",
             )
 

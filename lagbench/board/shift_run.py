@@ -176,6 +176,8 @@ class _ShiftRun:
             raise DataError(
                 "the data set has no manifest with the hash of shift",
                 where=str(size.folder(self.root)),
+                expected="a manifest with the hash of the subset",
+                got="none",
                 fix=f"lagbench verify --split {size.split} --size {size.name}",
             )
         return manifest.subset_sha256[SUBSET]
@@ -219,6 +221,8 @@ class _ShiftRun:
                         "the ranking metric has no value",
                         where=f"{name}, scenario {scenario}",
                         expected=metric,
+                        got="no finite value",
+                        fix="see whether the data are sound: lagbench verify",
                     )
                 values[scenario] = round_digits(value.mean, DIGITS)
                 self.meter.count(1, scenarios=1)

@@ -141,6 +141,7 @@ def submit(
         raise WorkFailedError(
             "cannot write there",
             where=str(error.filename or folder.path),
+            expected="a folder that you may write to, on a disk with space",
             got=error.strerror or error,
             fix="free disk space, or name a folder that you may write to: --board",
         ) from error

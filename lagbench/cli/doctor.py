@@ -112,7 +112,10 @@ def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     if broken_parts:
         raise ChecksFailedError(
             "this machine cannot run lagbench",
+            where="the table above",
+            expected="every part: ok",
             got=f"broken: {', '.join(broken_parts)}",
+            fix="install what the table names as broken once more",
         )
 
 

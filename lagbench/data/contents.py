@@ -78,6 +78,7 @@ def _content_hash(
         raise DataError(
             f"cannot read a {subset} scenario",
             where=str(path),
+            expected="a readable file",
             got=error.strerror,
             fix=hint,
         ) from error

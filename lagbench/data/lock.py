@@ -107,6 +107,7 @@ def _acquire(
         raise WorkFailedError(
             "another process writes this data set",
             where=str(folder),
+            expected="no other writer",
             got=str(read_holder(folder) or first_holder),
             fix="wait until it ends, or end it; files that are complete stay",
         ) from None

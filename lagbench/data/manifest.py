@@ -312,7 +312,11 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
     except (OSError, UnreadableFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error.got
         raise DataError(
-            "cannot read the manifest", where=str(path), got=reason
+            "cannot read the manifest",
+            where=str(path),
+            expected="a readable file",
+            got=reason,
+            fix="see that you may read it, and that it is a file",
         ) from error
     try:
         manifest = Manifest.model_validate_json(text)
@@ -322,6 +326,7 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         raise DataError(
             "the manifest is damaged",
             where=f"{path}, key {key or '(whole file)'}",
+            expected="the manifest that lagbench writes",
             got=first_error["msg"],
             fix=_MANIFEST_HINT,
         ) from None

@@ -52,6 +52,7 @@ def parse_obstacle(
                 where=f"{where}, attribute {name}",
                 expected="a finite number [length]",
                 got=attributes.get(name),
+                fix="mend the attribute, or make the file again",
             )
         values.append(float(stated.item()))
     if values[-1] <= 0.0:
@@ -60,6 +61,7 @@ def parse_obstacle(
             where=f"{where}, attribute obstacle_diameter",
             expected="a number above 0 [length]",
             got=values[-1],
+            fix="mend the attribute, or make the file again",
         )
     values[-1] *= 0.5
     return np.array(values, np.float32)

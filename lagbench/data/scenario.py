@@ -97,6 +97,7 @@ def parse_viscosity(stated: object, *, where: str) -> float | None:
             where=f"{where}, attribute viscosity",
             expected="a finite number from 0 [length^2/s]",
             got=stated,
+            fix="mend the attribute, or make the file again",
         )
     return viscosity
 
@@ -218,7 +219,11 @@ def read_scenario(path: Path) -> ScenarioFile:
     """
     if not path.is_file():
         raise DataError(
-            "a scenario file is missing", where=str(path), fix=_repair_hint(path)
+            "a scenario file is missing",
+            where=str(path),
+            expected="a readable file",
+            got="nothing",
+            fix=_repair_hint(path),
         )
     with _damage_errors(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
@@ -407,6 +412,7 @@ def damage_error(
     return DataError(
         "a scenario file is damaged or not one of lagbench",
         where=where,
+        expected="a file that lagbench writes",
         got=got,
         fix=fix or _repair_hint(path),
     )

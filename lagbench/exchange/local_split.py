@@ -258,6 +258,7 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
         raise WorkFailedError(
             "cannot write there",
             where=str(folder),
+            expected="a folder that you may write to, on a disk with space",
             got=reason,
             fix="free disk space, or name another folder: --output",
         ) from error

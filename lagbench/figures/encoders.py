@@ -90,7 +90,9 @@ def encode_mp4(
             raise WorkFailedError(
                 "ffmpeg cannot encode the video",
                 where=str(path.parent),
+                expected="a video",
                 got=message or "no message",
+                fix="free disk space, or write a GIF: -o FILE.gif",
             )
 
 

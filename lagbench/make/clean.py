@@ -117,7 +117,11 @@ def _remove_files(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
         except OSError as error:
             raise WorkFailedError(
-                "cannot remove a file", where=str(path), got=error.strerror
+                "cannot remove a file",
+                where=str(path),
+                expected="a file that you may remove",
+                got=error.strerror,
+                fix="see who owns the file and its folder: ls -l",
             ) from error
 
 

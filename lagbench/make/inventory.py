@@ -437,6 +437,7 @@ def _hash_error(size: Size, what: str, place: str) -> DataError:
         what,
         where=f"{size.split} {size.name}, {place}",
         expected=f"the hashes in {size.record_name}",
+        got="other hashes",
         fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
     )
 

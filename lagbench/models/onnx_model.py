@@ -119,11 +119,16 @@ class OnnxModel:
                 expected=f"at most {self.seconds_per_frame:g} s per frame and "
                 f"{self.memory >> 20} MiB",
                 got=answers.stopped,
+                fix="make the model smaller or faster; see docs/submitting.md",
             )
         answer: dict[str, Any] = answers.values[0]
         if "failed" in answer:
             raise UnreadableFileError(
-                "the model cannot be run", where=str(self.path), got=answer["failed"]
+                "the model cannot be run",
+                where=str(self.path),
+                expected="an ONNX model as docs/submitting.md describes it",
+                got=answer["failed"],
+                fix="export it again and run it with onnxruntime first",
             )
         return answer
 

@@ -108,6 +108,8 @@ def long_enough(size: Size) -> tuple[int, ...]:
             "no scenario of train is as long as the task",
             where=f"{size.split} {size.name}",
             expected=f"{needed} frames",
+            got="shorter ones only",
+            fix="shorten the task (--horizon), or take longer trajectories for train",
         )
     return tuple(scenarios)
 

@@ -95,7 +95,11 @@ def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
     """
     if path.is_symlink():  # it could lead out of the folder
         raise UnreadableFileError(
-            "not a score file", where=str(path), expected="a regular file", got="a link"
+            "not a score file",
+            where=str(path),
+            expected="a regular file",
+            got="a link",
+            fix="put the file itself in its place",
         )
     check_regular(
         path,

@@ -41,6 +41,7 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
             raise WorkFailedError(
                 "cannot write scores",
                 where=str(path),
+                expected="a folder that you may write to, on a disk with space",
                 got=error,
                 fix=f"free disk space, or name a folder that you may write to: "
                 f"{option}",

@@ -326,6 +326,8 @@ def skill_gap(
                 "there is no scenario that both have",
                 where=seeds[0].metric.name,
                 expected="values of the method and of the naive predictor",
+                got="none that both have",
+                fix="see which values are undefined: lagbench score --all",
             )
         base_mean = float(np.mean(base))
         ratio = float(np.mean(method)) / base_mean

@@ -159,6 +159,7 @@ def _active_frames(file: ScenarioFile) -> int | None:
         where=str(file.path),
         expected=">= 0",
         got=stated,
+        fix="mend the parameter in the file, or make the data again",
     )
 
 
@@ -174,6 +175,7 @@ def _materials(truth: Truth, scenario: int) -> set[str]:
             where=str(truth.path(scenario)),
             expected=f"{needed} frames",
             got=frames,
+            fix="make the data again, or shorten the task in split.yaml",
         )
     return {MATERIALS[value] for value in np.unique(material).tolist()}
 

@@ -76,6 +76,9 @@ def archive_name(size: Size) -> str:
         raise DataError(
             "a data set without a recorded hash has no archive",
             where=f"{size.split} {size.name}",
+            expected="a hash in datasets.yaml",
+            got="none",
+            fix="record it: python -m lagbench.generators.record",
         )
     return f"{size.split}-{size.name}-{size.measured.dataset_sha256[:16]}.tar"
 

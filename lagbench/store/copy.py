@@ -160,6 +160,7 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
         raise DataError(
             f"{len(missing)} of {len(paths)} scenarios are not there",
             where=str(size.folder(root)),
+            expected="all scenarios of these subsets",
             got=f"missing: {format_ids(missing)} of {names}",
             fix=suggest_repair(size, f"--subset {names}", root=root),
         )
@@ -252,6 +253,8 @@ def _check_objects(size: Size, url: str, manifest: Manifest) -> None:
         raise DataError(
             "the store lacks objects of its manifest, or they have another length",
             where=f"{address}, scenarios {format_ids(wrong_scenarios)}",
+            expected="the lengths that the manifest states",
+            got="other objects",
             fix=_store_hint(size, url),
         )
 
@@ -523,6 +526,7 @@ def _read_source_manifest(size: Size, root: Path, source: Path) -> Manifest:
         expected=f"a root folder with {size.split} {size.name} of another call of "
         f"lagbench generate",
         got=got,
+        fix="name the --root of that call: --gather FOLDER",
     )
 
 

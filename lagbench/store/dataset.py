@@ -202,6 +202,7 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
                 where=str(path),
                 expected=key,
                 got=attributes,
+                fix=fix,
             )
         scenario.set_close(stack.pop_all().close)
     return scenario

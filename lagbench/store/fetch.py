@@ -184,6 +184,7 @@ def partial_file_errors(partial: Path) -> Iterator[None]:
         raise WorkFailedError(
             "cannot write there",
             where=str(partial),
+            expected="a folder that you may write to, on a disk with space",
             got=error.strerror or error,
             fix="--root names another folder",
         ) from error
@@ -231,6 +232,7 @@ def retry(
     raise ConnectionLostError(
         "the connection to the store broke too often",
         where=url,
+        expected="a whole file",
         got=f"{arrived_bytes()} bytes after {MOST_ATTEMPTS} attempts",
         fix=RESUME_HINT,
     )
@@ -363,6 +365,7 @@ def _read_blocks(answer: Answer, rate: TransferRate) -> Iterator[bytes]:
             lost = ConnectionLostError(
                 "the connection to the store broke",
                 where=rate.url,
+                expected="a connection that stays",
                 got=f"{type(error).__name__}: {error}",
                 fix=RESUME_HINT,
             )

@@ -182,6 +182,7 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
         unreachable = StoreUnreachableError(
             "the store does not answer",
             where=url,
+            expected="an answer",
             got=f"{type(error).__name__}: {getattr(error, 'reason', error)}",
             fix="repeat the command later: it goes on where it stopped",
         )
@@ -267,6 +268,7 @@ def _status_error(
         return NotInStoreError(
             "the store does not have the object",
             where=url,
+            expected="the object",
             got=f"HTTP status {code}",
             fix=hint,
         )
@@ -282,6 +284,7 @@ def _status_error(
     refused = StoreUnreachableError(
         "the store refuses",
         where=url,
+        expected="HTTP status 200",
         got=f"HTTP status {code}: {str(error.reason)[:200]!a}",
         fix=hint,
     )
@@ -317,7 +320,11 @@ class _Redirections(urllib.request.HTTPRedirectHandler):
             return super().http_error_302(req, fp, code, msg, headers)
         except (ValueError, http.client.InvalidURL) as error:
             raise NotDataError(
-                "the store leads to no address", where=req.full_url, got=str(error)
+                "the store leads to no address",
+                where=req.full_url,
+                expected="the address of a file",
+                got=str(error),
+                fix="name another store: --from",
             ) from error
 
     http_error_301 = http_error_303 = http_error_307 = http_error_308 = http_error_302
@@ -350,7 +357,11 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         raise
     except FileNotFoundError:
         raise NotInStoreError(
-            "the store does not have the object", where=url, fix=hint
+            "the store does not have the object",
+            where=url,
+            expected="the object",
+            got="no such file",
+            fix=hint,
         ) from None
     except Exception as error:  # file systems raise what their libraries raise
         store_error = _translate_error(error, url)
@@ -543,6 +554,7 @@ def _translate_error(error: Exception, url: str) -> LagbenchError:
         return UsageError(
             "this kind of address needs another package",
             where=url,
+            expected="the package that reads it",
             got=message,
             fix=str(error),
         )
@@ -550,6 +562,7 @@ def _translate_error(error: Exception, url: str) -> LagbenchError:
         return DataError(
             "there is no such bucket",
             where=url,
+            expected="a bucket that exists",
             got=_bucket_of(url),
             fix="create the bucket, or correct the address: --root or LAGBENCH_ROOT",
         )
@@ -558,11 +571,16 @@ def _translate_error(error: Exception, url: str) -> LagbenchError:
         return StoreUnreachableError(
             "the store refuses",
             where=url,
+            expected="permission to read and write",
             got=message,
             fix=f"see that {keys} may read it, and write to it",
         )
     return StoreUnreachableError(
-        "the store does not answer or fails", where=url, got=message, fix=ADDRESS_HINT
+        "the store does not answer or fails",
+        where=url,
+        expected="an answer",
+        got=message,
+        fix=ADDRESS_HINT,
     )
 
 

@@ -117,6 +117,8 @@ class Publication:
             raise DataError(
                 "a file of the working copy is not the one that its manifest names",
                 where=str(path),
+                expected="the file that the manifest names",
+                got="another file",
                 fix=f"remove it, then lagbench generate with --root {root}",
             )
         if self._published.entry(entry.scenario) is not None:

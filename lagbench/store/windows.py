@@ -203,6 +203,8 @@ class FrameStore:
             raise DataError(
                 "a scenario file is missing",
                 where=str(path),
+                expected="a readable file",
+                got="nothing",
                 fix=self._repair_hint(scenario),
             )
         # Frames are cached here: HDF5 need not keep chunks too.
@@ -273,6 +275,7 @@ class FrameStore:
                 raise WorkFailedError(
                     "the system opens no more files",
                     where=str(path),
+                    expected="one open file for each scenario",
                     got=f"{len(self._open_scenarios)} scenario files are open",
                     fix="allow more, as by `ulimit -n 4096`, or open fewer data sets "
                     "at a time",

@@ -150,6 +150,7 @@ class Truth:
                 expected=f"at least {stop} frames of {particles} particles and "
                 f"{self.size.dimension} components",
                 got=frames.shape,
+                fix="make the data again; lagbench verify names wrong files",
             )
         return frames
 

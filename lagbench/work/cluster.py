@@ -107,6 +107,7 @@ def await_file(path: Path) -> None:
             "a worker's file does not appear",
             where=str(path),
             expected=f"a file within {PATIENCE:.0f} s",
+            got="no file",
             fix="name a folder on storage that all machines share, then run the same "
             "command again",
         )
@@ -406,6 +407,7 @@ def _lost_error(reason: object) -> WorkFailedError:
     return WorkFailedError(
         "the Dask cluster is lost",
         where="--scheduler",
+        expected="a scheduler and workers that answer",
         got=reason,
         fix="start scheduler and workers, then run the same command again",
     )
@@ -422,6 +424,7 @@ def _fetch_result(name: str, future: Any) -> ItemResult:  # noqa: ANN401
         raise WorkFailedError(
             "workers of the Dask cluster died again and again",
             where=name,
+            expected="workers that live as long as the work",
             got=str(error),
             fix="give the workers more memory, or leave --scheduler out",
         ) from error
@@ -431,6 +434,7 @@ def _fetch_result(name: str, future: Any) -> ItemResult:  # noqa: ANN401
         raise WorkFailedError(
             "a worker of the Dask cluster cannot do the work",
             where=name,
+            expected="a worker with the same packages",
             got=f"{type(error).__name__}: {error}",
             fix="install the same version of lagbench with its extras on every worker",
         ) from error

@@ -274,6 +274,7 @@ class LimitedChild:
             return WorkFailedError(
                 "a child process itself failed",
                 where=self._arguments[0],
+                expected="an answer of the child process",
                 got=ascii(lines[-1][:300]),
                 fix="`lagbench doctor` checks the installation; if it finds nothing, "
                 "report this with the file",

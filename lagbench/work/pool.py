@@ -109,7 +109,11 @@ class Pool:
         """Refuse a pool in which no item could ever run."""
         if not AVAILABLE:
             raise WorkFailedError(
-                "this system cannot start workers", fix="on Windows use WSL"
+                "this system cannot start workers",
+                where=sys.platform,
+                expected="a system with fork and pipes, as Linux or macOS",
+                got="none of them",
+                fix="on Windows use WSL",
             )
         self.size = worker_count(self.size)
 
@@ -239,6 +243,7 @@ class Pool:
             raise WorkFailedError(
                 f"a worker process died {ATTEMPTS} times",
                 where=attempt.item.name,
+                expected="a worker that lives as long as the work",
                 got=cause,
                 fix="free memory or take fewer workers: --workers 1",
             )
@@ -254,11 +259,18 @@ def crash_error(error: Exception) -> WorkFailedError:
         return WorkFailedError(
             "a package failed in a worker",
             where=place,
+            expected="a result",
             got=", ".join(messages),
             fix="mend or uninstall that package",
         )
     trace = "".join(traceback.format_exception(error, limit=-6))
-    return WorkFailedError("a worker crashed", got=f"{error!r}\n{trace}")
+    return WorkFailedError(
+        "a worker crashed",
+        where="a worker process",
+        expected="a result",
+        got=f"{error!r}\n{trace}",
+        fix="this is a fault of lagbench: report it with this message",
+    )
 
 
 def serve(descriptor: int) -> None:
