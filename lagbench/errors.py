@@ -38,6 +38,9 @@ _HOST_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-]):/+([^/]*)")
 SPLIT_NAMED = "SPLIT or --split"
 """Where a user names a split, for messages."""
 
+MOST_NAMES = 30
+"""Names that a hint lists; of more it lists those that are near a wrong one."""
+
 PATIENCE = 20.0
 """Time that the import of a package's module may take before a line names it [s]."""
 
@@ -304,8 +307,10 @@ def suggest_name(name: str, known_names: Iterable[str]) -> str:
     "did you mean 'cavity'? known: cavity, fluid"
     """
     words = sorted(known_names)
-    close_words = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
+    close_words = difflib.get_close_matches(name, words, n=5, cutoff=0.5)
     listing = f"known: {', '.join(words) or 'none'}"
+    if close_words and len(words) > MOST_NAMES:
+        listing = f"known, among others: {', '.join(close_words)}"
     if close_words:
         return f"did you mean {close_words[0]!r}? {listing}"
     return listing

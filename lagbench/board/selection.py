@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
@@ -11,6 +11,36 @@ from lagbench.errors import UsageError, suggest_name
 from .entry import DataSet, Entry, Status
 from .entry_file import read_entry
 from .folder import Folder
+
+
+def choose_data_sets(
+    known: Collection[tuple[str, str]], split: str | None, size: str | None
+) -> tuple[tuple[str, str], ...]:
+    """Return the data sets with entries; only those of a split or size, if given.
+
+    A data set is a pair (split, size).
+
+    Raises:
+        UsageError: a split or size is given that has no entries.
+    """
+    chosen = []
+    for known_split, known_size in known:
+        if split in (None, known_split) and size in (None, known_size):
+            chosen.append((known_split, known_size))
+    if chosen or (split is None and size is None):
+        return tuple(chosen)
+
+    request = " ".join(name for name in (split, size) if name)
+    fix: str | None = "submit something: lagbench submit"
+    if known:
+        fix = suggest_name(request, [" ".join(data_set) for data_set in known])
+    raise UsageError(
+        "no entries there",
+        where="--split, --size",
+        expected="a data set with entries",
+        got=ascii(request),
+        fix=fix,
+    )
 
 
 def choose_entries(
@@ -24,7 +54,8 @@ def choose_entries(
     """Return entries by name, or all active ones of the present data with models.
 
     Raises:
-        UsageError: no such entry, or one that has no model.
+        UsageError: no such entry, or one that has no model; or no entries of the split
+            or size.
     """
     known = {}
     for path in folder.entries():
@@ -54,6 +85,7 @@ def choose_entries(
             chosen.append(entry)
         return chosen
 
+    choose_data_sets(folder.data_sets(), split, size)
     chosen = []
     for path in known.values():
         _, entry_split, entry_size, _ = path.parts

@@ -28,36 +28,6 @@ from .model import Board, BoardRow, OnShift, ReferenceRow, Tab, Value
 NOTHING = "-"
 
 
-def choose_data_sets(
-    known: Collection[tuple[str, str]], split: str | None, size: str | None
-) -> tuple[tuple[str, str], ...]:
-    """Return the data sets with entries; only those of a split or size, if given.
-
-    A data set is a pair (split, size).
-
-    Raises:
-        UsageError: a split or size is given that has no entries.
-    """
-    chosen = []
-    for known_split, known_size in known:
-        if split in (None, known_split) and size in (None, known_size):
-            chosen.append((known_split, known_size))
-    if chosen or (split is None and size is None):
-        return tuple(chosen)
-
-    request = " ".join(name for name in (split, size) if name)
-    fix: str | None = "submit something: lagbench submit"
-    if known:
-        fix = suggest_name(request, [" ".join(data_set) for data_set in known])
-    raise UsageError(
-        "no entries there",
-        where="--split, --size",
-        expected="a data set with entries",
-        got=ascii(request),
-        fix=fix,
-    )
-
-
 def scope_of_tables(metrics: Collection[str], *, wide: bool) -> Scope:
     """Return how much of the score files the tables need."""
     names = {*metrics}

@@ -17,11 +17,11 @@ from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import ReproduceResult, reproduce
+from lagbench.board.selection import choose_data_sets
 from lagbench.board.shift import scores_of_seeds
 from lagbench.board.shift_run import ShiftResult, score_on_shift
 from lagbench.board.show import (
     SCOPE_OF_JSON,
-    choose_data_sets,
     scope_of_tables,
     tables,
     to_plain,
@@ -241,7 +241,9 @@ def picture_command(
             got=output,
             fix=f"-o {output.stem or 'cost'}.svg",
         )
-    model = collect(find_board(board), only=[(tier.split, tier.name)])
+    folder = find_board(board)
+    only = choose_data_sets(Folder(folder).data_sets(), tier.split, tier.name)
+    model = collect(folder, only=only)
     svg = picture(model, tier)
     write_atomically(output, svg.encode(), option="--output")
     print_line(str(output), quiet=quiet)

@@ -34,7 +34,8 @@ from lagbench.board.folder import Folder
 from lagbench.board.gates import gates_failed_by, read_failed_gates
 from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
-from lagbench.board.show import choose_data_sets, tables, to_plain
+from lagbench.board.selection import choose_data_sets
+from lagbench.board.show import tables, to_plain
 from lagbench.board.variants import find_variants
 from lagbench.data.registry import Registry
 from lagbench.errors import (

@@ -176,6 +176,13 @@ def test_the_board_of_the_clone_is_found_elsewhere(
     assert str(clone_board) in shown.stdout
     again = run("leaderboard", "reproduce", "cavity/mini/gns")
     assert "no such entry" in again.stderr
+    for command in ("reproduce", "shift"):
+        none = run("leaderboard", command, "--all", "--split", "cavty")
+        assert none.exit_code == 2
+        assert "no entries there" in none.stderr
+    picture = run("leaderboard", "picture", "cavity", "--size", "mini")
+    assert "no entries there" in picture.stderr
+    assert not (tmp_path / "cost.svg").exists()
     (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
     assert str(clone_board) not in run("leaderboard", "show").stdout
 

@@ -182,6 +182,18 @@ MISTAKES = {
     "an animation without pace": "animate SCENARIO --fps 0 -o x.gif",
     "pixels that are none": "plot SCENARIO --dpi 0 -o x.png",
     "files to clean that are none": "clean cavity --size tinny",
+    "a misspelt kind of film": "animate SCENARIO --kind vortcity -o x.mp4",
+    "an entry that is none": "compare curl-noise/mini/gnss persistence",
+    "an entry to run that is none": "leaderboard reproduce cavity/mini/gnss",
+    "a data set without entries": "leaderboard reproduce --all --split cavty",
+    "a picture without entries": "leaderboard picture poiseuille --size tiny",
+    "a text for an id": "animate SCENARIO --scenario test -o film.mp4",
+    "a folder of scores to import": "import nothere --format gns-npz -o own",
+    "an address without its colon": (
+        "download curl-noise --size tiny --from ftp//host/data"
+    ),
+    "an option for weights only": "predict notes.txt --split curl-noise -o x.nc",
+    "a season to run that is none": "season run winter",
 }
 
 
