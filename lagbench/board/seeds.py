@@ -216,7 +216,7 @@ def _labels_to_compare(
     if "training" not in meta.model_fields_set:
         trainings = _different_trainings([entry.provenance, header.provenance])
         if len(trainings) > 1:
-            yield "training", *trainings
+            yield "training", trainings[0], trainings[1]
 
 
 def _format_seeds(seeds: Iterable[int | None]) -> str:
