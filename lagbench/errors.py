@@ -34,6 +34,9 @@ PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics"
 _WORD = re.compile(r"\S+")
 # The scheme before it is only looked back at: a search through a long text is linear.
 _HOST_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-]):/+([^/]*)")
+_IPV6_HOST = re.compile(r"\[[0-9A-Fa-f:.]+(?:%\w+)?\](?::[0-9]*)?")
+_PORT = re.compile(r"[0-9]{1,5}")
+_LAST_PORT = 65535
 
 SPLIT_NAMED = "SPLIT or --split"
 """Where a user names a split, for messages."""
@@ -110,10 +113,14 @@ def hide_user(text: str, mark: str = "...@") -> str:
     """Return a text with a mark for the users and passwords of the addresses in it.
 
     Messages are printed, logged and sent to others. A password may hold any characters
-    but blanks, so after a user with a colon all is hidden up to the last ``@``.
+    but blanks, so after a user with a colon all is hidden up to the last ``@``. A port
+    is shown after ``localhost``, a name with a dot, and a number in brackets only: in
+    ``ann:12/cret@host`` the number may begin a password.
 
     >>> hide_user("ftp://ann:se/cret@host/data does not answer")
     'ftp://...@host/data does not answer'
+    >>> hide_user("http://localhost:8000/data@v2 does not answer")
+    'http://localhost:8000/data@v2 does not answer'
     """
     if "@" not in text:
         return text
@@ -133,7 +140,7 @@ def _hide_user_in_word(word: str, mark: str) -> str:
         begin = match.start(1)
         parts.append(word[end:begin])
         end = begin
-        if ":" in host and not host.startswith("["):
+        if ":" in host and not _is_host_with_port(host):
             parts.append(mark)
             end = last + 1
             break
@@ -142,6 +149,19 @@ def _hide_user_in_word(word: str, mark: str) -> str:
             end = begin + host.rfind("@") + 1
     parts.append(word[end:])
     return "".join(parts)
+
+
+def _is_host_with_port(host: str) -> bool:
+    """Return whether what stands before the first slash is surely a host and a port.
+
+    It is not where an ``@`` stands in it, nor after a name that may be a user.
+    """
+    if _IPV6_HOST.fullmatch(host):
+        return True
+    name, _, port = host.partition(":")
+    if not _PORT.fullmatch(port) or int(port) > _LAST_PORT:
+        return False
+    return "@" not in name and ("." in name or name == "localhost")
 
 
 def escape_unprintable(text: str) -> str:

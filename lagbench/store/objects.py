@@ -152,17 +152,24 @@ def _require_http_address(url: str) -> str:
     try:
         return _percent_encode(url)
     except ValueError as error:
-        raise _no_address(url, error) from error
+        raise _no_address(url, str(error)) from error
 
 
-def _no_address(url: str, error: Exception) -> UsageError:
+def _no_address(url: str, got: str) -> UsageError:
     return UsageError(
         "not the address of a store",
         where=_short_address(url),
         expected="http://host/path",
-        got=str(error),
+        got=got,
         fix=STORE_HINT,
     )
+
+
+def _describe_fault(error: Exception, url: str) -> str:
+    """Return what a library says of an address, unless that may hold a password."""
+    if "@" in url:
+        return "an address with an @ that cannot be read"
+    return str(error)
 
 
 def _open_http(url: str, offset: int, hint: str) -> Answer:
@@ -177,7 +184,7 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
         with closing(error):
             raise _status_error(error, url, offset, hint) from None
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
-        raise _no_address(url, error) from error
+        raise _no_address(url, _describe_fault(error, url)) from error
     except (OSError, http.client.HTTPException) as error:
         unreachable = StoreUnreachableError(
             "the store does not answer",
@@ -213,16 +220,25 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
 
 def _short_address(url: str) -> str:
     """Return an address for a message: its beginning, without user and password."""
-    return hide_user(url, mark="")[:LONGEST_SHOWN]
+    # a blank would end the address
+    whole_address = re.sub(r"\s", "%20", url)
+    if hide_user(whole_address) == whole_address:
+        return url[:LONGEST_SHOWN]
+    return hide_user(whole_address, mark="")[:LONGEST_SHOWN]
 
 
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
-    parts = urllib.parse.urlsplit(url)
-    port = parts.netloc.rpartition("]")[2].partition(":")[2]
-    has_slash_in_password = "@" in url and not re.fullmatch(r"[0-9]*", port)
-    if "@" in parts.netloc or has_slash_in_password:
+    if hide_user(url) != url:
         # the message and the manifest would show it
+        msg = "a user or a password before its host; an @ in its path is %40"
+        raise ValueError(msg)
+    try:
+        parts = urllib.parse.urlsplit(url)
+        _ = parts.port  # raises for one that is no number
+    except ValueError as error:
+        raise ValueError(_describe_fault(error, url)) from None
+    if "@" in parts.netloc:
         msg = "a user or a password before its host"
         raise ValueError(msg)
     _check_host(parts.hostname)
@@ -473,8 +489,9 @@ def _require_scheme(url: str) -> str:
     """
     import fsspec  # type: ignore[import-untyped]
 
-    scheme, mark, _ = url.partition("://")
+    scheme, mark, place = url.partition("://")
     if mark and scheme in fsspec.available_protocols():
+        _require_place(url, place)
         return scheme
     fix = STORE_HINT
     if not mark and os.path.isdir(url):
@@ -487,6 +504,20 @@ def _require_scheme(url: str) -> str:
         got=ascii(hide_user(scheme)[:LONGEST_SHOWN]),
         fix=fix,
     )
+
+
+def _require_place(url: str, place: str) -> None:
+    """Refuse an address that ends with its scheme, and one of S3 without a bucket."""
+    if url.startswith(S3) and place.startswith("/"):
+        place = ""
+    if not place:
+        raise UsageError(
+            "the address names no place",
+            where=_short_address(url),
+            expected="a host, a bucket or a path behind ://",
+            got="nothing",
+            fix=STORE_HINT,
+        )
 
 
 def _file_system(url: str) -> tuple[Any, str]:

@@ -294,6 +294,13 @@ def test_no_value_in_a_message_shows_the_user_of_an_address(value: object) -> No
         ("https://host/data@v2", "https://host/data@v2"),
         ("https://host:8000/data, ann@host", "https://host:8000/data, ann@host"),
         ("see ann@host or a:b@c", "see ann@host or a:b@c"),
+        ("ftp://[a:se/cret@host/x", "ftp://...@host/x"),
+        ("ftp://[::1]:se/cret@host/x", "ftp://...@host/x"),
+        ("http://[::1]:8000/data@v2", "http://[::1]:8000/data@v2"),
+        ("http://localhost:8000/data@v2", "http://localhost:8000/data@v2"),
+        ("http://127.0.0.1:80/data@v2", "http://127.0.0.1:80/data@v2"),
+        ("http://a.org:99999/cret@host", "http://...@host"),
+        ("http://ann@a.org:12/cret@host", "http://...@host"),
     ],
 )
 def test_a_password_may_hold_slashes(text: str, shown: str) -> None:
@@ -301,13 +308,40 @@ def test_a_password_may_hold_slashes(text: str, shown: str) -> None:
     assert hide_user(text) == shown
 
 
-@pytest.mark.parametrize("text", ["a", "a://", "a://b:", "a:", "/", "@", "a://b@", " "])
+@pytest.mark.parametrize(
+    "text",
+    ["a", "a://", "a://b:", "a:", "/", "@", "a://b@", " ", "a://b.c:1/", "a://[", "a."],
+)
 @pytest.mark.parametrize("ending", ["", "@host"])
 def test_a_long_text_in_a_message_costs_no_time(text: str, ending: str) -> None:
     """Quadratic time would be hours here: the suite would be stopped."""
     letters = text * 1_000_000 + ending
     message = str(UsageError("this fails", got=letters))
     assert message.startswith("this fails")
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://ann:secret\u2100x@host/a",
+        "http://ann:12/3secret@host/x",
+        "http://[a:secret@host/x",
+        "http://ann:secret x@host/a",
+        "http://ann:secret/\u2100@host/a",
+    ],
+)
+def test_an_address_with_a_password_is_refused_without_it(address: str) -> None:
+    """Also where Python cannot read the address and repeats it."""
+    with pytest.raises(UsageError) as caught:
+        objects.check_address(address)
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+    assert "secret" not in f"{error} {error.where} {error.got}"
+
+
+def test_an_at_sign_in_a_path_is_no_password() -> None:
+    objects.check_address("http://localhost:8000/data@v2")
+    objects.check_address("http://host/data@v2")
 
 
 def test_a_part_of_a_password_is_not_shown() -> None:

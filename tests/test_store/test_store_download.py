@@ -371,6 +371,11 @@ def test_no_store_at_all(here: Path) -> None:
         "http://2130706433/data",
         "http://127.1/data",
         "http://a..b/",
+        "http://127.0.0.1:abc/x",
+        "http://127.0.0.1:99999/x",
+        "s3://",
+        "s3:///prefix",
+        "file://",
     ],
 )
 def test_what_is_no_address(here: Path, address: str) -> None:
@@ -380,7 +385,18 @@ def test_what_is_no_address(here: Path, address: str) -> None:
     assert str(caught.value.where).startswith(address)
 
 
-@pytest.mark.parametrize("address", ["nowhere", "", "htp://host/data", "http:///data"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "nowhere",
+        "",
+        "htp://host/data",
+        "http:///data",
+        "http://127.0.0.1:99999/x",
+        "s3://",
+        "file://",
+    ],
+)
 def test_what_is_no_address_is_told_where_no_file_is_missing(
     address: str, generated: GenerationResult, tmp_path: Path
 ) -> None:
