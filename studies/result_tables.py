@@ -6,6 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
+from lagbench.board.overview import (
+    LearningVerdict,
+    place_among_solvers,
+    verdict_of_interval,
+)
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
@@ -62,23 +67,25 @@ def summary_table(all_results: Sequence[SplitResults]) -> str:
 def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     """Return in one sentence each where models beat a solver of their cost.
 
-    The model is the best learned or hybrid one of a data set.
+    The model is the best learned or hybrid one of a data set of known cost, as on the
+    page of the leaderboard.
     """
     pays = []
     open_sets = []
     does_not_pay = []
     unmatched = []
     for results in all_results:
-        model = results.best(Kind.LEARNED, Kind.HYBRID)
-        against = None if model is None else results.against_classical(model)
-        if against is None:
-            if model is not None and results.seconds_per_frame(model) is not None:
-                unmatched.append(_cheaper_than_solvers(results, model))
+        model = deciding_model(results)
+        if model is None:
             continue
-        low, high = against.interval
-        if high < 1.0:
+        against = results.against_classical(model)
+        if against is None:
+            unmatched.append(_cheaper_than_solvers(results, model))
+            continue
+        verdict = verdict_of_interval(*against.interval)
+        if verdict is LearningVerdict.PAYS:
             pays.append(results.where)
-        elif low > 1.0:
+        elif verdict is LearningVerdict.DOES_NOT_PAY:
             does_not_pay.append(results.where)
         else:
             open_sets.append(results.where)
@@ -100,20 +107,35 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     return " ".join([*sentences, *unmatched])
 
 
+def deciding_model(results: SplitResults) -> str | None:
+    """Return the most accurate learned or hybrid model whose cost is known, if any."""
+    for name in results.order():
+        is_model = results.methods[name].kind in (Kind.LEARNED, Kind.HYBRID)
+        if is_model and results.seconds_per_frame(name) is not None:
+            return name
+    return None
+
+
 def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
     """Return which solvers a model beats that is cheaper than all of them."""
     sentence = f"On {results.where} no classical solver is as cheap as the best model."
-    beaten = results.less_accurate(model, Kind.CLASSICAL)
-    if beaten:
-        sentence += f" Its mean error is less than that of {_label_all(beaten)}."
-    better = results.more_accurate(model, Kind.CLASSICAL)
-    if better:
-        sentence += f" That of {_label_all(better)} is less than the model's."
-    return sentence
-
-
-def _label_all(names: Sequence[str]) -> str:
-    return _join([label(name) for name in names])
+    error = results.methods[model].scores[results.ranking].mean
+    behind = []
+    equal = []
+    ahead = []
+    for name in results.order(results.references):
+        method = results.methods[name]
+        if method.kind is not Kind.CLASSICAL:
+            continue
+        solver_error = method.scores[results.ranking].mean
+        if solver_error > error:
+            behind.append(label(name))
+        elif solver_error < error:
+            ahead.append(label(name))
+        else:
+            equal.append(label(name))
+    places = place_among_solvers(behind=behind, equal=equal, ahead=ahead)
+    return " ".join([sentence, *places])
 
 
 def _join(names: Sequence[str]) -> str:

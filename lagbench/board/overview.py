@@ -29,17 +29,15 @@ class LearningVerdict(enum.Enum):
 
 SUMMARIES = {
     LearningVerdict.PAYS: (
-        "Learning pays on {names}: the most accurate model has less error than the "
-        "best classical solver that costs no more per frame."
+        "Learning pays on {names}: {model} has less error than the best classical "
+        "solver that costs no more per frame."
     ),
     LearningVerdict.OPEN: "Whether learning pays is open on {names}.",
     LearningVerdict.DOES_NOT_PAY: (
         "Learning does not pay on {names}: a classical solver that costs no more has "
-        "less error than the most accurate model."
+        "less error than {model}."
     ),
-    LearningVerdict.NO_SOLVER: (
-        "No classical solver is as cheap as the most accurate model on {names}."
-    ),
+    LearningVerdict.NO_SOLVER: "No classical solver is as cheap as {model} on {names}.",
 }
 """What is said of the data sets of a size by verdict, in this order."""
 
@@ -226,6 +224,15 @@ class Conclusion:
     tab: Tab
     row: BoardRow  # the most accurate model: an active entry that learns, of known cost
     verdict: LearningVerdict
+    # whether a model whose cost is not known has less error: it decides nothing
+    better_has_no_cost: bool
+
+    @property
+    def model(self) -> str:
+        """What the model is among those of the data set, in words."""
+        if self.better_has_no_cost:
+            return "the most accurate model of known cost"
+        return "the most accurate model"
 
     @property
     def measure(self) -> str:
@@ -249,16 +256,31 @@ def judge(tab: Tab) -> Conclusion | None:
             best = row
     if best is None:
         return None
-    return Conclusion(tab=tab, row=best, verdict=_verdict_on(best.against_classical))
+    least_error = min(_error_of(row, tab) for row in _models_of(tab))
+    return Conclusion(
+        tab=tab,
+        row=best,
+        verdict=_verdict_on(best.against_classical),
+        better_has_no_cost=least_error < _error_of(best, tab),
+    )
 
 
 def _verdict_on(ratio: Value | None) -> LearningVerdict:
-    """Return the verdict of a ratio; open where it has no interval."""
+    """Return the verdict of a row's ratio to the solvers of its cost."""
     if ratio is None:
         return LearningVerdict.NO_SOLVER
-    if ratio.high < 1.0:
+    return verdict_of_interval(ratio.low, ratio.high)
+
+
+def verdict_of_interval(low: float, high: float) -> LearningVerdict:
+    """Return the verdict of the interval of a ratio; NaN where there is none.
+
+    >>> verdict_of_interval(0.8, 0.9).name, verdict_of_interval(0.8, 1.1).name
+    ('PAYS', 'OPEN')
+    """
+    if high < 1.0:
         return LearningVerdict.PAYS
-    if ratio.low > 1.0:
+    if low > 1.0:
         return LearningVerdict.DOES_NOT_PAY
     return LearningVerdict.OPEN
 
@@ -302,9 +324,7 @@ def conclude(tab: Tab) -> str:
         return ""
     data_set = f"{tab.size.split} {tab.size.name}"
     row = conclusion.row
-    model = f"{row.entry.name}, the most accurate model"
-    if any(_error_of(other, tab) < _error_of(row, tab) for other in _models_of(tab)):
-        model += " of known cost"
+    model = f"{row.entry.name}, {conclusion.model}"
     ratio = row.against_classical
     if ratio is None:
         sentences = [
@@ -340,21 +360,39 @@ def _state_verdict(
 
 
 def _place_among_solvers(row: BoardRow, tab: Tab) -> list[str]:
-    """Return which classical solvers have a greater or less mean error than a model."""
+    """Return which classical solvers have a greater, equal or smaller mean error."""
     behind = []
+    equal = []
     ahead = []
     for reference in sorted(tab.references, key=lambda other: _error_of(other, tab)):
         if reference.kind is not Kind.CLASSICAL or tab.ranking not in reference.values:
             continue
         if _error_of(reference, tab) > _error_of(row, tab):
             behind.append(reference.name)
-        else:
+        elif _error_of(reference, tab) < _error_of(row, tab):
             ahead.append(reference.name)
+        else:
+            equal.append(reference.name)
+    return place_among_solvers(behind=behind, equal=equal, ahead=ahead)
+
+
+def place_among_solvers(
+    *, behind: Sequence[str], equal: Sequence[str], ahead: Sequence[str]
+) -> list[str]:
+    """Return sentences about the mean error of a model beside those of solvers.
+
+    >>> place_among_solvers(behind=[], equal=["projection"], ahead=["projection-3x"])
+    ['Its mean error equals that of projection.', 'The error of projection-3x is smaller.']
+    """
     sentences = []
     if behind:
         sentences.append(f"Its mean error is less than that of {join_names(behind)}.")
-    if ahead:
-        sentences.append(f"That of {join_names(ahead)} is less than the model's.")
+    if equal:
+        sentences.append(f"Its mean error equals that of {join_names(equal)}.")
+    if len(ahead) == 1:
+        sentences.append(f"The error of {ahead[0]} is smaller.")
+    elif ahead:
+        sentences.append(f"The errors of {join_names(ahead)} are smaller.")
     return sentences
 
 
@@ -389,7 +427,7 @@ def join_names(names: Sequence[str]) -> str:
 def summarise(overview: SizeOverview) -> list[str]:
     """Return who leads over all data sets of a size, and where learning pays."""
     sentences = [_name_leader(overview)]
-    data_sets: dict[LearningVerdict, list[str]] = {}
+    data_sets: dict[tuple[LearningVerdict, str], list[str]] = {}
     for tab in overview.tabs:
         conclusion = judge(tab)
         if conclusion is None:
@@ -397,11 +435,14 @@ def summarise(overview: SizeOverview) -> list[str]:
         data_set = tab.size.split
         if conclusion.measure:
             data_set += f" ({conclusion.measure})"
-        data_sets.setdefault(conclusion.verdict, []).append(data_set)
+        key = conclusion.verdict, conclusion.model
+        data_sets.setdefault(key, []).append(data_set)
     for verdict, words_of_verdict in SUMMARIES.items():
-        if verdict in data_sets:
-            names = join_names(data_sets[verdict])
-            sentences.append(words_of_verdict.format(names=names))
+        for key, names in data_sets.items():
+            verdict_of_names, model = key
+            if verdict_of_names is verdict:
+                sentence = words_of_verdict.format(names=join_names(names), model=model)
+                sentences.append(sentence)
     return sentences
 
 
@@ -428,8 +469,8 @@ def _name_leader(overview: SizeOverview) -> str:
     )
     if leader.rank_range is not None and leader.rank_range[1] > 1:
         sentence += (
-            f" Drawn again, {leader.name} has rank {leader.rank_range[0]} to "
-            f"{leader.rank_range[1]} (95 %)."
+            f" When the scenarios are drawn again, {leader.name} has rank "
+            f"{leader.rank_range[0]} to {leader.rank_range[1]} (95 %)."
         )
     return sentence
 

@@ -410,20 +410,6 @@ class SplitResults:
                 scores[name] = self.methods[name].scores[self.ranking]
         return rank(scores)
 
-    def less_accurate(self, model: str, kind: Kind) -> list[str]:
-        """Return the methods of a kind that are behind a model, best first."""
-        ranked = self._order_of_kind(model, kind)
-        return ranked[ranked.index(model) + 1 :]
-
-    def more_accurate(self, model: str, kind: Kind) -> list[str]:
-        """Return the methods of a kind that are ahead of a model, best first."""
-        ranked = self._order_of_kind(model, kind)
-        return ranked[: ranked.index(model)]
-
-    def _order_of_kind(self, model: str, kind: Kind) -> list[str]:
-        names = [name for name, method in self.methods.items() if method.kind is kind]
-        return self.order([model, *names])
-
     @property
     def best_naive(self) -> str | None:
         """Name of the best naive baseline, which skill is measured from; None without.

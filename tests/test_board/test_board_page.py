@@ -395,6 +395,10 @@ def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
     accurate = compared(board, "Accurate", error=1.0, ratio=GOOD)
     sentences = conclude(first_tab(board, silent, accurate))
     assert "Accurate, the most accurate model of known cost, has" in sentences
+    shown = text_of_overview(page_of(board, first_tab(board, silent, accurate)))
+    assert "the most accurate model of known cost has less error" in shown
+    shown = text_of_overview(page_of(board, first_tab(board, accurate)))
+    assert "the most accurate model has less error" in shown
 
 
 def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
@@ -430,11 +434,16 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
     assert conclude(tab) == (
         "On cavity full no classical solver is as cheap as Model, the most accurate "
-        "model. Its mean error is less than that of mid and coarse. That of fine is "
-        "less than the model's."
+        "model. Its mean error is less than that of mid and coarse. The error of fine "
+        "is smaller."
     )
     shown = text_of_overview(page_of(board, tab))
     assert "No classical solver is as cheap as the most accurate model on" in shown
+
+    tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
+    sentences = conclude(tab)
+    assert "Its mean error equals that of twin." in sentences
+    assert "The errors of finer and fine are smaller." in sentences
 
 
 def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(

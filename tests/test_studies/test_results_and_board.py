@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 
 from lagbench.board.build import collect
 from lagbench.board.model import Tab
-from lagbench.board.overview import LearningVerdict, judge
+from lagbench.board.overview import LearningVerdict, judge, verdict_of_interval
 from lagbench.references.predictor import Kind
-from studies.result_tables import verdict_on_learning
+from studies.result_tables import deciding_model, verdict_on_learning
 from studies.thesis.split_results import BOARD, Sources, SplitResults
 
 
@@ -49,7 +52,35 @@ def _require_same_verdict(tab: Tab, results: SplitResults) -> None:
     for own_verdict, words_of_verdict in words.items():
         is_own = own_verdict is conclusion.verdict
         assert (words_of_verdict in verdict) is is_own, tab.id
-    assert results.best(Kind.LEARNED, Kind.HYBRID) == conclusion.row.id
+    assert deciding_model(results) == conclusion.row.id
+
+
+def test_a_better_model_of_unknown_cost_decides_nothing() -> None:
+    """The next one decides, as on the page of the leaderboard."""
+    results = SplitResults(Sources(), "cavity", "mini")
+    first = deciding_model(results)
+    assert first is not None
+    unknown = replace(results.methods[first], cost=None, measured=None)
+    results.methods[first] = unknown
+    assert results.best(Kind.LEARNED, Kind.HYBRID) == first
+    second = deciding_model(results)
+    assert second not in (None, first)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [
+        (0.5, 0.9, LearningVerdict.PAYS),
+        (0.5, 1.1, LearningVerdict.OPEN),
+        (1.1, 1.5, LearningVerdict.DOES_NOT_PAY),
+        (math.nan, math.nan, LearningVerdict.OPEN),
+    ],
+)
+def test_the_interval_of_a_ratio_decides(
+    low: float, high: float, verdict: LearningVerdict
+) -> None:
+    """The page and the results take the verdict from this function."""
+    assert verdict_of_interval(low, high) is verdict
 
 
 def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats() -> (
@@ -69,4 +100,4 @@ def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats(
     verdict = verdict_on_learning([results])
     assert beaten
     assert f"less than that of {' and '.join(beaten)}." in verdict
-    assert f"That of {' and '.join(ahead)} is less than the model's." in verdict
+    assert f"The error of {' and '.join(ahead)} is smaller." in verdict
