@@ -246,7 +246,7 @@ def _show_forcing(model: Baseline, unseen: Sequence[str]) -> str:
     known_options = type(model.options).model_fields
     if all(name in known_options for name in unseen):
         settings = [f"--set model.{name}=true" for name in unseen]
-        return f"{' '.join(settings)} shows it"
+        return f"to show it to the model, add {' '.join(settings)}"
     if "body_force" in unseen:
         return "graph networks and NeuralMPM with model.body_force=true see it"
     return "graph networks with model.obstacle=true and NeuralMPM see it"

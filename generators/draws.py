@@ -90,6 +90,7 @@ def quantise(values: ArrayLike) -> NDArray[np.float64]:
     if not np.all(np.abs(exact) < _LARGEST):
         raise WorkFailedError(
             "a drawn value has no exact float32 form",
+            where="datasets.yaml",
             expected=f"finite, magnitude below {_LARGEST}",
             got=float(np.max(np.abs(exact))),
             fix="check the ranges and scales of this split in datasets.yaml",
@@ -116,7 +117,11 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     """
     if not 0.0 < low <= high:
         raise WorkFailedError(
-            "a log-uniform range is empty", expected="0 < low <= high", got=(low, high)
+            "a log-uniform range is empty",
+            where="datasets.yaml",
+            expected="0 < low <= high",
+            got=(low, high),
+            fix="check the ranges of this split in datasets.yaml",
         )
     ratio = _PRECISE.divide(Decimal(high), Decimal(low))
     span = _PRECISE.ln(ratio)

@@ -143,7 +143,9 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
             return bodies
     raise WorkFailedError(
         f"{len(shapes)} bodies have no room side by side",
+        where=f"{size.split} {size.name}",
         expected=f"a gap of {gap} within {_ATTEMPTS} attempts",
+        got="bodies that touch or overlap, in every attempt",
         fix="lower the areas or lengths of this split in datasets.yaml",
     )
 

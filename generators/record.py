@@ -50,6 +50,8 @@ def measured_values(manifest: Manifest) -> Measured:
             where=f"{manifest.split} {manifest.size}",
             expected="all scenarios of train, valid and test, and perturbed runs of "
             "test",
+            got=f"{len(manifest.files)} scenarios; perturbed runs of "
+            f"{sum(bool(limit) for limit in limits)} of test",
             fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
         )
     hashes: dict[int, str] = {}

@@ -209,6 +209,7 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
         if high - low < 2.0 * reach:
             raise WorkFailedError(
                 "a body does not fit between the walls",
+                where="datasets.yaml",
                 expected=f"extent up to {high - low:.4f}",
                 got=f"{2.0 * reach:.4f}",
                 fix="lower the areas or lengths of this split in datasets.yaml",

@@ -132,7 +132,7 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
             raise UsageError(
                 "the model cannot be exported",
                 where="export_onnx",
-                expected=f"a step that reads {names} only, which this data set has",
+                expected=f"a step that reads only inputs of this data set: {names}",
                 got=f"{type(error).__name__}: {reason}",
                 fix="name its networks: modules=[net]; use operations that ONNX has",
             ) from error

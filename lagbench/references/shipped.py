@@ -175,6 +175,10 @@ def _require(size: Size, folder: Path) -> dict[str, Any]:
         raise DataError(
             "no reference predictors were measured on this data set",
             where=str(shipped_path(size, folder)),
+            expected="scores of reference predictors on the present data",
+            got="none, or scores on other data",
+            fix="measure the scores first: "
+            "python -m lagbench.scoring.measure_references",
         )
     return content
 
