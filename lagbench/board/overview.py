@@ -381,8 +381,8 @@ def place_among_solvers(
 ) -> list[str]:
     """Return sentences about the mean error of a model beside those of solvers.
 
-    >>> place_among_solvers(behind=[], equal=["projection"], ahead=["projection-3x"])
-    ['Its mean error equals that of projection.', 'The error of projection-3x is smaller.']
+    >>> place_among_solvers(behind=["coarse"], equal=[], ahead=["fine"])
+    ['Its mean error is less than that of coarse.', 'The error of fine is smaller.']
     """
     sentences = []
     if behind:
