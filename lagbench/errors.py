@@ -44,6 +44,9 @@ SPLIT_NAMED = "SPLIT or --split"
 MOST_NAMES = 30
 """Names that a hint lists; of more it lists those that are near a wrong one."""
 
+FIRST_NAMES = 5
+"""Names that a hint lists where there are more, and none is near."""
+
 PATIENCE = 20.0
 """Time that the import of a package's module may take before a line names it [s]."""
 
@@ -329,8 +332,12 @@ def suggest_name(name: str, known_names: Iterable[str]) -> str:
     words = sorted(known_names)
     close_words = difflib.get_close_matches(name, words, n=5, cutoff=0.5)
     listing = f"known: {', '.join(words) or 'none'}"
-    if close_words and len(words) > MOST_NAMES:
-        listing = f"known, among others: {', '.join(close_words)}"
+    if len(words) > MOST_NAMES:
+        if close_words:
+            listing = f"known, among others: {', '.join(close_words)}"
+        else:
+            first_words = ", ".join(words[:FIRST_NAMES])
+            listing = f"known: {first_words} and {len(words) - FIRST_NAMES} more"
     if close_words:
         return f"did you mean {close_words[0]!r}? {listing}"
     return listing

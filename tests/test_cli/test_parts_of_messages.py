@@ -114,3 +114,14 @@ def test_errors_named_by_their_module_are_found(tmp_path: Path) -> None:
     path = tmp_path / "module.py"
     path.write_text("raise errors.UsageError('no')\nraise UsageError('no')\n")
     assert len(list(incomplete_errors(path))) == 2
+
+
+def test_a_hint_of_many_names_is_short() -> None:
+    """Above thirty names, the nearest are listed, or else the first and a count."""
+    names = [f"name{number:03d}" for number in range(200)]
+    hint = errors.suggest_name("zzzqqq", names)
+    assert hint.endswith("name004 and 195 more")
+    assert "did you mean 'name001'?" in errors.suggest_name("name01", ["name001"])
+    for name in ("zzzqqq", "name01"):
+        assert len(errors.suggest_name(name, names)) < 120
+    assert errors.suggest_name("zzzqqq", names[:30]).count("name") == 30
