@@ -265,13 +265,13 @@ def compare(
     expected_split = None
     if split is not None:
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
-    entries = list_entries(board)
+    board_folder, entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)
     splits = (registry or load()).splits
-    first = _find_entry(first, entries, splits)
+    first = _find_entry(first, board_folder, entries, splits=splits)
     if not is_bare:
-        second = _find_entry(second, entries, splits)
+        second = _find_entry(second, board_folder, entries, splits=splits)
 
     # before anything is scored
     _check_files(first)
@@ -355,15 +355,15 @@ def _is_bare_name(second: str | Path) -> bool:
     return is_plain and not os.path.lexists(second)
 
 
-def list_entries(board: str | Path | None) -> dict[Place, Path]:
-    """Return the entries of a leaderboard that have score files.
+def list_entries(board: str | Path | None) -> tuple[Path | None, dict[Place, Path]]:
+    """Return the folder of a leaderboard, and its entries that have score files.
 
     A path without the number of a seed stands for all seeds of an entry, as
     :func:`_seed_files` reads it.
 
     Args:
         board: its folder; ``leaderboard`` in the working folder when None, else that of
-            the clone, else none.
+            the clone, else none: then the folder is None.
 
     Raises:
         UsageError: the named folder is no leaderboard.
@@ -374,20 +374,26 @@ def list_entries(board: str | Path | None) -> dict[Place, Path]:
         # without a leaderboard, files are compared still
         if board is not None:
             raise
-        return {}
+        return None, {}
 
     entries: dict[Place, Path] = {}
     for path in sorted((folder / SCORES).glob("*/*/*.nc")):
         split, size = path.parts[-3:-1]
         method = re.sub(r"_[0-9]+$", "", path.stem)
         entries[split, size, method] = path.with_name(f"{method}.nc")
-    return entries
+    return folder, entries
 
 
 def _find_entry(
-    source: str | Path, entries: Mapping[Place, Path], splits: Collection[str]
+    source: str | Path,
+    board: Path | None,
+    entries: Mapping[Place, Path],
+    *,
+    splits: Collection[str],
 ) -> str | Path:
     """Return the score file of an entry named as split/size/method, else the source.
+
+    The path of a file, which has a suffix, is no name of an entry.
 
     Raises:
         UsageError: the name of an entry without its data set, or of none; or there is
@@ -398,8 +404,8 @@ def _find_entry(
     place = Path(source).parts
     if len(place) == 3 and place in entries:
         return entries[place]
-    if len(place) == 3 and place[0] in splits:
-        raise _no_such_entry(place, entries)
+    if len(place) == 3 and place[0] in splits and not Path(source).suffix:
+        raise _no_such_entry(place, board, entries)
     data_sets = []
     for split, size, method in entries:
         if (method,) == place:
@@ -415,15 +421,17 @@ def _find_entry(
     return source
 
 
-def _no_such_entry(place: Place, entries: Mapping[Place, Path]) -> UsageError:
+def _no_such_entry(
+    place: Place, board: Path | None, entries: Mapping[Place, Path]
+) -> UsageError:
     """Return the error for the name of an entry that the leaderboard does not have."""
-    if not entries:
+    if board is None:
         return no_board()
     name = "/".join(place)
     names = ["/".join(known) for known in entries if known[0] == place[0]]
     return UsageError(
         "no such entry",
-        where="the leaderboard",
+        where=str(board),
         expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
         got=ascii(name),
         fix=suggest_name(name, names),

@@ -347,6 +347,23 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     with pytest.raises(UsageError, match="no such entry") as caught:
         compare(f"{name}s", "persistence", board=entries)
     assert f"did you mean '{name}'" in str(caught.value)
+    assert caught.value.where == str(entries)
+
+
+def test_a_board_without_the_entry_is_named(tmp_path: Path) -> None:
+    """An empty leaderboard is one."""
+    (tmp_path / "empty" / "submissions").mkdir(parents=True)
+    name = "cavity/mini/gns"
+    with pytest.raises(UsageError, match="no such entry") as caught:
+        compare(name, "persistence", board=tmp_path / "empty")
+    assert caught.value.where == str(tmp_path / "empty")
+
+
+def test_a_missing_file_is_no_missing_entry(entries: Path) -> None:
+    for name in ("cavity/mini/predictions.nc", "cavity/mini/scores.json"):
+        with pytest.raises(UnreadableFileError, match="no such file") as caught:
+            compare(name, "persistence", board=entries)
+        assert name in str(caught.value.where)
 
 
 def refused_before_scoring(
