@@ -7,7 +7,7 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
@@ -26,7 +26,6 @@ from lagbench.errors import (
 )
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
-from .frame import FramePair
 from .metric import Metric, observable
 
 GROUP = "lagbench.metrics"
@@ -167,10 +166,10 @@ def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def own_metrics(
-    values: Iterable[Metric | Callable[[FramePair], float]],
-) -> tuple[Metric, ...]:
+def own_metrics(values: object) -> tuple[Metric, ...]:
     """Return metrics that a user hands over in Python, without a package.
+
+    Values are metrics and functions of a frame pair, or one of them.
 
     A function of a frame pair becomes an observable, which is shown and not judged. It
     has the name of the function, and as summary the first paragraph of its docstring.
@@ -179,23 +178,22 @@ def own_metrics(
         UsageError: a value is neither a metric nor a function; its name is taken, or no
             name for a metric; or it follows from statistics that nothing measures.
     """
+    candidates: Iterable[object]
     if isinstance(values, Metric) or callable(values):
-        values = (values,)
+        candidates = (values,)
+    elif isinstance(values, Iterable) and not isinstance(values, str):
+        candidates = values
+    else:
+        raise _no_own_metric(values)
     metrics = []
     table = available()
-    for value in values:
+    for value in candidates:
         if isinstance(value, Metric):
             own = value
-        elif hasattr(value, "__name__"):
+        elif callable(value) and hasattr(value, "__name__"):
             own = observable(value)
         else:
-            raise UsageError(
-                "a value is no metric",
-                where="metrics",
-                expected="lagbench.metrics.Metric, or a named function of a frame pair",
-                got=f"{type(value).__name__}: {value!r:.60}",
-                fix="write the function first: see docs/extending.md",
-            )
+            raise _no_own_metric(value)
         if own.name in table:
             raise UsageError(
                 "another metric has the name",
@@ -209,6 +207,20 @@ def own_metrics(
     for own in metrics:
         _check_statistics(own, table)
     return tuple(metrics)
+
+
+def _no_own_metric(value: object) -> UsageError:
+    """Return the error for a value that is neither a metric nor a named function."""
+    fix = "write the function first: see docs/extending.md"
+    if isinstance(value, str):
+        fix = f"leave the name out: built-in metrics need no metrics=; or {fix}"
+    return UsageError(
+        "a value is no metric",
+        where="metrics",
+        expected="lagbench.metrics.Metric, or a named function of a frame pair",
+        got=f"{type(value).__name__}: {value!r:.60}",
+        fix=fix,
+    )
 
 
 def _check_statistics(own: Metric, table: Mapping[str, Metric]) -> None:

@@ -1,4 +1,8 @@
-"""Metrics of other packages that fail: they cost their own column, not the score."""
+"""Metrics that are not ours and fail.
+
+One of another package costs its own column, not the score. One that a user hands over
+ends the scoring.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import Severity, ValidationIssue, quote
 
 FIX = "mend it, or leave it out: uninstall the package that adds it"
+OWN_FIX = "mend the function, or leave it out of metrics="
 
 
 class PackageMetricError(WorkFailedError):
@@ -67,6 +72,17 @@ def drop_metric(metrics: Sequence[Metric], name: str) -> tuple[Metric, ...]:
         if name not in (metric.name, *metric.of):
             rest.append(metric)
     return tuple(rest)
+
+
+def own_metric_error(error: PackageMetricError) -> WorkFailedError:
+    """Return the error for a metric that the user hands over, as it failed."""
+    return WorkFailedError(
+        f"the metric {error.metric}, which is your own, failed",
+        where=error.where,
+        expected="a number",
+        got=error.got,
+        fix=OWN_FIX,
+    )
 
 
 def describe_failure(error: PackageMetricError) -> ValidationIssue:

@@ -34,6 +34,7 @@ from .package_metrics import (
     PackageMetricError,
     describe_failure,
     drop_metric,
+    own_metric_error,
     package_metric_errors,
 )
 from .published_scores import read_scores
@@ -237,7 +238,7 @@ def _measure(
             tallies, scores = _aggregate(outcomes, metrics)
         except PackageMetricError as error:
             if error.metric in own_names:
-                raise
+                raise own_metric_error(error) from error.__cause__
             # measured again without it: its column is left out, the others are whole
             metrics = drop_metric(metrics, error.metric)
             failures.append(describe_failure(error))

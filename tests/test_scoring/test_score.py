@@ -472,7 +472,11 @@ def test_an_own_metric_may_follow_from_others(
 @pytest.mark.parametrize(
     ("metrics", "options"),
     [
+        (3, {}),
         ([3], {}),
+        ([np], {}),
+        ([object()], {}),
+        ("vorticity_rmse", {}),
         (["vorticity_rmse"], {}),
         ([lambda pair: 0.0], {}),
         ([replace(FALL, name="position_rmse")], {}),
@@ -485,7 +489,7 @@ def test_an_own_metric_may_follow_from_others(
 def test_what_is_no_own_metric_is_refused(
     bench: ScoreBench,
     tmp_path: Path,
-    metrics: list[object],
+    metrics: object,
     options: dict[str, object],
 ) -> None:
     """Nothing is scored before."""
@@ -506,6 +510,17 @@ def test_an_own_metric_that_fails_is_told(bench: ScoreBench, tmp_path: Path) -> 
         bench.evaluate(path, metrics=[broken])
     assert isinstance(caught.value.__cause__, AttributeError)
     assert "scenario" in str(caught.value.where)
+    assert "metrics=" in str(caught.value.fix)
+    assert "package" not in str(caught.value)
+
+
+@pytest.mark.parametrize("metrics", ["vorticity_rmse", ["vorticity_rmse"]])
+def test_a_built_in_metric_needs_no_argument(
+    bench: ScoreBench, tmp_path: Path, metrics: object
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        bench.evaluate(tmp_path / "none.nc", metrics=metrics)
+    assert "built-in metrics need no metrics=" in str(caught.value.fix)
 
 
 def test_the_own_metric_of_the_docs_is_measured(
