@@ -29,6 +29,7 @@ __all__ = [
     "obstacle_features",
     "require_force",
     "root_mean_square",
+    "skip_frames",
 ]
 
 
@@ -179,6 +180,25 @@ def require_force(given: Batch, info: DatasetInfo) -> Tensor:
             fix="train without it: --set model.body_force=false",
         )
     return given.body_force * info.frame_interval**2
+
+
+def skip_frames(forcing: Tensor, count: int = 1, *, least: int = 1) -> Tensor:
+    """Return the forcing from some frames later on; the last known one stays.
+
+    Args:
+        forcing: what drives the flow in the coming frames, shape
+            [window, frame, ...].
+        count: frames to skip.
+        least: frames that the result has at least; the last known one repeats.
+    """
+    last_frame = forcing.shape[1] - 1
+    skipped = min(count, last_frame)
+    later = forcing[:, skipped:]
+    missing_frames = least - later.shape[1]
+    if missing_frames <= 0:
+        return later
+    repeated = forcing[:, -1:].repeat_interleave(missing_frames, dim=1)
+    return torch.cat([later, repeated], dim=1)
 
 
 def force_at(

@@ -28,7 +28,7 @@ from lagbench.tensors import TensorBox
 
 from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
-from .forcing import ForcingFeatures, require_force, root_mean_square
+from .forcing import ForcingFeatures, require_force, root_mean_square, skip_frames
 from .graph import MATERIALS
 
 OBSTACLE_REACH = 3.0  # how far a particle sees an obstacle's surface [radius]
@@ -262,23 +262,12 @@ class FrameModel(Baseline):
         states = torch.cat([latest_states, new_state.unsqueeze(1)], dim=1)
         force = state.body_force
         if force is not None:
-            force = _skip_frame(force, least=states.shape[1])
+            force = skip_frames(force, least=states.shape[1])
         window = replace(state, state=states, body_force=force)
 
         position = self.frame_state.position(new_state)
         position = position.flatten(0, 1)
         return window, position.to(torch.float32)
-
-
-def _skip_frame(force: Tensor, *, least: int) -> Tensor:
-    """Return the force from one frame later on, of a least number of frames.
-
-    The last known one stays. The shape is [window, frame, layer, axis].
-    """
-    later = force[:, 1:]
-    if later.shape[1] < least:
-        return torch.cat([later, force[:, -1:]], dim=1)
-    return later
 
 
 class FrameTarget(enum.StrEnum):

@@ -38,7 +38,7 @@ from .augmentation import (
     velocity_towards_path,
 )
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
-from .forcing import require_force
+from .forcing import require_force, skip_frames
 from .neuralmpm_accelerations import (
     Accelerations,
     FieldAccelerations,
@@ -442,10 +442,10 @@ class NeuralMPM(Baseline):
         new_velocities = [velocity for _, velocity in frames]
         new_velocity = torch.stack(new_velocities, dim=1)
         velocity = torch.cat([state.velocity, new_velocity], dim=1)
-        walls = _skip_frames(state.walls, frame_count)
+        walls = skip_frames(state.walls, frame_count)
         force = state.body_force
         if force is not None:
-            force = _skip_frames(force, frame_count)
+            force = skip_frames(force, frame_count)
         return replace(
             state,
             position=last_position,
@@ -453,16 +453,6 @@ class NeuralMPM(Baseline):
             walls=walls,
             body_force=force,
         )
-
-
-def _skip_frames(forcing: Tensor, count: int) -> Tensor:
-    """Return the forcing after some frames; the last one always stays.
-
-    The shape of ``forcing`` is [window, frame, ...].
-    """
-    last_frame = forcing.shape[1] - 1
-    skipped = min(count, last_frame)
-    return forcing[:, skipped:]
 
 
 def _isotropic_std(info: DatasetInfo, name: str) -> float:

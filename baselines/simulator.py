@@ -39,7 +39,7 @@ from .baseline import (
     check_moving_walls,
     last_velocities,
 )
-from .forcing import ForcingFeatures, root_mean_square
+from .forcing import ForcingFeatures, root_mean_square, skip_frames
 from .graph import (
     NodeFeatures,
     Standardisation,
@@ -85,23 +85,19 @@ class ParticleState:
         """Return the state one frame on."""
         later_velocities = self.velocity[:, 1:]
         velocities = torch.cat([later_velocities, velocity.unsqueeze(1)], dim=1)
+        wall_velocity = self.wall_velocity
+        if wall_velocity is not None:
+            wall_velocity = skip_frames(wall_velocity)
+        body_force = self.body_force
+        if body_force is not None:
+            body_force = skip_frames(body_force)
         return replace(
             self,
             position=position,
             velocity=velocities,
-            wall_velocity=_skip_frame(self.wall_velocity),
-            body_force=_skip_frame(self.body_force),
+            wall_velocity=wall_velocity,
+            body_force=body_force,
         )
-
-
-def _skip_frame(forcing: Tensor | None) -> Tensor | None:
-    """Return what drives the flow from the frame after the next on; the last one stays.
-
-    The shape is [window, frame, ...].
-    """
-    if forcing is None or forcing.shape[1] == 1:
-        return forcing
-    return forcing[:, 1:]
 
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")

@@ -22,11 +22,10 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lagbench.errors import UsageError
-from lagbench.scoring.boards import require_board
+from lagbench.scoring.boards import SUBMISSIONS, require_board
 
 Place = tuple[str, str, str]  # split, size and method
 
-SUBMISSIONS = "submissions"
 SCORES = "scores"
 REFERENCES = "floors"
 WEIGHTS = "weights"

@@ -10,9 +10,9 @@ from lagbench.scoring.compare import compare
 from lagbench.scoring.tables import comparison_lines, comparison_tables
 
 from .options import (
+    FoundBoardOption,
     JsonFlag,
     QuietFlag,
-    ReadBoardOption,
     RootOption,
     WorkersOption,
     option,
@@ -43,7 +43,7 @@ def compare_command(
         list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
     ] = None,
     split: ExpectedSplitOption = None,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
     every: Annotated[bool, option("--all", "Show every metric.")] = False,

@@ -13,10 +13,10 @@ from lagbench.errors import UsageError, format_count, hide_user
 from lagbench.make.generate import GenerationResult, generate
 
 from .options import (
+    FoundBoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
-    ReadBoardOption,
     RootOption,
     ScenariosOption,
     SchedulerOption,
@@ -64,7 +64,7 @@ def generate_command(
             "for those of --split and --size.",
         ),
     ] = None,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

@@ -35,10 +35,10 @@ from lagbench.scoring.references import sizes_with_test_files
 from .options import (
     DEFAULT_BOARD,
     BoardOption,
+    FoundBoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
-    ReadBoardOption,
     RootOption,
     SplitArgument,
     SplitOption,
@@ -51,6 +51,7 @@ from .output import (
     format_bytes,
     print_json,
     print_line,
+    print_note,
     print_result,
     print_tables,
     print_warning,
@@ -84,7 +85,7 @@ def build_command(
 
 
 def check_command(
-    board: BoardOption = DEFAULT_BOARD,
+    board: FoundBoardOption = None,
     base: Annotated[
         str | None,
         option("--base REF", "Report changes to entries that this git commit has."),
@@ -154,7 +155,7 @@ def check_command(
         sizes = _sizes_to_measure(root, split, size)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = check_board(
-            board,
+            find_board(board),
             page=page,
             base=base,
             own=own or (),
@@ -228,7 +229,7 @@ def picture_command(
     output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path(
         "cost.svg"
     ),
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw the accuracy of models against their cost as an SVG file."""
@@ -282,7 +283,7 @@ def reproduce_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -312,9 +313,12 @@ def reproduce_command(
             got="both" if costs and no_costs else f"--scenarios {scenarios}",
             fix="leave one of the options out, or ask for one scenario or more",
         )
+    folder = find_board(board)
+    if recording and not quiet:
+        print_note(f"results go to {folder}")
     with progress_bar(quiet=quiet or as_json) as progress:
         result = reproduce(
-            find_board(board),
+            folder,
             entries or (),
             split=split,
             size=size,
@@ -392,7 +396,7 @@ def shift_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -415,9 +419,12 @@ def shift_command(
             got="both" if every else "neither",
             fix="lagbench leaderboard shift cavity/mini/gns",
         )
+    folder = find_board(board)
+    if not quiet:
+        print_note(f"results go to {folder}")
     with progress_bar(quiet=quiet or as_json) as progress:
         result = score_on_shift(
-            find_board(board),
+            folder,
             entries or (),
             split=split,
             size=size,
@@ -468,7 +475,7 @@ def show_command(
             "Show variants, deviations and the first metrics of each data set.",
         ),
     ] = False,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Print the tables of the leaderboard."""

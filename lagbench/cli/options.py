@@ -85,7 +85,7 @@ SchedulerOption = Annotated[
 ]
 DEFAULT_BOARD = Path("leaderboard")
 BoardOption = Annotated[Path, option("--board FOLDER", "Folder of the leaderboard.")]
-ReadBoardOption = Annotated[
+FoundBoardOption = Annotated[
     Path | None,
     option(
         "--board FOLDER",

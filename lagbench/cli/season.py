@@ -34,13 +34,13 @@ from lagbench.scoring.boards import find_board
 from .options import (
     DEFAULT_BOARD,
     BoardOption,
+    FoundBoardOption,
     JsonFlag,
     QuietFlag,
-    ReadBoardOption,
     RootOption,
     option,
 )
-from .output import print_json, print_line, print_result, print_tables
+from .output import print_json, print_line, print_note, print_result, print_tables
 from .progress import progress_bar
 
 SeasonArgument = Annotated[
@@ -150,7 +150,7 @@ def run_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -167,6 +167,8 @@ def run_command(
     5: out of memory or disk
     """
     board = find_board(board)
+    if not check and not quiet:
+        print_note(f"results go to {board}")
     with progress_bar(quiet=quiet or as_json) as progress:
         result = run_season(
             board,
@@ -218,7 +220,7 @@ def show_command(
     as_markdown: Annotated[
         bool, option("--markdown", "Print the table as Markdown, for a page.")
     ] = False,
-    board: ReadBoardOption = None,
+    board: FoundBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Print public and blind skill of a season, and their gap."""

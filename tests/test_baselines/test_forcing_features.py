@@ -20,7 +20,12 @@ from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
-from lagbench.baselines.forcing import ForcingFeatures, force_at, obstacle_features
+from lagbench.baselines.forcing import (
+    ForcingFeatures,
+    force_at,
+    obstacle_features,
+    skip_frames,
+)
 from lagbench.baselines.graph import edge_features
 from lagbench.baselines.predict import predict
 from lagbench.baselines.rollout import roll_out, scenario_batch
@@ -49,6 +54,26 @@ def info_of_box(box: Box) -> DatasetInfo:
         statistics[name] = (*values, *values)[: box.dimension]
     axes = [name for name, repeats in zip("xyz", box.periodic, strict=False) if repeats]
     return info(bounds=box.bounds, periodic=tuple(axes), statistics=statistics)
+
+
+@pytest.mark.parametrize(
+    ("frames", "count", "least", "expected"),
+    [
+        (4, 1, 1, [1, 2, 3]),
+        (4, 3, 1, [3]),
+        (4, 9, 1, [3]),
+        (1, 1, 1, [0]),
+        (3, 1, 3, [1, 2, 2]),
+        (4, 1, 3, [1, 2, 3]),
+    ],
+)
+def test_the_last_known_forcing_stays(
+    frames: int, count: int, least: int, expected: list[int]
+) -> None:
+    """Frames beyond the known ones have it."""
+    forcing = torch.arange(frames).reshape(1, frames, 1)
+    later = skip_frames(forcing, count, least=least)
+    assert later.flatten().tolist() == expected
 
 
 def parabola(height: NDArray[np.float64], force: float, viscosity: float) -> Any:

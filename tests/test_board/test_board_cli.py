@@ -176,10 +176,15 @@ def test_the_board_of_the_clone_is_found_elsewhere(
     assert str(clone_board) in shown.stdout
     again = run("leaderboard", "reproduce", "cavity/mini/gns")
     assert "no such entry" in again.stderr
+    assert str(clone_board) in again.stderr.replace("\n", "")
+    checked = run("leaderboard", "check")
+    assert checked.exit_code == 0
+    assert str(clone_board) in checked.stdout
     for command in ("reproduce", "shift"):
         none = run("leaderboard", command, "--all", "--split", "cavty")
         assert none.exit_code == 2
         assert "no entries there" in none.stderr
+        assert str(clone_board) in none.stderr.replace("\n", "")
     picture = run("leaderboard", "picture", "cavity", "--size", "mini")
     assert "no entries there" in picture.stderr
     assert not (tmp_path / "cost.svg").exists()
