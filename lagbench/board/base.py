@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from lagbench.errors import UsageError
+from lagbench.scoring.boards import SUBMISSIONS
 from lagbench.submission.issues import ValidationIssue
 
 from .entry_file import MAX_ENTRY_BYTES
@@ -23,7 +24,6 @@ from .folder import (
     SCORES,
     SEASONS,
     SHIFT,
-    SUBMISSIONS,
     VERIFIED,
     WEIGHTS,
     Folder,

@@ -21,6 +21,7 @@ from pathlib import Path
 from lagbench.atomic import move_together, refuse_folders, write_atomically
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
+from lagbench.scoring.boards import SUBMISSIONS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
@@ -33,7 +34,6 @@ from .folder import (
     REFERENCES,
     SHIFT,
     STAGING,
-    SUBMISSIONS,
     VERIFIED,
     Folder,
     entry_path,

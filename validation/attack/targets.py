@@ -22,12 +22,12 @@ from lagbench.board.folder import (
     SCORES,
     SEASONS,
     SHIFT,
-    SUBMISSIONS,
     VERIFIED,
     WEIGHTS,
 )
 from lagbench.data.registry import load
 from lagbench.models.onnx_model import LOAD_SECONDS, SECONDS_PER_FRAME
+from lagbench.scoring.boards import SUBMISSIONS
 
 from .arrays import ARRAYS, write_gns, write_trajectories
 from .models import ONNX, write_straight_on
