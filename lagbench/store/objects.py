@@ -507,7 +507,11 @@ def _require_scheme(url: str) -> str:
 
 
 def _require_place(url: str, place: str) -> None:
-    """Refuse an address that ends with its scheme, and one of S3 without a bucket."""
+    """Refuse an address without host, bucket or path, or with a blank in its user.
+
+    Raises:
+        UsageError: it is one of these.
+    """
     if url.startswith(S3) and place.startswith("/"):
         place = ""
     if not place:
@@ -517,6 +521,18 @@ def _require_place(url: str, place: str) -> None:
             expected="a host, a bucket or a path behind ://",
             got="nothing",
             fix=STORE_HINT,
+        )
+    without_blanks = re.sub(r"\s", "", url)
+    has_user = hide_user(without_blanks) != without_blanks
+    has_blank = re.search(r"\s", url.rpartition("@")[0]) is not None
+    if has_user and has_blank and not url.startswith(LOCAL):
+        # messages would show what stands before the blank
+        raise UsageError(
+            "a blank in the user or the password of an address",
+            where=_short_address(url),
+            expected="no blank before the last @",
+            got="a blank",
+            fix="write it as %20",
         )
 
 

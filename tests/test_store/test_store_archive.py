@@ -328,6 +328,7 @@ def test_a_long_text_in_a_message_costs_no_time(text: str, ending: str) -> None:
         "http://[a:secret@host/x",
         "http://ann:secret x@host/a",
         "http://ann:secret/\u2100@host/a",
+        "ftp://ann:secret x@host/a",
     ],
 )
 def test_an_address_with_a_password_is_refused_without_it(address: str) -> None:
@@ -342,6 +343,7 @@ def test_an_address_with_a_password_is_refused_without_it(address: str) -> None:
 def test_an_at_sign_in_a_path_is_no_password() -> None:
     objects.check_address("http://localhost:8000/data@v2")
     objects.check_address("http://host/data@v2")
+    objects.check_address("file:///my folder/data@v2")
 
 
 def test_a_part_of_a_password_is_not_shown() -> None:
