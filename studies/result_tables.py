@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
@@ -72,6 +73,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     """
     pays = []
     open_sets = []
+    without_interval = []
     does_not_pay = []
     unmatched = []
     for results in all_results:
@@ -87,6 +89,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             pays.append(results.where)
         elif verdict is LearningVerdict.DOES_NOT_PAY:
             does_not_pay.append(results.where)
+        elif math.isnan(sum(against.interval)):
+            without_interval.append(results.where)
         else:
             open_sets.append(results.where)
     sentences = []
@@ -98,6 +102,11 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     if open_sets:
         sentences.append(
             f"On {_join(open_sets)} the interval contains 1: the question is open."
+        )
+    if without_interval:
+        sentences.append(
+            f"On {_join(without_interval)} there are too few scenarios for an interval:"
+            " the question is open."
         )
     if does_not_pay:
         sentences.append(
