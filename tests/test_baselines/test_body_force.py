@@ -209,6 +209,7 @@ def test_a_training_says_that_its_model_does_not_see_the_force(
         assert "--set model.body_force=true" in messages[0]
 
 
+@pytest.mark.slow
 def test_the_obstacle_of_a_data_set_is_found(
     root: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:

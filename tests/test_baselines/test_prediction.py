@@ -594,6 +594,7 @@ def test_options_that_need_other_weights_do_not_change(
         run("several", settings=[setting])
 
 
+@pytest.mark.slow
 def test_no_image_falls_sideways(
     tiny_split: Callable[..., GenerationResult], tmp_path: Path
 ) -> None:

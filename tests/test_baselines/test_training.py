@@ -165,7 +165,7 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
     ("baseline", "settings"),
     [
         ("drift", []),
-        (
+        pytest.param(
             "neuralmpm",
             [
                 "model.noise_std=1e-4",
@@ -174,6 +174,7 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
                 "model.pushforward=2",
                 "model.recovery=4",
             ],
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -379,6 +379,7 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "most"),
     [

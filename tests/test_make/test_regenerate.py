@@ -16,7 +16,7 @@ from lagbench.make.verify import verify
 
 SPLITS = tuple(load().splits)
 
-# Each compiles kernels of its own, which takes seconds.
+# Each compiles kernels of its own, which takes up to 20 seconds.
 OWN_KERNELS = (
     "decaying-vortices",
     "poiseuille",
@@ -28,7 +28,10 @@ OWN_KERNELS = (
 )
 OF_THIS_TURN = (
     *(name for name in SPLITS if name not in OWN_KERNELS),
-    *of_this_turn(OWN_KERNELS, turns=len(OWN_KERNELS)),
+    *(
+        pytest.param(name, marks=pytest.mark.slow)
+        for name in of_this_turn(OWN_KERNELS, turns=len(OWN_KERNELS))
+    ),
 )
 
 

@@ -217,6 +217,7 @@ def test_a_forger_who_mends_the_file_is_caught(
     assert caught.value.where.endswith("root/curl-noise/tiny/v2")
 
 
+@pytest.mark.slow
 def test_a_forger_who_keeps_the_stored_hashes_is_caught(
     copied: Copy, measured: Registry
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_header_may_be_as_long_as_a_pickle_begins(sound: Path) -> None:
     assert load(sound).baseline == "gns"
 
 
+@pytest.mark.slow
 def test_the_checks_run_in_a_child(sound: Path) -> None:
     """What it refuses is an error of an unreadable file here."""
     check_in_child(sound)

@@ -362,6 +362,7 @@ def test_the_page_works_without_entries(
     assert has_section is floor
 
 
+@pytest.mark.slow
 def test_a_stale_page_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -627,7 +628,9 @@ def test_an_interrupt_says_how_to_go_on(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not of_this_turn([0], turns=2), reason="the turn of other commits")
+@pytest.mark.skipif(
+    not of_this_turn([0], turns=3, shift=1), reason="the turn of other commits"
+)
 def test_everything_is_made_at_tiny(
     tmp_path: Path,
     unmeasured: Registry,

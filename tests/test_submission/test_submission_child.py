@@ -122,6 +122,7 @@ def test_a_hard_limit_of_memory_is_kept_and_named() -> None:
     assert failure == "768 MiB for a child process | a limit of 500 MiB"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("jobs")
 def test_a_child_that_answers_waits_or_raises() -> None:
     """What JSON can hold goes there and back, in the order of requests.

@@ -88,7 +88,17 @@ def test_there_are_enough_faults_and_a_valid_file_has_none(bench: Bench) -> None
     assert result.method == "truth"
 
 
-@pytest.mark.parametrize("name", FAULTS)
+SLOW_FAULTS = ("heap_loops",)
+"""Their files are read for seconds before they are given up."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in SLOW_FAULTS else name
+        for name in FAULTS
+    ],
+)
 def test_a_faulty_file_fails_its_check(
     bench: Bench, peaks: list[float], name: str
 ) -> None:
