@@ -359,10 +359,13 @@ def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterat
             verdict = "reproduced"
             if not one.agrees:
                 verdict = "NOT reproduced"
+            when = ""
+            if f"{name}{seed}" not in result.predicted:
+                when = f"; recorded on {line.date}, --again runs it now"
             yield (
                 f"{name}{seed}: {verdict}, {one.metric} {one.reproduced:.6g} against "
                 f"{one.submitted:.6g} ({one.difference:.1e} relative, {one.scenarios} "
-                f"of {one.of} scenarios)"
+                f"of {one.of} scenarios){when}"
             )
         if line.cost is not None and with_costs:
             milliseconds = 1e3 * line.cost.seconds_per_frame

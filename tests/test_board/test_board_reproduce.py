@@ -215,3 +215,18 @@ def test_the_command_says_what_it_did(
         assert result.exit_code == 2
     result = run(*command, "curl-noise/tiny/nobody", *board, "--json")
     assert result.exit_code == 2
+
+
+def test_what_was_not_run_is_told_as_recorded(
+    own: ModelBoard, run: Callable[..., Result]
+) -> None:
+    """The first and the third call run the model; the second one reads its line."""
+    command = ["leaderboard", "reproduce", NAME, "--no-costs"]
+    where = ["--board", own.folder, "--root", own.root]
+    printed = []
+    for options in (["--again"], [], ["--again"]):
+        result = run(*command, *options, *where)
+        assert result.exit_code == 0, result.output
+        printed.append(result.stdout)
+    told = ["--again runs it now" in text for text in printed]
+    assert told == [False, True, False]
