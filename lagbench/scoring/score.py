@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
+from lagbench.data.local import (
+    DESCRIPTION,
+    load_rooted_registry,
+    locate_split,
+    resolve_root,
+)
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
@@ -334,14 +339,17 @@ def _aggregate(
 def scores_folder(predictions: Path) -> Path:
     """Return the default folder of the scores of a file: beside it, with its name.
 
+    The folder of a local split is none: predictions may have the name of their split.
+
     >>> scores_folder(Path("runs/gns.nc")).as_posix()
     'runs/gns'
     >>> scores_folder(Path("runs/gns")).as_posix()
     'runs/gns-scores'
     """
-    if predictions.suffix:
-        return predictions.parent / predictions.stem
-    return predictions.parent / f"{predictions.name}-scores"
+    folder = predictions.parent / predictions.stem
+    if predictions.suffix and not (folder / DESCRIPTION).exists():
+        return folder
+    return predictions.parent / f"{predictions.stem}-scores"
 
 
 def _check_overwriting(path: Path, header: Header) -> None:

@@ -23,6 +23,7 @@ from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.published_scores import read_scores
+from lagbench.scoring.score import scores_folder
 from lagbench.scoring.score_file_checks import read_published_scores
 from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.store.dataset import open_split
@@ -541,3 +542,13 @@ def test_the_own_metric_of_the_docs_is_measured(
     path = bench.submit(tmp_path / "predictions.nc", right)
     card = bench.evaluate(path, metrics=[names["mean_height_error"]])
     assert card.submission["mean_height_error"].mean == 0.0
+
+
+def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
+    """Predictions that are named after their local split are scored beside it."""
+    predictions = tmp_path / "own.nc"
+    assert scores_folder(predictions) == tmp_path / "own"
+    (tmp_path / "own").mkdir()
+    assert scores_folder(predictions) == tmp_path / "own"
+    (tmp_path / "own" / "split.yaml").write_text("format: 1\n")
+    assert scores_folder(predictions) == tmp_path / "own-scores"
