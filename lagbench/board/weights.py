@@ -33,7 +33,7 @@ from .entry_file import MOST_FILE_BYTES, is_unchanged
 from .folder import Folder, Place, weights_path
 from .issues import make_issue
 
-MOST_BYTES = MOST_FILE_BYTES
+MOST_BYTES = 60_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
 good.
 """
