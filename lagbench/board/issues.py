@@ -124,8 +124,8 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "weights": BoardCheck(
         "weights that are missing, edited, in a wrong place, or named by no entry or "
-        "by two; more than 40 MB of weights; a training log that is too long or "
-        "broken",
+        "by two; more than 60 MB of weights, or a file of more than 40 MB; a training "
+        "log that is too long or broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "
