@@ -11,6 +11,7 @@ from lagbench.data.local import locate_new
 from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, format_count, hide_user
 from lagbench.make.generate import GenerationResult, generate
+from lagbench.scoring.boards import find_board
 
 from .options import (
     FoundBoardOption,
@@ -133,7 +134,6 @@ def _season_places(
     from lagbench.board.folder import Folder
     from lagbench.board.season import read_season, season_registry, season_root
     from lagbench.board.season_scores import read_scores
-    from lagbench.scoring.boards import find_board
 
     folder = Folder(find_board(board))
     season = read_season(folder, name)
