@@ -78,9 +78,10 @@ def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
     """Refuse options that do not fit each other or the data set.
 
     Raises:
-        UsageError: a material is unknown or named twice, there are no mirror images to
-            average over, no wall moves, or an option needs a two-dimensional box
-            without periodic axes and the box is another one.
+        UsageError: no material is named, or one is unknown or named twice; `average` is
+            set and there are no mirror images; `wall_velocity` is set and no wall
+            moves; or an option needs a two-dimensional box without periodic axes, and
+            the box is another one.
     """
     check_moving_walls(options.wall_velocity, info)
     _check_box(options, info)

@@ -74,9 +74,13 @@ class RestShape:
         return cls(grid, position, stencil, weight_sum, lever)
 
     def strain(self, position: Tensor) -> Tensor:
-        """Return ``tanh(e / 0.2)`` as (xx, xy, yy) [1], shape [particle, 3].
+        """Return the scaled strain tanh(e / UNIT) as (xx, xy, yy), shape [particle, 3].
 
-        ``position`` is x, the positions now [length], shape [particle, 2].
+        The strain e = (F F^T - 1) / 2 is symmetric; F = dx/dX leads from the positions
+        X in the first frame to those now.
+
+        Args:
+            position: x, the positions now [length], shape [particle, 2].
         """
         displacement = self.grid.box.displacement(self.position, position)
         mean_offset = _relative_means(

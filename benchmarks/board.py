@@ -393,9 +393,10 @@ def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) ->
 
 
 def _preview(size: Size, rng: np.random.Generator) -> Preview:
-    """Return noise in place of maps, histograms and a film of two sides.
+    """Return a made-up preview: maps, histograms and a film of truth and prediction.
 
-    Both sides start from the truth; side 1, the prediction, then strays from it.
+    Side 0 is the truth, side 1 the prediction. The maps and the film of the prediction
+    are those of the truth with noise. The histograms of both sides are independent.
     """
     frames = tuple(frames_to_predict(size))
     maps = reported_frames(size)

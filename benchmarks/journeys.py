@@ -43,6 +43,7 @@ def trace_command(words: list[str]) -> Counter[Path]:
     functions: set[tuple[Path, int]] = set()
 
     def watch(frame: FrameType, event: str, _: object) -> None:
+        """Note a named function of the package; `sys.setprofile` calls this."""
         code = frame.f_code
         is_named = not code.co_name.startswith("<")  # as <module> and <lambda>
         if event != "call" or not is_named:

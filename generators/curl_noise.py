@@ -137,7 +137,10 @@ def _frequency(size: Size, scenario: int) -> int:
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
-    """Draw a lattice of particles and the stream function that sets them moving."""
+    """Draw a jittered grid of particles and a random stream function that moves them.
+
+    The stream function is Perlin noise times ``scale``, between the walls.
+    """
     low, high = closed_box_walls(size)
     columns = size.value("lattice_x")
     rows = size.value("lattice_y")
@@ -153,12 +156,12 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         rng, columns, rows, low=low, high=high, jitter=size.value("jitter")
     )
     frequency = _frequency(size, scenario)
-    lattice = gradients(rng, frequency)
+    noise_gradients = gradients(rng, frequency)
     scale = _scale_of(size, frequency)
 
-    psi = stream_function(position, lattice, low=low, high=high, scale=scale)
+    psi = stream_function(position, noise_gradients, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)
-    divergence, vorticity = _grid_rates(lattice, size, scale)
+    divergence, vorticity = _grid_rates(noise_gradients, size, scale)
     speed_sum = math.fsum(v * v for v in velocity.ravel().tolist())
     energy = 0.5 * speed_sum / size.particles
     return InitialState(

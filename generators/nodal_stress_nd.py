@@ -543,7 +543,12 @@ class NodalStressND:
 
     @ti.func
     def g2p_solid(self, s: ti.i32, p: ti.i32) -> None:
-        """Interpolate in three dimensions, row by row, which takes fewer sums."""
+        """Interpolate velocity, its gain and its gradient to a particle in three
+        dimensions.
+
+        Nodes are summed row by row along z, which takes fewer sums. ``spot`` holds the
+        particle's place among the 27 nodes, and the number of the lowest one.
+        """
         spot = self.spot[s, p]
         lowest = ti.bit_cast(spot[3], ti.i32)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)

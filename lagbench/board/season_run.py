@@ -229,7 +229,7 @@ class _SeasonRun:
 
     def score(self, data_set: SeasonDataSet) -> DataSetScores:
         """Return the scores of all models of a data set."""
-        task = self._task(data_set)
+        task = self._load_blind_task(data_set)
         hashes = {}
         for scenario in task.scenarios:
             with read_scenario(task.truth.path(scenario)) as file:
@@ -261,8 +261,13 @@ class _SeasonRun:
             )
         return values_of(reference.scores[data_set.metric])
 
-    def _task(self, data_set: SeasonDataSet) -> ScoredTask:
-        """Return the blind scenarios, which were drawn from the seed of the season."""
+    def _load_blind_task(self, data_set: SeasonDataSet) -> ScoredTask:
+        """Load the blind scenarios of a data set, with all that scoring them needs.
+
+        Raises:
+            DataError: a scenario is missing, or was drawn from another seed than the
+                one that the season has for the data set.
+        """
         size = blind_size(self.season, data_set, self.registry, self.recorded)
         fix = (
             f"lagbench generate --season {self.season.season} "

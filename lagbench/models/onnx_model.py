@@ -103,7 +103,7 @@ class OnnxModel:
     def _run(self, scenario_file: Path, frames: int | None) -> dict[str, Any]:
         """Return the answer of a child about one scenario."""
         count = frames or self.size.task.horizon
-        request = self._request(scenario_file, count)
+        request = self._make_request(scenario_file, count)
         seconds = self.load_seconds + self.seconds_per_frame * (count + 1)
         answers = run_in_child(
             "lagbench.models.onnx_rollout.predict_scenario",
@@ -132,7 +132,12 @@ class OnnxModel:
             )
         return answer
 
-    def _request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
+    def _make_request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
+        """Return as JSON what the child process needs to roll a scenario out.
+
+        The model gets velocities of walls and forces per unit of time; files hold them
+        per frame.
+        """
         with read_scenario(scenario_file) as file:
             given = given_in(file, self.size, self.root)
         arrays: dict[str, NDArray[Any]] = {
