@@ -672,6 +672,14 @@ class SplitBuilder:
                 test_entries.append(entry)
         return test_entries
 
+    def _predicted_entries(self) -> list[FileEntry]:
+        """Return the entries of test and valid, those of test first."""
+        entries = self._test_entries()
+        for entry in self.entries:
+            if entry.subset == "valid":
+                entries.append(entry)
+        return entries
+
     def _particle_count(self) -> int:
         """Return the particles of a scenario; the most of any if they differ."""
         return max(entry.particles for entry in self.entries)
@@ -715,14 +723,16 @@ class SplitBuilder:
     def _describe_task(self) -> dict[str, Any]:
         """Return the key ``task`` of the size; what is not stated gets a default.
 
-        The horizon is by default what the shortest test scenario leaves.
+        The horizon is by default what the shortest test or valid scenario leaves:
+        trainings predict those of valid.
 
         Raises:
-            UsageError: a test scenario is too short for the task, or a frame of
-                interest is not predicted.
+            UsageError: a test or valid scenario is too short for the task, or a frame
+                of interest is not predicted.
         """
         description = self.description
-        shortest = min(entry.frames for entry in self._test_entries())
+        shortest_entry = min(self._predicted_entries(), key=_count_frames)
+        shortest = shortest_entry.frames
         horizon = description.horizon
         if horizon is None:
             horizon = shortest - description.input_frames
@@ -732,11 +742,11 @@ class SplitBuilder:
             if description.horizon:
                 got += f", {horizon} to predict"
             raise UsageError(
-                "a test scenario is too short for the task",
+                f"a {shortest_entry.subset} scenario is too short for the task",
                 where="--input-frames and --horizon",
                 expected=f"together at most {shortest} frames, one of them to predict",
                 got=got,
-                fix="give fewer frames, or longer test trajectories",
+                fix="give fewer frames, or longer trajectories of test and valid",
             )
 
         interest = sorted(set(description.frames_of_interest or (last,)))
@@ -800,6 +810,10 @@ class SplitBuilder:
                     position = file.read("position", slice(frame, frame + 1))[0]
                     area = len(position) * self.spacing**self.dimension
                     yield Cloud(position, area)
+
+
+def _count_frames(entry: FileEntry) -> int:
+    return entry.frames
 
 
 def format_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> str:

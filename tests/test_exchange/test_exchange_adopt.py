@@ -482,8 +482,8 @@ def test_the_folder_of_another_writer_is_left_alone(
 
 
 def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
-    """Ragged trajectories are padded when opened; the task follows the shortest test
-    scenario.
+    """Ragged trajectories are padded when opened; the task follows the shortest
+    scenario of test and valid.
     """
     ragged = []
     for frames, particles in (
@@ -496,7 +496,7 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
         (run,) = straight_runs(1, frames=frames, particles=particles, seed=frames)
         ragged.append(run)
     own_split = adopted(tmp_path, ragged, test=2)
-    assert own_split.horizon == 12
+    assert own_split.horizon == 9  # 15 frames of valid, 18 and 30 of test
     assert own_split.particles == (25, 40)
     with lagbench.open_split(str(own_split.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
@@ -507,6 +507,17 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     lagbench.template(str(own_split.folder), output=path)
     result = lagbench.validate(path, root=tmp_path)
     assert result.valid
+
+
+def test_a_horizon_that_valid_is_too_short_for_is_refused(tmp_path: Path) -> None:
+    """A training could not predict the scenarios of valid."""
+    ragged = []
+    for frames in (20, 12, 20):
+        ragged.extend(straight_runs(1, frames=frames, seed=frames))
+    with pytest.raises(UsageError) as caught:
+        adopted(tmp_path, ragged, test=1, valid=1, horizon=10)
+    assert "a valid scenario is too short for the task" in str(caught.value)
+    assert "at most 12 frames" in str(caught.value)
 
 
 def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) -> None:
