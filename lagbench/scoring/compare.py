@@ -312,6 +312,10 @@ def _compare_metrics(
 ) -> dict[str, MetricComparison]:
     """Compare the ranking metric, then others that judge and are asked for, by name."""
     judging = _judging_metrics(one, two)
+    if isinstance(metrics, str):
+        metrics = (metrics,)
+    for name in metrics:
+        _require_of_both(name, one, two)
     chosen = _choose_metrics(metrics, judging)
     names = [one.ranking]
     for name in judging:
@@ -540,10 +544,22 @@ def _names(one: Contestant, two: Contestant, *, is_reference: bool) -> list[str]
     return [*number_methods(methods[:1], taken=(two.name,)), two.name]
 
 
+def _require_of_both(name: str, one: Contestant, two: Contestant) -> None:
+    """Refuse a metric that only one of the two methods was scored by."""
+    for with_metric, without in ((one, two), (two, one)):
+        if name in with_metric.scores and name not in without.scores:
+            raise UsageError(
+                f"only one of the two methods has the metric {name!r}",
+                where="--metric",
+                expected="a metric of both",
+                got=f"{name!r} of {with_metric.name}, none of {without.name}",
+                fix="compare two files of predictions: both are scored here by the "
+                "metrics of installed packages, entries and references are not",
+            )
+
+
 def _choose_metrics(metrics: Collection[str], judging: Sequence[str]) -> set[str]:
     """Return the names of the metrics that are compared; by default all that judge."""
-    if isinstance(metrics, str):
-        metrics = (metrics,)
     for name in metrics:
         if name not in judging:
             raise UsageError(

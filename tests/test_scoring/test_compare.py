@@ -634,6 +634,22 @@ def test_a_misspelt_metric_or_reference_is_refused(scored: Folders) -> None:
         compare(first, "constant-velocty")
 
 
+def test_a_metric_of_one_method_only_is_named_as_that(tmp_path: Path) -> None:
+    """Scores of an installed metric stand beside one file, not beside an entry."""
+    rows = rows_of([1.0, 2.0])
+    for row in rows.values():
+        row["mse_end"] = row["mse_avg"]
+    mine = publish(tmp_path, [1.0, 2.0], method="mine", rows=rows)
+    other = publish(tmp_path, [2.0, 3.0], method="other")
+    for first, second in ((mine, other), (other, mine)):
+        with pytest.raises(UsageError) as caught:
+            compare(first, second, metrics=["mse_end"])
+        assert "only one of the two methods has the metric 'mse_end'" in str(
+            caught.value
+        )
+        assert f"of {mine}, none of {other}" in str(caught.value)
+
+
 def test_chosen_metrics_come_after_the_ranking_metric(scored: Folders) -> None:
     first = scored["still"]
     second = scored["straight"]
