@@ -29,6 +29,7 @@ from lagbench.board.show import (
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, format_count
+from lagbench.references.shipped import shipped
 from lagbench.scoring.boards import find_board
 from lagbench.scoring.references import sizes_with_test_files
 
@@ -243,8 +244,10 @@ def picture_command(
             fix=f"-o {output.stem or 'cost'}.svg",
         )
     folder = find_board(board)
-    only = choose_data_sets(Folder(folder).data_sets(), tier.split, tier.name)
-    model = collect(folder, only=only)
+    if not shipped(tier):
+        # without references the picture of no entry would be empty
+        choose_data_sets(Folder(folder).data_sets(), tier.split, tier.name)
+    model = collect(folder, only=[(tier.split, tier.name)])
     svg = picture(model, tier)
     write_atomically(output, svg.encode(), option="--output")
     print_line(str(output), quiet=quiet)

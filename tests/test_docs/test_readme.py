@@ -140,6 +140,7 @@ def test_every_command_of_the_pages_exists() -> None:
             options = {"--help"}
             for parameter in command.loaded.params:
                 options.update(parameter.opts)
+                options.update(parameter.secondary_opts)  # as in --no-record
             for word in words:
                 if word.startswith("-"):
                     option, _, _ = word.partition("=")
