@@ -132,14 +132,7 @@ def score(
     result = validated
     if result is None:
         result = validate(path, root=data_root, require_truth=True, registry=splits)
-    if result.path != path:
-        raise UsageError(
-            "the validation is of another file",
-            where=str(path),
-            expected="the result of validate for this file",
-            got=result.path,
-            fix="leave validated out: score validates by itself",
-        )
+    _require_validation_of(path, result)
     require_split(result, expected_split)
     if examined is not None:
         examined(result)
@@ -350,6 +343,18 @@ def scores_folder(predictions: Path) -> Path:
     if predictions.suffix and not (folder / DESCRIPTION).exists():
         return folder
     return predictions.parent / f"{predictions.stem}-scores"
+
+
+def _require_validation_of(path: Path, result: ValidationResult) -> None:
+    """Refuse the result of a validation of another file."""
+    if result.path != path:
+        raise UsageError(
+            "the validation is of another file",
+            where=str(path),
+            expected="the result of validate for this file",
+            got=result.path,
+            fix="leave validated out: score validates by itself",
+        )
 
 
 def _check_overwriting(path: Path, header: Header) -> None:

@@ -42,6 +42,7 @@ CONNECT_SECONDS = 20  # how long a Dask scheduler may take to answer
 POLL_SECONDS = 0.02  # pause between two looks at the items [s]
 CHECK_SECONDS = 1.0  # pause between two looks at the workers [s]
 LOST_SECONDS = 60.0  # how long a Dask cluster may be without any worker
+FETCH_SECONDS = 5.0  # how long to wait for a result before a look at the workers
 STOP_SECONDS = 5  # how long to wait for the workers to stop
 WORKERS = "dask worker ADDRESS --nworkers -1 --nthreads 1"
 """The command that starts workers as they must be: one a core, each with one thread."""
@@ -306,8 +307,11 @@ class Cluster:
             yield from self._progress_events()
             finished = self._list_finished()
             for number in finished:
-                item, future = self._pending.pop(number)
+                item, future = self._pending[number]
                 result = _fetch_result(item.name, future)
+                if result is None:
+                    continue
+                del self._pending[number]
                 yield self._count_units(number, item, result.units)
                 yield Event(
                     item=item, kind="done", value=result.value, machine=result.machine
@@ -413,11 +417,15 @@ def _lost_error(reason: object) -> WorkFailedError:
     )
 
 
-def _fetch_result(name: str, future: Any) -> ItemResult:  # noqa: ANN401
-    """Return the result of an item; turn any exception into an error of ours."""
+def _fetch_result(name: str, future: Any) -> ItemResult | None:  # noqa: ANN401
+    """Return the result of an item; turn any exception into an error of ours.
+
+    It is None where the result does not come. The worker that held it may be lost: the
+    scheduler then has the item done again, and waits for ever where no worker is left.
+    """
     killed_worker_error = require("distributed", extra="cluster").KilledWorker
     try:
-        result: ItemResult = future.result()
+        result: ItemResult = future.result(timeout=FETCH_SECONDS)
     except LagbenchError:
         raise
     except killed_worker_error as error:
@@ -429,13 +437,16 @@ def _fetch_result(name: str, future: Any) -> ItemResult:  # noqa: ANN401
             fix="give the workers more memory, or leave --scheduler out",
         ) from error
     except Exception as error:  # a worker that cannot read the item raises anything
-        if future.status != "error":
-            raise _lost_error(error) from error
-        raise WorkFailedError(
-            "a worker of the Dask cluster cannot do the work",
-            where=name,
-            expected="a worker with the same packages",
-            got=f"{type(error).__name__}: {error}",
-            fix="install the same version of lagbench with its extras on every worker",
-        ) from error
+        if future.status == "error":
+            raise WorkFailedError(
+                "a worker of the Dask cluster cannot do the work",
+                where=name,
+                expected="a worker with the same packages",
+                got=f"{type(error).__name__}: {error}",
+                fix="install the same version of lagbench with its extras on every "
+                "worker",
+            ) from error
+        if isinstance(error, TimeoutError):
+            return None
+        raise _lost_error(error) from error
     return result

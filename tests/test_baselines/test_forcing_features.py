@@ -312,7 +312,7 @@ def test_a_model_that_sees_what_is_not_there_says_so(name: str) -> None:
     assert f"model.{name}=false" in str(caught.value.fix)
 
 
-OLD_OPTIONS = {"latent": 4, "layers": 1, "noise_std": 0.0}
+OLD_OPTIONS: dict[str, object] = {"latent": 4, "layers": 1, "noise_std": 0.0}
 # Deviation of the output over the particles, by the code that knew neither option.
 OLD_DEVIATIONS = {
     "gns": (0.0188042, 0.0116549),
@@ -332,15 +332,7 @@ def test_weights_without_the_options_give_the_numbers_that_they_gave(
     """A header that lacks them means none, in a split with a force too; what drives the
     flow changes no bit then.
     """
-    entry = find(name)
-    model = entry.model.build(OLD_OPTIONS, info())
-    options = model.options.model_dump(mode="json")
-    del options["body_force"]
-    del options["obstacle"]
-    path = tmp_path / "weights.pt"
-    weights = filled(model.state_dict())
-    save(path, Checkpoint(baseline=name, options=options, info=info(), weights=weights))
-    restored = restore(load(path))
+    restored = restored_from_old_weights(name, OLD_OPTIONS, tmp_path)
     assert restored.forcing_seen == frozenset()
 
     window = forced_batch(BOXES["walls"]).part(slice(6))
@@ -358,6 +350,28 @@ def test_weights_without_the_options_give_the_numbers_that_they_gave(
     assert torch.equal(output, expected)
     deviation = output.double().std(dim=0)
     assert deviation.tolist() == pytest.approx(OLD_DEVIATIONS[name], rel=1e-3)
+
+
+def restored_from_old_weights(
+    name: str, options: dict[str, object], folder: Path
+) -> Any:
+    """Return a model from weights whose header lacks the options of force and obstacle.
+
+    The weights follow from a formula.
+    """
+    model = find(name).model.build(options, info())
+    stored_options = model.options.model_dump(mode="json")
+    del stored_options["body_force"]
+    del stored_options["obstacle"]
+    checkpoint = Checkpoint(
+        baseline=name,
+        options=stored_options,
+        info=info(),
+        weights=filled(model.state_dict()),
+    )
+    path = folder / "weights.pt"
+    save(path, checkpoint)
+    return restore(load(path))
 
 
 def filled(weights: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -387,15 +401,7 @@ OLD_POSITION_DEVIATIONS = {
 def test_frame_models_without_the_options_give_the_numbers_that_they_gave(
     name: str, tmp_path: Path
 ) -> None:
-    entry = find(name)
-    model = entry.model.build(FRAME_OPTIONS[name], info())
-    options = model.options.model_dump(mode="json")
-    del options["body_force"]
-    del options["obstacle"]
-    path = tmp_path / "weights.pt"
-    weights = filled(model.state_dict())
-    save(path, Checkpoint(baseline=name, options=options, info=info(), weights=weights))
-    restored: Any = restore(load(path))
+    restored = restored_from_old_weights(name, FRAME_OPTIONS[name], tmp_path)
     assert restored.forcing_seen == frozenset()
     window = restored.start(forced_batch(BOXES["walls"]).part(slice(6)))
     assert window.body_force is None

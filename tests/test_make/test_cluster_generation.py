@@ -26,7 +26,7 @@ from cluster_bench import (
     writers,
 )
 from conftest import SIZE, SPLIT
-from parallel_jobs import report_for_ever
+from parallel_jobs import double, report_for_ever
 
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest
@@ -157,6 +157,29 @@ def test_all_workers_killed_is_an_error(
         path = tmp_path / SPLIT / SIZE / "v2" / entry.path
         check_scenario(path, entry.content_sha256)
     assert writers(tmp_path) == {}
+
+
+@pytest.mark.timeout(60)
+def test_a_result_that_is_lost_with_its_worker_is_not_awaited_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The only worker is killed between the end of its item and the fetch of the
+    result.
+    """
+    monkeypatch.setattr(cluster, "LOST_SECONDS", 1.0)
+    monkeypatch.setattr(cluster, "FETCH_SECONDS", 1.0, raising=False)
+    with lonely_scheduler(1) as (address, processes), cluster.Cluster(address) as here:
+        here.submit(WorkItem(name="one", function=double, arguments=(1,)))
+        ((_, future),) = here._pending.values()
+        end = time.monotonic() + 30
+        while not future.done():
+            assert time.monotonic() < end, "waited too long"
+            time.sleep(0.02)
+        for process in processes:
+            process.kill()
+            process.wait()
+        with pytest.raises(WorkFailedError, match="no worker"):
+            list(here.events())
 
 
 def test_a_folder_that_workers_do_not_share(

@@ -220,6 +220,14 @@ def test_a_short_scenario_is_a_reason(tmp_path: Path) -> None:
     trajectories = four_lattices(12)
     trajectories[1] = lattice(12)[:4]
     split = adopt_trajectories(tmp_path, trajectories)
+    assert not list_reasons(split)
+    # somebody asks for more than valid has
+    description = split.folder / "split.yaml"
+    text = description.read_text()
+    horizon = f"horizon: {split.horizon}"
+    assert horizon in text
+    longer = text.replace(horizon, f"horizon: {split.horizon + 1}")
+    description.write_text(longer)
     assert "a valid scenario is too short" in list_reasons(split)
 
 
