@@ -216,13 +216,18 @@ def train(
     ):
         model = _build_model(job, entry.model, initial)
         _warn_of_unseen_forcing(model, tier, root_folder)
-        if earlier is None and not is_helper():
-            folder.clear()
-        if getattr(model, "closed_form", False):
-            log, steps = fit(job, model)
-        else:
-            log, steps = descend(job, model)
-        return _result(job, model, log, steps)
+        return _train_model(job, model)
+
+
+def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
+    """Fit a model or descend on its loss, in a folder without an earlier training."""
+    if job.earlier is None and not is_helper():
+        job.folder.clear()
+    if getattr(model, "closed_form", False):
+        log, steps = fit(job, model)
+    else:
+        log, steps = descend(job, model)
+    return _result(job, model, log, steps)
 
 
 def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:

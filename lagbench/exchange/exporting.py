@@ -115,14 +115,7 @@ def export(
         WorkFailedError: the disk is full or not writable.
     """
     form = parse_format(format)
-    if from_walls and form is not Format.LAGRANGEBENCH_H5:
-        raise UsageError(
-            "this option is for lagrangebench-h5 only",
-            where="--from-walls",
-            expected="--format lagrangebench-h5",
-            got=form.value,
-            fix="leave --from-walls out",
-        )
+    _check_from_walls(form, from_walls=from_walls)
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     target = Path(output)
     file_of = {}
@@ -182,6 +175,18 @@ def export(
     metadata_path = write_metadata(target, metadata)
     written = (*paths, metadata_path)
     return _summarise(entry, form, target, written, frames_of, shapes)
+
+
+def _check_from_walls(form: Format, *, from_walls: bool | None) -> None:
+    """Refuse the option --from-walls for a format that has none."""
+    if from_walls and form is not Format.LAGRANGEBENCH_H5:
+        raise UsageError(
+            "this option is for lagrangebench-h5 only",
+            where="--from-walls",
+            expected="--format lagrangebench-h5",
+            got=form.value,
+            fix="leave --from-walls out",
+        )
 
 
 def _summarise(

@@ -138,13 +138,12 @@ def score(
         examined(result)
     result.check()
 
-    if write:
-        check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header = opened.header
         info = opened.info
         sha256 = result.sha256 or opened.content_sha256()
     if write:
+        check_writable(folder, option="--output")
         _check_overwriting(folder / JSON_NAME, header)
 
     size = splits.size(header.split, header.size).scored_on(header.subset)
@@ -156,20 +155,17 @@ def score(
     if not shipped_references:
         references = measurable(size, data_root)
         check_train(size, data_root, references)
-    measurement = _measure(
-        functools.partial(
-            score_scenarios,
-            task,
-            path,
-            info,
-            references=references,
-            workers=workers,
-            scheduler=scheduler,
-            meter=Meter(progress),
-        ),
-        measured_metrics,
-        own=own,
+    score_all = functools.partial(
+        score_scenarios,
+        task,
+        path,
+        info,
+        references=references,
+        workers=workers,
+        scheduler=scheduler,
+        meter=Meter(progress),
     )
+    measurement = _measure(score_all, measured_metrics, own=own)
     card = _make_card(
         measurement,
         task=task,
