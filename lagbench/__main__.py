@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import functools
+import importlib
 import io
 import os
 import sys
@@ -10,13 +12,19 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from .addresses import REPOSITORY, describe
-from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS, SEASON_COMMANDS
-from .cli.lazy_group import LazyGroup
+from .cli.commands import (
+    COMMANDS,
+    LEADERBOARD_COMMANDS,
+    SEASON_COMMANDS,
+    CommandEntry,
+)
 from .errors import (
     LagbenchError,
     UsageError,
@@ -61,7 +69,46 @@ MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 MOST_LETTERS = 60  # of a word of the command line in a message
 
 
-class _Program(LazyGroup):
+class _LazyCommand(TyperCommand):
+    """Stands for a command in its group and loads it when it is called."""
+
+    def __init__(self, entry: CommandEntry) -> None:
+        super().__init__(entry.name, help=entry.summary)
+        self._entry = entry
+
+    @functools.cached_property
+    def loaded(self) -> Any:  # noqa: ANN401 (typer does not export its class of commands)
+        """The command itself, with its options."""
+        module_name, _, function_name = self._entry.target.partition(":")
+        module = importlib.import_module(f"lagbench.cli.{module_name}")
+        function = getattr(module, function_name)
+        app = typer.Typer(add_completion=False)
+        register = app.command(
+            self._entry.name, epilog=f"Example: lagbench {self._entry.example}"
+        )
+        register(function)
+        return get_command(app)
+
+    def make_context(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401
+        """Return a context of the command itself, which runs instead of this one."""
+        return self.loaded.make_context(*args, **options)
+
+
+class _LazyGroup(TyperGroup):
+    """A group of lazy commands; other commands of the group come after them."""
+
+    entries: ClassVar[tuple[CommandEntry, ...]] = ()
+
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
+        commands: dict[str, Any] = {}
+        for entry in self.entries:
+            commands[entry.name] = _LazyCommand(entry)
+        commands.update(self.commands)
+        self.commands = commands
+
+
+class _Program(_LazyGroup):
     """All commands; what they raise becomes a message on stderr and an exit code."""
 
     entries = COMMANDS
@@ -362,7 +409,7 @@ def _lagbench(
     """Bit-reproducible particle data sets for neural surrogates of simulators."""
 
 
-class _LeaderboardGroup(LazyGroup):
+class _LeaderboardGroup(_LazyGroup):
     entries = LEADERBOARD_COMMANDS
 
 
@@ -378,7 +425,7 @@ app.add_typer(
 )
 
 
-class _SeasonGroup(LazyGroup):
+class _SeasonGroup(_LazyGroup):
     entries = SEASON_COMMANDS
 
 

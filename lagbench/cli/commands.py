@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
-from .lazy_group import CommandEntry
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandEntry:
+    """A command as its group lists it, without its code."""
+
+    name: str
+    # "module:function", the module below lagbench.cli
+    target: str
+    # line of the group's help; the docstring of the function begins with it too
+    summary: str
+    # words of a call that the help of the command shows, without "lagbench"
+    example: str
+
 
 COMMANDS = (
     CommandEntry(

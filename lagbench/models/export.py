@@ -21,6 +21,7 @@ from lagbench.torch import WindowDataset, collate
 
 from .onnx_checks import LEAST_OPSET, OUTPUT
 from .onnx_model import check_onnx
+from .onnx_rollout import open_session
 
 __all__ = ["export_onnx"]
 
@@ -176,14 +177,10 @@ def _sums_of_index_add() -> Iterator[None]:
 def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
     """Refuse a file that predicts something else than the model.
 
-    Exporters translate some operations wrongly, without an error.
+    Exporters translate some operations wrongly, without an error. The file runs here as
+    it runs when an entry is reproduced.
     """
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(
-        str(path), providers=["CPUExecutionProvider"]
-    )
-    names = {value.name for value in session.get_inputs()}
+    session, names = open_session(str(path))
     values = {}
     for name, tensor in inputs.items():
         if name in names:

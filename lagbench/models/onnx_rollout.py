@@ -55,9 +55,11 @@ def forbid_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
 
-@functools.cache
-def _session(path: str) -> Any:  # noqa: ANN401
-    """Return a checked model that is ready to run, on one thread."""
+def open_session(path: str) -> tuple[Any, dict[str, str]]:
+    """Return a checked model that is ready to run on one thread, and its inputs.
+
+    The inputs are types by name.
+    """
     import onnxruntime
 
     declared = examine(path)
@@ -76,6 +78,9 @@ def _session(path: str) -> Any:  # noqa: ANN401
     return session, declared["inputs"]
 
 
+_cached_session = functools.cache(open_session)
+
+
 def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
     """Return the rollout of a scenario, or why there is none.
 
@@ -92,7 +97,7 @@ def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
     """
     forbid_files()
     try:
-        session, inputs = _session(request["path"])
+        session, inputs = _cached_session(request["path"])
         given = {name: unpack(value) for name, value in request["arrays"].items()}
         # the first call compiles and allocates
         _advance(session, inputs, given, given["position"], 0, request["radius"])

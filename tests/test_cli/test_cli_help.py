@@ -13,8 +13,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from lagbench.__main__ import app
-from lagbench.cli.commands import COMMANDS, LEADERBOARD_COMMANDS, SEASON_COMMANDS
-from lagbench.cli.lazy_group import CommandEntry
+from lagbench.cli.commands import (
+    COMMANDS,
+    LEADERBOARD_COMMANDS,
+    SEASON_COMMANDS,
+    CommandEntry,
+)
 
 Run = Callable[..., Result]
 
@@ -70,7 +74,6 @@ def test_the_help_of_a_group_loads_no_command() -> None:
         "lagbench.addresses",
         "lagbench.cli",
         "lagbench.cli.commands",
-        "lagbench.cli.lazy_group",
         "lagbench.errors",
     }
 
