@@ -7,7 +7,9 @@ import json
 import math
 import re
 import shutil
+from collections import Counter
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 from file_size_limit import largest_file
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError
@@ -28,6 +31,7 @@ from lagbench.scoring.score_file_checks import read_published_scores
 from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
+from lagbench.submission.predictions import Predictions
 from lagbench.work.progress import Progress
 
 
@@ -300,6 +304,34 @@ def test_a_validated_file_is_not_validated_again(
     other = predictions.with_name("other.nc")
     with pytest.raises(UsageError):
         bench.evaluate(other, validated=validated)
+
+
+def test_scoring_reads_every_predicted_frame_once(
+    bench: ScoreBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The validation, which is done before, reads the frames too."""
+    validated = validate(
+        predictions,
+        root=bench.root,
+        require_truth=True,
+        registry=bench.registry,
+    )
+    reads: Counter[tuple[int, int]] = Counter()
+    read_frames = Predictions.frames
+
+    def count_and_read(
+        self: Predictions, scenario: int, start: int, count: int
+    ) -> NDArray[np.float32]:
+        for frame in range(start, start + count):
+            reads[scenario, frame] += 1
+        return read_frames(self, scenario, start, count)
+
+    monkeypatch.setattr(Predictions, "frames", count_and_read)
+    bench.evaluate(predictions, validated=validated, workers=1)
+
+    task = bench.size.task
+    frames = range(task.input_frames, task.input_frames + task.horizon)
+    assert reads == Counter(product(bench.size.subsets["test"], frames))
 
 
 def test_progress_reaches_its_total(bench: ScoreBench, predictions: Path) -> None:
