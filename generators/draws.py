@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterable
 from decimal import Context, Decimal
 from typing import Protocol
 
@@ -98,6 +99,21 @@ def quantise(values: ArrayLike) -> NDArray[np.float64]:
     rounded = np.rint(exact / QUANTUM) * QUANTUM
     # rint keeps the sign of -0.0, the addition of zero does not
     return np.asarray(rounded + 0.0, dtype=np.float64)
+
+
+def add_in_order(values: Iterable[float]) -> float:
+    """Return the sum of some numbers, added one after the other and rounded each time.
+
+    The built-in ``sum`` does so in Python 3.11 only: later ones carry the rounding
+    errors along, and would give other bits.
+
+    >>> add_in_order([1e16, 1.0, -1e16])
+    0.0
+    """
+    total = 0.0
+    for value in values:
+        total += value
+    return total
 
 
 def _draw_unit(rng: RandomSource) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .constants import constants, free_surface_walls, interval
-from .draws import RandomSource, choice, quantise, uniform
+from .draws import RandomSource, add_in_order, choice, quantise, uniform
 from .shapes import Body, sample_points
 from .solids import Ball, Block, Solid
 from .split import (
@@ -135,7 +135,7 @@ def _state(
 
     Particles are shared out by volume; the last body has what rounding leaves.
     """
-    total_volume = sum(solid.measure for solid, _, _ in bodies)
+    total_volume = add_in_order(solid.measure for solid, _, _ in bodies)
     positions = []
     velocities = []
     left_count = size.particles

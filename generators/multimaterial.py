@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 from lagbench.errors import WorkFailedError
 
 from .constants import constants, free_surface_walls, interval, shift_number
-from .draws import RandomSource, choice, direction, quantise, uniform
+from .draws import (
+    RandomSource,
+    add_in_order,
+    choice,
+    direction,
+    quantise,
+    uniform,
+)
 from .shapes import Body, Disc, Rectangle, Shape, place, sample_points
 from .split import FreeSurfaceParameters, InitialState, Material
 
@@ -171,7 +178,7 @@ def _body_parameters(
 
 def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int]:
     """Return the particles of each body, in proportion to areas or volumes."""
-    area = sum(measures)
+    area = add_in_order(measures)
     counts = []
     for body_area in measures[:-1]:
         counts.append(math.floor(particle_count * body_area / area + 0.5))
@@ -245,7 +252,7 @@ def draw_bodies(
         velocity=np.repeat(np.stack(velocities), counts, axis=0),
         affine=np.zeros((size.particles, dimension, dimension)),
         material=np.repeat(np.array(materials, dtype=np.int8), counts),
-        area=sum(measures),
+        area=add_in_order(measures),
         wall_velocity=np.zeros((2 * dimension, dimension)),
         friction=friction,
         parameters=parameters,
