@@ -482,8 +482,12 @@ class GraphNetwork(Baseline):
         end = self.options.pushforward + 1
         drawn = torch.randint(end, (), generator=generator, device=device)
         frame_count = int(drawn)
+        # Operators have losses of their own in training only; nobody needs them here.
+        was_training = self.training
+        self.eval()
         for _ in range(frame_count):
             state, _ = self.step(state)
+        self.train(was_training)
         return state, frame_count
 
     def _step_terms(

@@ -25,7 +25,8 @@ from turns import of_this_turn
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.dataset_info import read_dataset_info
-from lagbench.baselines.operators.supergat import SuperGAT
+from lagbench.baselines.operators import supergat
+from lagbench.baselines.operators.supergat import SuperGAT, draw_unlinked_pairs
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import (
     GRID_TERMS,
@@ -342,6 +343,28 @@ def test_an_oracle_has_no_loss_after_own_steps() -> None:
         terms = model(batch(frames), seeded(seed))
         for name in TERMS:
             assert float(terms[name]) < 2e-5
+
+
+def test_steps_without_gradients_predict_no_links(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many own steps come first, each layer draws unlinked pairs once."""
+    linked = GraphNetwork.with_operator(SuperGAT)
+    options = {"layers": 2, "latent": 8, "pushforward": 4, "noise_std": 0.0}
+    model = linked.build(options, info())
+    model.train()
+    draws = []
+
+    def count_draw(*arguments: Any, **keywords: Any) -> Tensor:
+        draws.append(arguments)
+        return draw_unlinked_pairs(*arguments, **keywords)
+
+    monkeypatch.setattr(supergat, "draw_unlinked_pairs", count_draw)
+    for seed in range(8):
+        terms = model(two_swirls(12), seeded(seed))
+        assert "link" in terms
+        assert model.training
+    assert len(draws) == 8 * 2
 
 
 @pytest.mark.parametrize(
