@@ -19,6 +19,7 @@ from lagbench.data.registry import PluginWarning, list_entry_points, package_of
 from lagbench.errors import (
     LagbenchError,
     UsageError,
+    describe_exception,
     load_entry_point,
     suggest_name,
 )
@@ -177,4 +178,4 @@ def _find_recipes(model: type, name: str) -> Path | None:
 def _describe_error(error: Exception) -> str:
     if isinstance(error, LagbenchError):
         return str(error)
-    return f"{type(error).__name__}: {error}"
+    return describe_exception(error)

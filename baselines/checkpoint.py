@@ -29,6 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from lagbench.atomic import atomic_path
+from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     DataError,
@@ -299,8 +300,8 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         raise UnreadableFileError(
             f"option {key!r} of the model does not fit",
             where=where,
-            expected=f"options of {checkpoint.baseline}",
-            got=detail["msg"],
+            expected=describe_expectation(detail),
+            got=describe_input(detail),
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
         ) from None
     except (

@@ -27,6 +27,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
+from lagbench.data.field_errors import describe_expectation
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
@@ -575,7 +576,7 @@ def _check_options(
     except ValidationError as error:
         detail = error.errors()[0]
     path = [str(part) for part in (group, *detail["loc"]) if part != ""]
-    key = ".".join(path)
+    key = ".".join(path) or "the file"
     if detail["type"] == "extra_forbidden":
         known_keys = _known_keys(options, detail["loc"][:-1])
         raise error_class(
@@ -586,9 +587,7 @@ def _check_options(
             fix=suggest_name(str(detail["loc"][-1]), known_keys),
         )
 
-    expected = detail["msg"].removeprefix("Value error, ")
-    if detail["type"] == "tuple_type":
-        expected = "a list in brackets"
+    expected = describe_expectation(detail)
     got = repr(detail["input"])[:80]
     is_type_error = detail["type"].endswith("_type")
     if isinstance(detail["input"], Mapping) and not is_type_error:

@@ -161,17 +161,20 @@ def _check_advance(
         state, position = output
         if isinstance(position, Tensor) and position.shape == shape:
             return state, position
-    shapes = []
+    descriptions = []
     for part in output:
-        type_name = type(part).__name__
-        shape_or_type = getattr(part, "shape", type_name)
-        shapes.append(str(shape_or_type))
+        description = f"a {type(part).__name__}"
+        if hasattr(part, "shape"):
+            description += f" of shape {list(part.shape)}"
+        descriptions.append(description)
     raise UsageError(
         "a model returned no positions of the next frame",
         where=f"{type(model).__qualname__}.advance",
-        expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
-        got=", ".join(shapes),
-        fix="mend that class",
+        expected=f"the next state and a tensor of shape {list(shape)}: "
+        "[particle, axis]",
+        got=", ".join(descriptions),
+        fix="return both from this method; torch.from_numpy makes a tensor of a NumPy "
+        "array",
     )
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
@@ -98,11 +99,11 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
     rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     module = split_module(size)
     place = f"{size.split} {size.name}, scenario {scenario}"
-    try:
-        with blamed_on_parameters(size, f"drawing scenario {scenario}"):
+    with blamed_on_parameters(size, f"drawing scenario {scenario}"):
+        try:
             state: object = module.initial_state(size, scenario, rng)
-    except WorkFailedError as error:
-        raise _relocate(error, place) from error
+        except WorkFailedError as error:
+            raise _relocate(error, place) from error
 
     where = f"{size.generator}.initial_state"
     if not isinstance(state, InitialState):
@@ -113,6 +114,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             got=type(state).__name__,
             fix="return an InitialState: docs/extending.md",
         )
+    _check_values(state, f"{where}, scenario {scenario}")
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:
         raise UsageError(
@@ -126,9 +128,48 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
     return state
 
 
-def _relocate(error: WorkFailedError, where: str) -> WorkFailedError:
+def _check_values(state: InitialState, where: str) -> None:
+    """Refuse single values and drawn parameters that are of another kind than stated.
+
+    The solver checks the arrays.
+    """
+    for name in ("area", "viscosity", "friction"):
+        value = getattr(state, name)
+        if not isinstance(value, Real) or not np.isfinite(float(value)):
+            raise UsageError(
+                f"the {name} of an initial state is no number",
+                where=where,
+                expected="a finite number",
+                got=repr(value)[:80],
+                fix=f"give InitialState a number as {name}: docs/extending.md",
+            )
+
+    parameters: object = state.parameters
+    fix = "give InitialState parameters={'name': number or text}"
+    if not isinstance(parameters, Mapping):
+        raise UsageError(
+            "the parameters of an initial state are no mapping",
+            where=where,
+            expected="names with what was drawn, numbers or texts",
+            got=repr(parameters)[:80],
+            fix=fix,
+        )
+    for name, value in parameters.items():
+        is_number = isinstance(value, Real) and np.isfinite(float(value))
+        is_text = isinstance(value, str) and value != ""
+        if not isinstance(name, str) or not (is_number or is_text):
+            raise UsageError(
+                "a parameter of an initial state cannot be stored",
+                where=f"{where}, parameter {name!r}",
+                expected="a finite number, or a text that is not empty",
+                got=repr(value)[:80],
+                fix=fix,
+            )
+
+
+def _relocate(error: LagbenchError, where: str) -> LagbenchError:
     """Return the same error with another place."""
-    return WorkFailedError(
+    return type(error)(
         error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
     )
 
@@ -291,7 +332,7 @@ class ScenarioBatch:
 
         try:
             yield
-        except WorkFailedError as error:
+        except (WorkFailedError, UsageError) as error:
             place = re.sub(r"scenario (\d+)", name_scenario, error.where or "")
             raise _relocate(error, f"{size.split} {size.name}, {place}") from error
 

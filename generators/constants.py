@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from lagbench.data.box import Box
 from lagbench.data.limits import Limit
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import (
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+    describe_exception,
+    find_place_in_extension,
+)
 
 from .full_box_parameters import FullBoxParameters
 from .shapes import Region
@@ -92,6 +99,10 @@ finite numbers.
 """
 
 
+PARAMETER_ERRORS = (TypeError, ValueError, ArithmeticError, LookupError)
+"""What a split of ours raises over parameters that it cannot use."""
+
+
 def check_constants(
     kind: ParametersType, values: Mapping[str, object], size: Size
 ) -> None:
@@ -161,20 +172,42 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
 
 @contextmanager
 def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
-    """Turn what a split's module raises over its parameters into an error that names
-    their file.
+    """Turn what a split's module raises over its parameters into an error of ours.
+
+    It names the file of the parameters. Where the split is of another package, it names
+    the line of its module too.
+
+    Raises:
+        WorkFailedError: the module of another package failed.
+        UnreadableFileError: a module of ours cannot use the parameters, or another
+            asks for one that is not there.
     """
     try:
         yield
     except UsageError as error:
+        places = [_place_of(size), find_place_in_extension(error, size.generator)]
         raise UnreadableFileError(
             error.what,
-            where=_place_of(size),
+            where=", ".join(place for place in places if place),
             expected=error.expected,
             got=error.got,
             fix=error.fix,
         ) from error
-    except (TypeError, ValueError, ArithmeticError, LookupError) as error:
+    except (LagbenchError, MemoryError):
+        raise
+    except Exception as error:  # a stranger's module may raise anything
+        place = find_place_in_extension(error, size.generator)
+        if place is not None:
+            raise WorkFailedError(
+                f"{work} failed in the module of split {size.split!r}",
+                where=place,
+                expected="no exception",
+                got=f"{type(error).__name__}: {error}",
+                fix="mend this line of the module, or the parameters that it uses: "
+                f"{_place_of(size)}",
+            ) from error
+        if not isinstance(error, PARAMETER_ERRORS):
+            raise
         raise UnreadableFileError(
             f"{work} failed with these parameters",
             where=_place_of(size),
@@ -247,12 +280,14 @@ def split_module(size: Size) -> SplitGenerator:
     """
     try:
         module = importlib.import_module(size.generator)
-    except ImportError as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # a stranger's module may raise anything
         raise UsageError(
             f"the generator of split {size.split!r} cannot be imported",
             where=size.generator,
             expected="a module that can be imported",
-            got=error,
+            got=describe_exception(error, size.generator),
             fix="mend the module, or correct the key generator of the split",
         ) from error
     needed = ("solver_parameters", "initial_state")

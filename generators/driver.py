@@ -310,7 +310,8 @@ class Driver(ABC, Generic[Parameters]):
                 "abs(C) dt <= 2",
                 got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
                 f"{np.count_nonzero(~is_finite)} coordinates that are not finite",
-                fix="draw slower motion, or lower dt in the file of the split",
+                fix="draw finite positions and slower motion, or lower dt in the file "
+                "of the split",
             )
 
     def _check_arrays(self, index: int, state: InitialState) -> None:
@@ -331,7 +332,7 @@ class Driver(ABC, Generic[Parameters]):
                     where=f"scenario {index}",
                     expected=f"{shape}, {number}",
                     got=f"{array.shape}, {array.dtype}",
-                    fix="return arrays of these shapes: docs/extending.md",
+                    fix="return such arrays from initial_state: docs/extending.md",
                 )
 
 

@@ -7,6 +7,7 @@ import functools
 import importlib
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -65,6 +66,9 @@ VANISHED_ERRORS = {
 
 MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 """What a library says that finds no memory while it is loaded."""
+
+_EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
+"""What click says of words that are neither arguments nor options."""
 
 MOST_LETTERS = 60  # of a word of the command line in a message
 
@@ -221,12 +225,41 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
             got=_wrong_value(error),
             fix=f"give another value; {help_hint}",
         )
+    extra_words = _EXTRA_WORDS.search(message)
+    if extra_words is not None and context is not None:
+        return _extra_words_error(context, command, extra_words[1])
     return UsageError(
         message[:1].lower() + message[1:],
         where=command,
         expected="a command, its arguments and its options",
         got=" ".join(map(_quote_word, sys.argv[1:])) or None,
         fix=help_hint,
+    )
+
+
+def _extra_words_error(
+    context: Any,  # noqa: ANN401 (two copies of click)
+    command: str,
+    words: str,
+) -> UsageError:
+    """Return the error for words that are neither arguments nor options."""
+    usage = " ".join([command, *context.command.collect_usage_pieces(context)])
+    fix = f"leave them out, or put quotes around a text with blanks; `{command} --help`"
+    for option, setting, value in zip(
+        sys.argv, sys.argv[1:], sys.argv[2:], strict=False
+    ):
+        if option != "--set" or value.startswith("-"):
+            continue
+        if "=" not in setting:
+            fix = f"write it with =, without blanks: --set {setting}={value}"
+        elif "=" in value:
+            fix = f"write --set before each: --set {setting} --set {value}"
+    return UsageError(
+        "too many words",
+        where=command,
+        expected=usage,
+        got=_quote_word(words),
+        fix=fix,
     )
 
 
@@ -359,9 +392,13 @@ def _output_errors() -> Iterator[None]:
 
 @contextmanager
 def _short_warnings() -> Iterator[None]:
-    """Print warnings for users in one line; those for developers keep their place."""
+    """Print warnings for users in one line; those for developers keep their place.
+
+    A warning that is raised again is printed once.
+    """
     with warnings.catch_warnings():
         show_in_full = warnings.showwarning
+        printed_texts: set[str] = set()
 
         def show(
             message: Warning | str,
@@ -371,7 +408,9 @@ def _short_warnings() -> Iterator[None]:
         ) -> None:
             if category.__module__.startswith("lagbench."):
                 text = escape_unprintable(str(message))
-                typer.echo(f"warning: {text}", err=True)
+                if text not in printed_texts:
+                    typer.echo(f"warning: {text}", err=True)
+                printed_texts.add(text)
             else:
                 show_in_full(message, category, *place, **more)
 

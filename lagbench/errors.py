@@ -343,15 +343,19 @@ def suggest_name(name: str, known_names: Iterable[str]) -> str:
     return listing
 
 
-def find_place_in_extension(error: BaseException) -> str | None:
+def find_place_in_extension(error: BaseException, *modules: str) -> str | None:
     """Return the innermost line of a traceback that lies in an extension of lagbench.
 
     It has the form ``file, line n``. None if no line of the traceback lies in one.
+
+    Args:
+        error: an exception that was caught.
+        modules: modules that belong to extensions, beside those of entry points.
     """
     # importlib.metadata takes half as long to import as the rest of lagbench.
     from importlib.metadata import entry_points
 
-    package_names = set()
+    package_names = {module.split(".")[0] for module in modules}
     for group in PLUGIN_GROUPS:
         for point in entry_points(group=group):
             module_name = point.value.partition(":")[0]
@@ -364,6 +368,18 @@ def find_place_in_extension(error: BaseException) -> str | None:
         if module_name.split(".")[0] in package_names:
             place = f"{frame.f_code.co_filename}, line {line}"
     return place
+
+
+def describe_exception(error: BaseException, *modules: str) -> str:
+    """Return the class and the text of an exception, and its line in an extension.
+
+    ``modules`` as for :func:`find_place_in_extension`.
+    """
+    description = f"{type(error).__name__}: {error}"
+    place = find_place_in_extension(error, *modules)
+    if place is None:
+        return description
+    return f"{description} ({place})"
 
 
 def load_entry_point(

@@ -28,7 +28,7 @@ from torch.utils.data import Dataset, Sampler
 
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.store.windows import CACHE_BYTES, WindowReader
+from lagbench.store.windows import CACHE_BYTES, WindowReader, check_whole
 from lagbench.store.windows import Window as ArrayWindow
 from lagbench.tensors import Batch, TensorWindow, collate
 
@@ -292,6 +292,7 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         UsageError: frames below 1 or beyond the known forcing, or the model returns no
             [particle, axis].
     """
+    check_whole(frames, "frames")
     # Beyond the known forcing a model would take the last known one.
     longest = max(1, frames)
     for forcing in (given.wall_velocity, given.body_force):
@@ -318,13 +319,20 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
 
 
 def _check_step_result(position: object, shape: torch.Size) -> None:
+    fix = "return the positions of the next frame only: position[:, -1] + v"
+    got = type(position).__name__
+    if isinstance(position, np.ndarray):
+        got = f"a NumPy array of shape {list(position.shape)}"
+        fix = "return a tensor: torch.from_numpy(array).to(batch.position)"
+    elif isinstance(position, Tensor):
+        got = f"a tensor of shape {list(position.shape)}"
     if not isinstance(position, Tensor) or position.shape != shape:
         raise UsageError(
             "a model returned no positions of the next frame",
             where="roll_out, step",
             expected=f"a tensor of shape {list(shape)}: [particle, axis]",
-            got=getattr(position, "shape", None) or type(position).__name__,
-            fix="return the positions of the next frame only: position[:, -1] + v",
+            got=got,
+            fix=fix,
         )
 
 
@@ -365,6 +373,8 @@ def predict(
             that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
+    if history is not None:
+        check_whole(history, "history")
     data = WindowDataset(
         split, subset=subset, size=size, root=root, future=0, registry=registry
     )

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from lagbench.data.checksums import file_sha256
+from lagbench.data.field_errors import describe_expectation, is_own_sentence
 from lagbench.data.yamlfile import format_yaml, read_yaml
 from lagbench.errors import (
     ChecksFailedError,
@@ -249,12 +250,12 @@ def _issue_from(kind: type[BaseModel], item: ErrorDetails) -> SchemaIssue:
         return SchemaIssue(where=where, what="this key is missing", got="no such key")
 
     pattern = item.get("ctx", {}).get("pattern", "")
-    if item["type"] == "tuple_type":
-        what = "is not a list"
-    elif pattern in PATTERNS:
+    if pattern in PATTERNS:
         what = f"is not {PATTERNS[pattern]}"
+    elif is_own_sentence(item):
+        what = describe_expectation(item)
     else:
-        what = item["msg"].removeprefix("Value error, ")
+        what = f"is not {describe_expectation(item)}"
     return SchemaIssue(where=where, what=what, got=got)
 
 

@@ -11,6 +11,7 @@ from lagbench.data.local import locate_new
 from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, format_count, hide_user
 from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.inventory import recording_hint
 from lagbench.scoring.boards import find_board
 
 from .options import (
@@ -105,6 +106,8 @@ def generate_command(
             lines = _describe_plan(result)
         else:
             lines = _describe_result(result)
+            if result.complete and season is None:
+                lines += recording_hint(result.split, result.size, result.root)
         print_result(result, lines, as_json=as_json, quiet=quiet)
 
 

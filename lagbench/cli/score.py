@@ -128,11 +128,12 @@ def _check_file_count(predictions: Sequence[Path], report: Path | None) -> None:
     """
     if len(predictions) > 1 and report is None:
         raise UsageError(
-            "several files are scored for one report only",
+            "several files are scored together for a report only",
             where="FILE",
-            expected="one file",
-            got=f"{len(predictions)} files",
-            fix="add --report FOLDER",
+            expected="one file, or several with --report FOLDER",
+            got=" ".join(map(str, predictions)),
+            fix="score one after the other; `lagbench compare A.nc B.nc` says which of "
+            "two is better; --report FOLDER draws all of them in one report",
         )
 
 

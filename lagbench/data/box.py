@@ -298,7 +298,16 @@ def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
         UsageError: a name is that of no axis of the box, or appears twice.
     """
     names = AXES[:dimension]
-    if len(set(axes)) != len(axes) or not set(axes) <= set(names):
+    unknown_axes = sorted(map(repr, set(axes) - set(names)))
+    if unknown_axes:
+        raise UsageError(
+            f"periodic axes: the box has no axis {', '.join(unknown_axes)}",
+            where="periodic",
+            expected=f"axes of the box: {', '.join(names)}",
+            got=", ".join(map(str, axes)),
+            fix=f"name axes of the box, as in {names[0]} or {','.join(names)}",
+        )
+    if len(set(axes)) != len(axes):
         raise UsageError(
             "periodic axes are named once each",
             where="periodic",

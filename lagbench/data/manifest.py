@@ -41,6 +41,7 @@ from .checksums import (
     round_digits,
     subset_hash,
 )
+from .field_errors import describe_expectation, describe_input
 from .layout import (
     MANIFEST_NAME,
     NOTES_NAME,
@@ -326,8 +327,9 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         raise DataError(
             "the manifest is damaged",
             where=f"{path}, key {key or '(whole file)'}",
-            expected="the manifest that lagbench writes",
-            got=first_error["msg"],
+            expected="the manifest that lagbench writes, here "
+            f"{describe_expectation(first_error)}",
+            got=describe_input(first_error),
             fix=_MANIFEST_HINT,
         ) from None
     if not manifest.is_of(split, size, major):

@@ -36,11 +36,13 @@ from lagbench.errors import (
     LagbenchError,
     UnreadableFileError,
     UsageError,
+    describe_exception,
     load_entry_point,
     suggest_name,
 )
 
 from .box import Box, parse_periodic
+from .field_errors import describe_expectation, describe_input, is_own_sentence
 from .grid import Grid, Placement
 from .layout import (
     ScenarioKey,
@@ -643,7 +645,7 @@ def _describe_plugin_error(point: EntryPoint, error: Exception) -> str:
     package = package_of(point)
     reason = str(error)
     if not isinstance(error, LagbenchError):
-        reason = f"{type(error).__name__}: {error}"
+        reason = describe_exception(error)
     return f"package {package} adds no split {point.name!r} ({point.value}): {reason}"
 
 
@@ -672,12 +674,10 @@ def _read(path: Path) -> _RegistryFile:
 def _describe_validation_error(detail: ErrorDetails) -> str:
     """Return key, expected value and, where it is short, the value that is wrong."""
     key = ".".join(str(part) for part in detail["loc"])
-    message = detail["msg"].removeprefix("Value error, ")
-    value = detail["input"]
-    # Python prints no thousands of digits.
-    if isinstance(value, int) and value.bit_length() > 256:
-        value = f"an integer of {value.bit_length()} bits"
-    is_short = isinstance(value, str | int | float)
+    message = describe_expectation(detail)
+    if not is_own_sentence(detail):
+        message = f"expected {message}"
+    is_short = isinstance(detail["input"], str | int | float)
     if is_short and "; got " not in message:
-        return f"{key}: {message}; got {value!r}"
+        return f"{key}: {message}; got {describe_input(detail)}"
     return f"{key}: {message}"

@@ -337,12 +337,21 @@ class SplitBuilder:
             self.dimension = trajectory.dimension if bounds is None else len(bounds)
         if trajectory.dimension == self.dimension:
             return
+        if self.entries or bounds is None:
+            source = "the trajectories before have"
+            fix = (
+                "adopt trajectories of two and of three dimensions apart, each kind "
+                "into a folder of its own: -o FOLDER"
+            )
+        else:
+            source = "--bounds has pairs"
+            fix = "give --bounds with a pair for each component of a position"
         raise DataError(
             "positions have another number of components",
             where=trajectory.name,
-            expected=f"{self.dimension}, as of the bounds or of trajectories before",
-            got=trajectory.dimension,
-            fix="give --bounds with a pair for each axis",
+            expected=f"{self.dimension} components, as {source}",
+            got=f"{trajectory.dimension} components",
+            fix=fix,
         )
 
     def _check_walls(self, trajectory: Trajectory) -> None:

@@ -37,6 +37,7 @@ from pydantic import (
 from lagbench.atomic import write_atomically
 from lagbench.data import MATERIALS
 from lagbench.data.box import AXES
+from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.registry import Size
 from lagbench.errors import (
     UnreadableFileError,
@@ -492,8 +493,8 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
     raise UnreadableFileError(
         "the metadata lack what a split needs, or state it otherwise",
         where=f"{path}, key {key}",
-        expected=first["msg"],
-        got=first["input"],
+        expected=describe_expectation(first),
+        got=describe_input(first),
         fix="correct the key in the metadata",
     )
 

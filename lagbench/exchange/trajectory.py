@@ -20,6 +20,7 @@ from typing_extensions import TypedDict
 
 from lagbench.data.box import Box, parse_periodic, unit_box
 from lagbench.data.checksums import round_digits
+from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
@@ -222,15 +223,11 @@ def _option_error(detail: ErrorDetails, *, where: str) -> UsageError:
     fix = "docs/exchange.md has the keys"
     if detail["type"] == "extra_forbidden":
         fix = suggest_name(key, DataOptions.__annotations__)
-    value = detail["input"]
-    got = f"a {type(value).__name__}"
-    if isinstance(value, str | int | float):
-        got = quote(value)
     return UsageError(
         "this does not describe data",
         where=f"{where}{key or '(whole file)'}",
-        expected=detail["msg"],
-        got=got,
+        expected=describe_expectation(detail),
+        got=describe_input(detail),
         fix=fix,
     )
 
@@ -396,7 +393,7 @@ class Description:
                 where="--periodic",
                 expected=error.expected,
                 got=error.got,
-                fix="separate them by commas, as in --periodic x,y",
+                fix=f"{error.fix}; a box of three axes has three pairs of --bounds",
             ) from None
 
     @cached_property

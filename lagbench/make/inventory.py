@@ -10,12 +10,20 @@ that promises no equal bits may differ from datasets.yaml, but not from its mani
 from __future__ import annotations
 
 import enum
+import shlex
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, to_plain
-from lagbench.data.layout import PICTURES, format_ids, scenario_path, url_of
+from lagbench.data.layout import (
+    PICTURES,
+    format_ids,
+    quote_root,
+    scenario_path,
+    url_of,
+)
+from lagbench.data.local import locate
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
@@ -397,7 +405,10 @@ def compare_hashes(
     record = size.record_name
     measured = size.measured
     if measured is None:
-        return f"{record} holds no hash of this size yet: nothing to compare with"
+        return (
+            f"nothing to compare with: {record} holds no hash of this size yet, which "
+            "would tell whether these are the bits that every machine has"
+        )
 
     differing = []
     broken = []
@@ -430,6 +441,23 @@ def compare_hashes(
     if manifest.complete:
         return f"equal to {record}"
     return f"what is there is equal to {record}"
+
+
+def recording_hint(split: str, size_name: str, root: Path) -> list[str]:
+    """Return how the author of a split records the hashes of a complete data set.
+
+    There are no lines where they are recorded, or the data lie in a store.
+    """
+    size, _, _ = locate(split, size_name, root=root)
+    if size.measured is not None or url_of(root) is not None:
+        return []
+    options = f"--split {size.split} --size {size.name} --root {quote_root(root)}"
+    registry = shlex.quote(str(size.file))
+    return [
+        "Is the split yours? Then record the hashes of these data. Later generations, "
+        "on other machines too, are compared with them:",
+        f"  python -m lagbench.generators.record {options} --registry {registry}",
+    ]
 
 
 def _hash_error(size: Size, what: str, place: str) -> DataError:

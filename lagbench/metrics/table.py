@@ -21,6 +21,7 @@ from lagbench.data.registry import (
 from lagbench.errors import (
     LagbenchError,
     UsageError,
+    describe_exception,
     load_entry_point,
     suggest_name,
 )
@@ -163,7 +164,7 @@ def _load(point: EntryPoint) -> Sequence[Metric]:
 def _describe(error: Exception) -> str:
     if isinstance(error, LagbenchError):
         return error.what
-    return f"{type(error).__name__}: {error}"
+    return describe_exception(error)
 
 
 def own_metrics(values: object) -> tuple[Metric, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from pathlib import Path
 
 from lagbench.errors import UsageError
@@ -14,6 +16,12 @@ DEFAULT_BOARDS = (
     Path(__file__).resolve().parents[2] / "leaderboard",
 )
 """The leaderboard in the working folder, and that of a clone."""
+
+MOST_NAMES = 1000
+"""Names of a folder among which leaderboards are looked for."""
+
+MOST_BOARDS = 3
+"""Leaderboards that a hint lists."""
 
 
 def find_board(board: str | Path | None = None) -> Path:
@@ -47,6 +55,10 @@ def require_board(board: str | Path, *, fix: str | None = None) -> None:
 
 def no_board(folder: Path = DEFAULT_BOARDS[0], fix: str | None = None) -> UsageError:
     """Return the error for a folder that is no leaderboard."""
+    fix = fix or "run it from the root of the clone, or name it: --board FOLDER"
+    boards = [str(board) for board in find_boards_near(folder)]
+    if boards:
+        fix = f"there is a leaderboard in {', '.join(boards)}: name it; or {fix}"
     got = "no such folder"
     if folder.is_dir():
         got = "a folder without it"
@@ -57,5 +69,19 @@ def no_board(folder: Path = DEFAULT_BOARDS[0], fix: str | None = None) -> UsageE
         where=str(folder),
         expected=f"a folder that holds {SUBMISSIONS}/",
         got=got,
-        fix=fix or "run it from the root of the clone, or name it: --board FOLDER",
+        fix=fix,
     )
+
+
+def find_boards_near(folder: Path) -> list[Path]:
+    """Return leaderboards in a folder, beside it, and those that are the default."""
+    candidates = []
+    for place in (folder, folder.parent):
+        with suppress(OSError):
+            names = sorted(os.listdir(place))[:MOST_NAMES]
+            candidates += [place / name for name in names]
+    boards: dict[Path, Path] = {}
+    for candidate in (*candidates, *DEFAULT_BOARDS):
+        if (candidate / SUBMISSIONS).is_dir():
+            boards.setdefault(candidate.resolve(), candidate)
+    return list(boards.values())[:MOST_BOARDS]

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from lagbench.data.field_errors import describe_expectation, is_own_sentence
 from lagbench.errors import check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
 from lagbench.metrics.metric import Metric
@@ -111,7 +112,10 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = "/".join(map(str, first["loc"]))
-        raise ValueError(f"{place!a}: {first['msg']}") from error
+        message = describe_expectation(first)
+        if not is_own_sentence(first):
+            message = f"expected {message}"
+        raise ValueError(f"{place!a}: {message}") from error
 
     metrics = available()
     rows = {}

@@ -7,7 +7,7 @@ import operator
 import os
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from itertools import accumulate
@@ -334,6 +334,24 @@ class Window(NamedTuple):
     obstacle: NDArray[np.float32] | None = None
 
 
+def check_whole(value: object, name: str) -> None:
+    """Refuse an argument that is no whole number, such as a text.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise UsageError(
+            f"{name} is no whole number",
+            where=name,
+            expected="a whole number",
+            got=repr(value)[:80],
+            fix=f"give a number without quotes, as in {name}=2",
+        ) from None
+
+
 class WindowReader:
     """All windows of ``history + future`` consecutive frames, by number.
 
@@ -359,8 +377,14 @@ class WindowReader:
         origin: bool = False,
         verify: bool = False,
     ) -> None:
+        if history is not None:
+            check_whole(history, "history")
+        check_whole(future, "future")
+        check_whole(cache_bytes, "cache_bytes")
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
-        subsets = (subset,) if isinstance(subset, str) else tuple(subset)
+        if isinstance(subset, str) or not isinstance(subset, Iterable):
+            subset = (subset,)
+        subsets = tuple(subset)
         paths = scenario_files(tier, root_folder, subsets)
         # what the registry publishes: bounds, task, parameters, statistics of train
         self.size = tier

@@ -118,16 +118,16 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
         default: the number where the user gave none.
 
     Raises:
-        UsageError: the number is below 1.
+        UsageError: it is no whole number from 1.
     """
     if workers is None:
         return default or available_cores()
-    if workers < 1:
+    if not isinstance(workers, int) or workers < 1:
         raise UsageError(
             "at least one worker is needed",
             where="--workers",
-            expected="1 or more",
-            got=workers,
+            expected="a whole number from 1",
+            got=repr(workers),
             fix="leave it out: one per core is taken",
         )
     return workers

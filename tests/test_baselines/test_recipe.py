@@ -422,7 +422,7 @@ def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
             "{format: 1, recipes: {cavity/tiny: {baselines: {gnss: {}}}}}",
             "did you mean 'gns'",
         ),
-        ("[1, 2]", "dictionary"),
+        ("[1, 2]", "the file does not fit"),
         ("{format: 1, a: &x 1, b: *x}", "aliases"),
     ],
 )

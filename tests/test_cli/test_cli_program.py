@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from score_bench import ScoreBench, still
 from typer.testing import CliRunner, Result
 
 import lagbench
@@ -42,6 +43,19 @@ def test_usage_errors_exit_2(line: str, culprit: str, run: Run, tmp_path: Path) 
     assert culprit in result.stderr
     assert "Traceback" not in result.output
     assert result.stdout == ""
+
+
+@pytest.mark.filterwarnings("always::lagbench.data.registry.PluginWarning")
+def test_a_broken_package_is_warned_of_once(
+    package: Callable[..., Path], bench: ScoreBench, run: Run, tmp_path: Path
+) -> None:
+    """Several parts of a command ask for the metrics; the line of the fault is told."""
+    module_file = package("metrics", "broken_metric:METRICS", "1 / 0\n")
+    predictions = bench.submit(tmp_path / "still.nc", still)
+    result = run("score", predictions, "--root", bench.root)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count("adds no metric") == 1
+    assert f"({module_file}, line 1)" in result.stderr
 
 
 def test_an_unknown_command_exits_2(run: Run) -> None:

@@ -37,7 +37,10 @@ def files(bench: ScoreBench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "bad.yaml").write_text("format: 1\nrecipes: [\n")
     (folder / "bad_key.yaml").write_text("authors: [A]\ncomand: python x.py\n")
     (folder / "model.onnx").write_bytes(b"onnx")
+    (folder / "near" / "board" / "submissions").mkdir(parents=True)
     runs = np.stack(straight_runs(3))
+    solid_runs = np.concatenate([runs, runs[..., :1]], axis=-1)
+    np.save(folder / "solid.npy", solid_runs)
     np.save(folder / "runs.npy", runs)
     np.save(folder / "axes.npy", np.moveaxis(runs, 1, 3))
     np.save(folder / "metres.npy", 1000.0 * runs)
@@ -195,6 +198,40 @@ MISTAKES = {
     "an option for weights only": "predict notes.txt --split curl-noise -o x.nc",
     "a season to run that is none": "season run winter",
 }
+
+
+HINTS = {
+    f"{TRAIN} gns --set training.steps 10": "--set training.steps=10",
+    f"{TRAIN} gns --set training.steps=1 training.batch=2": (
+        "--set training.steps=1 --set training.batch=2"
+    ),
+    f"{TRAIN} gns --set training.steps=many": "expected: a whole number",
+    "score good.nc nan.nc": "lagbench compare",
+    "validate good.nc nan.nc": "expected: lagbench validate [OPTIONS] ",
+    "submit good.nc --author A --command x --board near/bord": "near/board",
+    f"{ADOPT} runs.npy --periodic w --bounds 0,1,0,1": "axes of the box: x, y",
+    f"{ADOPT} runs.npy solid.npy": "apart",
+    f"{ADOPT} solid.npy --bounds 0,1,0,1": "a pair for each component",
+}
+"""What the message about a mistake contains, by command."""
+
+
+@pytest.mark.parametrize("command", HINTS)
+def test_a_mistake_is_told_with_what_mends_it(
+    command: str,
+    run: Callable[..., Result],
+    bench: ScoreBench,
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(files)
+    monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
+    words = shlex.split(command)
+    monkeypatch.setattr("sys.argv", ["lagbench", *words])
+    result = run(*words)
+    assert result.exit_code in {2, 4}
+    assert has_all_parts(result.stderr), result.stderr
+    assert HINTS[command] in result.stderr
 
 
 def has_all_parts(message: str) -> bool:

@@ -851,6 +851,10 @@ def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
         ({"split": "cavty"}, "did you mean 'cavity'"),
         ({"history": 40}, "no scenario is as long as a window"),
         ({"history": 0}, "at least one given frame"),
+        ({"history": "2"}, "expected: a whole number.*got: '2'"),
+        ({"future": 1.5}, "expected: a whole number.*got: 1.5"),
+        ({"cache_bytes": None}, "expected: a whole number.*got: None"),
+        ({"subset": 3}, "no subset 3"),
         ({"subset": []}, "0 scenarios"),
         ({"cache_bytes": -1}, "cache_bytes -1"),
         (
@@ -1067,8 +1071,10 @@ def test_outputs_that_are_no_positions_are_refused(
     def step(batch: Batch) -> Any:
         return change_output(last_position(batch))
 
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError) as caught:
         roll_out(step, two_frames, 2)
+    kind = "a NumPy array" if change_output is np.asarray else "a tensor"
+    assert str(caught.value.got).startswith(kind)
 
 
 def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:

@@ -1,0 +1,105 @@
+"""What a field of a file or of options should hold, in our words.
+
+pydantic checks these fields. Its messages are for developers ("Input should be a valid
+integer, unable to parse string as an integer"). This table replaces them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+EXPECTATIONS = {
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_parsing_size": "a whole number with fewer digits",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "greater_than": "a number greater than {gt}",
+    "greater_than_equal": "a number not less than {ge}",
+    "less_than": "a number less than {lt}",
+    "less_than_equal": "a number not greater than {le}",
+    "multiple_of": "a multiple of {multiple_of}",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "string_type": "a text",
+    "string_sub_type": "a text",
+    "string_unicode": "a text in UTF-8",
+    "string_too_short": "a text of at least {min_length} characters",
+    "string_too_long": "a text of at most {max_length} characters",
+    "string_pattern_mismatch": "a text of the form {pattern}",
+    "bytes_type": "bytes",
+    "list_type": "a list in brackets",
+    "tuple_type": "a list in brackets",
+    "set_type": "a list in brackets",
+    "frozen_set_type": "a list in brackets",
+    "iterable_type": "a list in brackets",
+    "too_short": "at least {min_length} values",
+    "too_long": "at most {max_length} values",
+    "dict_type": "keys with values",
+    "mapping_type": "keys with values",
+    "model_type": "keys with values",
+    "model_attributes_type": "keys with values",
+    "dataclass_type": "keys with values",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "none_required": "null",
+    "missing": "a value of this key",
+    "missing_argument": "a value of this key",
+    "extra_forbidden": "no such key",
+    "unexpected_keyword_argument": "no such key",
+    "json_invalid": "JSON; reading it fails: {error}",
+    "json_type": "JSON",
+    "date_type": "a date, as in 2026-01-31",
+    "date_parsing": "a date, as in 2026-01-31",
+    "date_from_datetime_parsing": "a date, as in 2026-01-31",
+    "date_from_datetime_inexact": "a date, as in 2026-01-31",
+    "datetime_type": "a date with its time",
+    "datetime_parsing": "a date with its time",
+    "datetime_from_date_parsing": "a date with its time",
+    "url_type": "an address, as in https://host/path",
+    "url_parsing": "an address, as in https://host/path",
+    "url_scheme": "an address that begins with {expected_schemes}",
+}
+"""What was expected, by the type of pydantic's error.
+
+Words in braces come from its context.
+"""
+
+
+def describe_expectation(detail: ErrorDetails) -> str:
+    """Return what was expected where pydantic found something else.
+
+    Where a validator of ours found it, this is the validator's own sentence.
+
+    >>> describe_expectation({"type": "int_parsing", "loc": (), "msg": "", "input": ""})
+    'a whole number'
+    """
+    if is_own_sentence(detail):
+        return detail["msg"].partition(", ")[2]
+    expectation = EXPECTATIONS.get(detail["type"])
+    if expectation is None:
+        return detail["msg"].removeprefix("Input should be ")
+    return expectation.format_map(detail.get("ctx", {}))
+
+
+def describe_input(detail: ErrorDetails) -> str:
+    """Return what pydantic found, shortened; the name of its class if it is long."""
+    if detail["type"] in {"missing", "missing_argument"}:
+        return "no such key"
+    value = detail["input"]
+    # Python prints no thousands of digits.
+    if isinstance(value, int) and value.bit_length() > 256:
+        return f"a whole number of {value.bit_length()} bits"
+    if value is None or isinstance(value, str | bytes | int | float):
+        return ascii(value)[:80]
+    return f"a {type(value).__name__}"
+
+
+def is_own_sentence(detail: ErrorDetails) -> bool:
+    """Return whether a validator of ours found the error and said what is wrong."""
+    return detail["type"] in {"value_error", "assertion_error"}

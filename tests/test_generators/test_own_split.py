@@ -1,0 +1,169 @@
+"""What a user is told about the module of a split of their own that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import Result
+
+from lagbench.data.registry import Registry, Size, load
+from lagbench.errors import (
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
+from lagbench.generators.batch import draw_initial_state
+from lagbench.generators.constants import solver_constants, split_module
+from lagbench.make.generate import GenerationResult
+
+Install = Callable[..., Path]
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "dam_break" / "dam_break"
+SOURCE = (EXAMPLE / "__init__.py").read_text()
+
+WIDTH = "uniform(rng, 0.2, 0.4)"
+HEIGHT = '"height": height'
+CONSTANTS = "constants(FreeSurfaceParameters, size)"
+
+
+def own_size(package: Install, old: str, new: str) -> tuple[Size, Path]:
+    """Install the example of the docs with one change; return its size and module."""
+    assert old in SOURCE
+    module_file = package("generators", "mine", SOURCE.replace(old, new))
+    registry = module_file.with_name("dam_break.yaml")
+    text = (EXAMPLE / registry.name).read_text()
+    registry.write_text(text.replace("generator: dam_break", "generator: mine"))
+    return load(registry).size("dam-break", "tiny"), module_file
+
+
+def line_of(module_file: Path, text: str) -> str:
+    """Return how a message names the line of a module that has a text."""
+    for number, line in enumerate(module_file.read_text().splitlines(), start=1):
+        if text in line:
+            return f"{module_file}, line {number}"
+    raise AssertionError(text)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ("1 / 0", "ZeroDivisionError"),
+        ("undefined_name", "NameError"),
+        ("uniform(rng, 0.2)", "TypeError"),
+        ("np.linalg.solve(np.zeros((3, 2)), np.ones(3))", "LinAlgError"),
+        ("open('/no/such/file')", "FileNotFoundError"),
+    ],
+)
+def test_an_exception_of_initial_state_is_told_with_file_and_line(
+    change: str, kind: str, package: Install
+) -> None:
+    """The line is the last one of the user's module, not one of NumPy or of ours."""
+    size, module_file = own_size(package, WIDTH, change)
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(size, 3)
+    assert caught.value.where == line_of(module_file, change)
+    assert str(caught.value.got).startswith(f"{kind}: ")
+    assert "Traceback" not in str(caught.value)
+
+
+def test_a_parameter_that_is_not_there_is_told_with_both_places(
+    package: Install,
+) -> None:
+    """The file that lacks it, and the line that asks for it."""
+    change = 'size.value("widht")'
+    size, module_file = own_size(package, WIDTH, change)
+    with pytest.raises(UnreadableFileError) as caught:
+        draw_initial_state(size, 3)
+    where = str(caught.value.where)
+    assert str(size.file) in where
+    assert line_of(module_file, change) in where
+
+
+def test_an_exception_of_solver_parameters_is_told_with_file_and_line(
+    package: Install,
+) -> None:
+    size, module_file = own_size(package, CONSTANTS, "no_constants")
+    with pytest.raises(WorkFailedError) as caught:
+        solver_constants(size)
+    assert caught.value.where == line_of(module_file, "no_constants")
+
+
+def test_a_module_that_fails_at_import_is_told_with_file_and_line(
+    package: Install,
+) -> None:
+    size, module_file = own_size(package, "GAP = 0.01", "GAP = 0.01 / 0")
+    with pytest.raises(UsageError) as caught:
+        split_module(size)
+    assert line_of(module_file, "GAP = 0.01 / 0") in str(caught.value.got)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("area=width * height", "area=None"),
+        ("area=width * height", "area=float('nan')"),
+        ("area=width * height", "area=1.0, friction='a'"),
+        (HEIGHT, '"height": None'),
+        (HEIGHT, '"height": np.ones(3)'),
+        (HEIGHT, '"height": ""'),
+        (HEIGHT, "3: height"),
+        ('parameters={"width": width, "height": height}', "parameters=[1.0]"),
+    ],
+)
+def test_a_value_that_cannot_be_stored_is_refused_as_it_is_drawn(
+    old: str, new: str, package: Install
+) -> None:
+    size, _ = own_size(package, old, new)
+    with pytest.raises(UsageError) as caught:
+        draw_initial_state(size, 3)
+    assert str(caught.value.where).startswith("mine.initial_state, scenario 3")
+    parts = (caught.value.expected, caught.value.got, caught.value.fix)
+    assert None not in parts
+
+
+def test_parameters_of_our_own_splits_are_blamed_on_the_registry(
+    tmp_path: Path,
+) -> None:
+    """There is no module of a user to mend."""
+    size = load().size("cavity", "tiny")
+    parameters = dict(size.parameters)
+    name = next(name for name in parameters if name.startswith("reynolds"))
+    parameters[name] = parameters[name].model_copy(update={"value": "fast"})
+    with pytest.raises(LagbenchError) as caught:
+        draw_initial_state(size.model_copy(update={"parameters": parameters}), 0)
+    assert isinstance(caught.value, UnreadableFileError)
+
+
+def test_a_split_without_recorded_hashes_says_how_to_record_them(
+    generated: GenerationResult,
+    unmeasured: Registry,
+    unmeasured_path: Path,
+    run: Callable[..., Result],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Generate and verify name the command, and its options are those of the data."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    for command in ("generate", "verify"):
+        words = (command, generated.split, "--size", generated.size)
+        result = run(*words, "--root", generated.root)
+        assert result.exit_code == 0, result.stderr
+        (line,) = [
+            line for line in result.stdout.splitlines() if "generators.record" in line
+        ]
+        assert f"--split {generated.split} --size {generated.size} " in line
+        assert f"--root {generated.root}" in line
+        assert f"--registry {unmeasured_path}" in line
+
+
+def test_a_split_with_recorded_hashes_says_nothing_of_recording(
+    generated: GenerationResult,
+    run: Callable[..., Result],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("LAGBENCH_REGISTRY", raising=False)
+    result = run("verify", generated.split, "--root", generated.root)
+    assert result.exit_code == 0, result.stderr
+    assert "generators.record" not in result.stdout
