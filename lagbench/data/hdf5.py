@@ -1,9 +1,8 @@
 """Open HDF5 files, and read their members and attributes as netCDF shows them.
 
-Files are read with h5py, which opens a file in half the time that netCDF4 takes. They
-are written with netCDF4. Links are listed and never followed: nothing outside the file
-is opened. Files of strangers are checked in :mod:`.structure` before their values are
-read.
+h5py opens a file in half the time that netCDF4 takes. Links are listed and never
+followed: nothing outside the file is opened. Files of strangers are checked in
+:mod:`.structure` before their values are read.
 """
 
 from __future__ import annotations
@@ -11,15 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import h5py
 import numpy as np
 
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, check_regular
-
-if TYPE_CHECKING:
-    import netCDF4
 
 MAX_LINKS = 1000
 """Most entries of a group that are inspected."""
@@ -146,17 +141,6 @@ def open_hdf5(
         file = h5py.File(path, "r", locking=False)
     with file:
         yield file
-
-
-def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
-    """Open a netCDF4 file, to read it or to write it anew.
-
-    Every use of the library goes through here, because it takes a tenth of a second to
-    load: help and plans of work do without it.
-    """
-    import netCDF4
-
-    return netCDF4.Dataset(path, mode, format="NETCDF4")
 
 
 # --- members and storage --------------------------------------------------------------

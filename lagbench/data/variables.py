@@ -8,10 +8,15 @@ changed. So a variable has exactly the attributes of :data:`ATTRIBUTES`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from . import MATERIALS
+
+if TYPE_CHECKING:
+    import netCDF4
 
 ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
     "frame": {
@@ -62,6 +67,18 @@ MAX_VALUES_PER_FRAME = 20_000_000
 
 These are two for each of ten million particles, or three for each of 6.7 million.
 """
+
+
+def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
+    """Open a netCDF4 file, to read it or to write it anew.
+
+    Every use of the library goes through here, because it takes a tenth of a second to
+    load: help and plans of work do without it. It stands here because a process that
+    only writes does without h5py.
+    """
+    import netCDF4
+
+    return netCDF4.Dataset(path, mode, format="NETCDF4")
 
 
 def expected_attributes(name: str, dims: Sequence[str]) -> dict[str, object]:

@@ -24,9 +24,8 @@ from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
-from .hdf5 import open_netcdf
 from .layout import ScenarioKey
-from .variables import MAX_VALUES_PER_FRAME, expected_attributes
+from .variables import MAX_VALUES_PER_FRAME, expected_attributes, open_netcdf
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.hdf5 import open_netcdf
 from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
+from lagbench.data.variables import open_netcdf
 from lagbench.errors import (
     DataError,
     UsageError,
