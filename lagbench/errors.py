@@ -116,14 +116,14 @@ def hide_user(text: str, mark: str = "...@") -> str:
     """Return a text with a mark for the users and passwords of the addresses in it.
 
     Messages are printed, logged and sent to others. A password may hold any characters
-    but blanks, so after a user with a colon all is hidden up to the last ``@``. A port
-    is shown after ``localhost``, a name with a dot, and a number in brackets only: in
-    ``ann:12/cret@host`` the number may begin a password.
+    but blanks, so after a user with a colon all is hidden up to the last ``@``. But a
+    number from 1 to 65535 between the colon and the first slash is a port, as every
+    reader of addresses takes it: an ``@`` behind it belongs to the path.
 
     >>> hide_user("ftp://ann:se/cret@host/data does not answer")
     'ftp://...@host/data does not answer'
-    >>> hide_user("http://localhost:8000/data@v2 does not answer")
-    'http://localhost:8000/data@v2 does not answer'
+    >>> hide_user("http://nas:8000/data@v2 does not answer")
+    'http://nas:8000/data@v2 does not answer'
     """
     if "@" not in text:
         return text
@@ -155,16 +155,17 @@ def _hide_user_in_word(word: str, mark: str) -> str:
 
 
 def _is_host_with_port(host: str) -> bool:
-    """Return whether what stands before the first slash is surely a host and a port.
+    """Return whether what stands before the first slash is a host and a port.
 
-    It is not where an ``@`` stands in it, nor after a name that may be a user.
+    A user may stand before them.
     """
+    host = host.rpartition("@")[2]
     if _IPV6_HOST.fullmatch(host):
         return True
     name, _, port = host.partition(":")
-    if not _PORT.fullmatch(port) or int(port) > _LAST_PORT:
+    if not name or not _PORT.fullmatch(port):
         return False
-    return "@" not in name and ("." in name or name == "localhost")
+    return 1 <= int(port) <= _LAST_PORT
 
 
 def escape_unprintable(text: str) -> str:
