@@ -131,7 +131,7 @@ class Baseline(nn.Module):
                 where=f"the box of {info.split} {info.size}",
                 expected="bounds of x and y",
                 got=f"{len(info.bounds)} axes",
-                fix="train a graph network, such as gns",
+                fix="train neuralmpm, or a graph network such as gns",
             )
         self.options = options
         self.info = info

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import enum
 from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -117,6 +118,23 @@ class FrameState(nn.Module):
         }
 
 
+def require_particles(counts: Iterable[int], particles: int) -> None:
+    """Refuse windows or scenarios with another number of particles than the model's.
+
+    Raises:
+        DataError: one has another number.
+    """
+    distinct_counts = set(counts)
+    if distinct_counts != {particles}:
+        raise DataError(
+            "a model of whole frames needs one number of particles",
+            where="scenarios of this data set",
+            expected=f"{particles} particles in each scenario",
+            got=", ".join(map(str, sorted(distinct_counts))),
+            fix="train neuralmpm, or a graph network such as gns",
+        )
+
+
 def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
     """Return positions and materials of a batch, window by window.
 
@@ -127,15 +145,7 @@ def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
         DataError: a window has another number of particles.
     """
     counts = torch.bincount(batch.sample, minlength=batch.windows)
-    distinct_counts = set(counts.tolist())
-    if distinct_counts != {particles}:
-        raise DataError(
-            "a model of whole frames needs every particle",
-            where="batch",
-            expected=f"{particles} particles in each window",
-            got=", ".join(map(str, sorted(distinct_counts))),
-            fix="use a graph network for scenarios of other sizes",
-        )
+    require_particles(counts.tolist(), particles)
     windows = batch.windows
     position = batch.position.view(windows, particles, batch.frames, -1)
     material = batch.material.view(windows, particles)

@@ -265,7 +265,7 @@ class HybridProjection(Baseline):
                 where=f"{self.info.split} {self.info.size}",
                 expected="a viscosity in each scenario file, or in the registry",
                 got="none",
-                fix="choose a model that does not ask for it",
+                fix="train neuralmpm, or a graph network such as gns",
             )
         # A file states it in float64; the solver's steps may hang on the last digit.
         stated = float(given.viscosity[window])

@@ -38,7 +38,7 @@ from lagbench.errors import WorkFailedError
 
 from . import baseline
 from .baseline import DatasetInfo
-from .frame_model import FrameModel, FrameWindow
+from .frame_model import FrameModel, FrameWindow, require_particles
 
 BLOCK = 1024  # rows in memory at a time, at most
 EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
@@ -105,6 +105,7 @@ class Fitted(FrameModel):
 
         The first frame is left out: it has no velocity of its own.
         """
+        require_particles([position.shape[1]], self.info.particles)
         stored_position = torch.from_numpy(position)
         exact_position = stored_position.to(torch.float64)
         state = self.frame_state.standardise(exact_position)

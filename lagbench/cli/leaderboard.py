@@ -16,6 +16,7 @@ from lagbench.board.build import build, collect
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
+from lagbench.board.measured_cost import TIMED_FRAMES
 from lagbench.board.reproduce import ReproduceResult, reproduce
 from lagbench.board.selection import choose_data_sets
 from lagbench.board.shift import scores_of_seeds
@@ -371,8 +372,12 @@ def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterat
                 f"of {one.of} scenarios){when}"
             )
         if line.cost is not None and with_costs:
-            milliseconds = 1e3 * line.cost.seconds_per_frame
-            yield f"{name}: {milliseconds:.3g} ms per frame, {line.cost.machine}"
+            cost = line.cost
+            yield (
+                f"{name}: {cost.seconds_per_frame:.3g} s per frame: processor time, "
+                f"mean over {TIMED_FRAMES} frames, least of {cost.repeats} rounds; "
+                f"{cost.machine}"
+            )
     yield (
         f"{result.folder}: {format_count(len(result.lines), 'entry')}, "
         f"{format_count(len(result.differing), 'difference')}, "

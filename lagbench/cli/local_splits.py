@@ -237,16 +237,25 @@ def _parse_axes(text: str) -> tuple[str, ...]:
 
 
 def _next_steps(local_split: LocalSplit) -> Iterator[str]:
-    """Yield the commands that predict with a model of the user, and that train one."""
+    """Yield the commands that predict with a model of the user, and that train one.
+
+    The recipe has no options of a model, so every baseline can be trained by it.
+    """
     folder = shlex.quote(f"{local_split.folder}/")
-    network = "model: {latent: 32, layers: 2}, training: {steps: 2000}"
+    training = "training: {steps: 2000, learning_rate: 1.0e-3, schedule: cosine}"
     name = f"{local_split.name}/{local_split.size}"
-    recipe = f"{{format: 1, recipes: {{{name}: {{{network}}}}}}}"
+    recipe = f"{{format: 1, recipes: {{{name}: {{{training}}}}}}}"
     file = shlex.quote(f"{local_split.name}-recipe.yaml")
     yield f"  use it  lagbench template --split {folder} -o predictions.nc"
     yield "  train   lagbench has no recipe for your data; begin with this one:"
     yield f"          echo {shlex.quote(recipe)} > {file}"
-    yield f"          lagbench train --baseline gns --split {folder} --recipe {file}"
+    options = f"--split {folder} --recipe {file}"
+    yield f"          lagbench train --baseline neuralmpm {options}"
+    yield "          or a small graph network:"
+    yield (
+        f"          lagbench train --baseline gns {options} --set model.latent=32 "
+        "--set model.layers=2"
+    )
     yield "          docs/exchange.md and docs/baselines.md say more about recipes"
 
 

@@ -181,8 +181,8 @@ def _predict_onnx(
     lines = [
         f"{result.path}: {result.method}, {result.scenarios} scenarios, "
         f"{result.frames} frames",
-        f"  model   {result.seconds_per_frame:.3g} s per frame, processor time "
-        f"of one thread",
+        f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of one "
+        "thread, mean over all predicted frames",
         _next_command(result.path, root),
     ]
     print_result(result, lines, as_json=as_json, quiet=quiet)

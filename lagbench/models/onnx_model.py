@@ -32,7 +32,7 @@ LOAD_SECONDS = 10.0  # processor time until a model is ready to run [s]
 CHECK_MEMORY = 1 << 30  # address space of the checks [bytes]
 MEMORY = 4 << 30  # address space of a rollout [bytes]
 SECONDS_PER_FRAME = 4.0  # processor time of a rollout, per frame [s]
-LEAST_SECONDS = 1e-4  # clocks of processor time are no finer [s]
+LEAST_SECONDS = 1e-6  # processor time of a rollout, which is never nothing [s]
 WALL_FACTOR = 4.0  # time of the clock over processor time, on a busy machine
 START_SECONDS = 30.0  # time of the clock for the start of a child [s]
 

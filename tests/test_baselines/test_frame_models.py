@@ -209,7 +209,7 @@ def test_scenarios_of_another_size_are_refused() -> None:
     model = MLP.build(SMALL, INFO)
     frames = SCENARIOS[0][:2]
     window = batch_of([frames[:, :11]])
-    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
+    with pytest.raises(DataError, match="12 particles in each scenario\n  got: 11"):
         model.start(window)
 
 
