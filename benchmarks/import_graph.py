@@ -7,6 +7,7 @@ if asked, those that only a type checker sees.
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import TypeGuard
 
 Graph = Mapping[str, set[str]]
 """The modules that each module imports, by dotted name."""
+
+ImportStatement = ast.Import | ast.ImportFrom
 
 
 def package_modules(root: Path) -> dict[str, Path]:
@@ -57,20 +60,36 @@ def imported_names(name: str, path: Path, *, for_types: bool) -> Iterator[str]:
     package_parts = name.split(".")
     if path.name != "__init__.py":
         package_parts.pop()
-    pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
-    while pending:
-        node = pending.pop()
-        if not for_types and _is_for_types(node):
-            pending += node.orelse
+    source = path.read_text(encoding="utf-8")
+    for statement, is_for_types in _import_statements(source):
+        if is_for_types and not for_types:
             continue
-        if isinstance(node, ast.Import):
-            for alias in node.names:
+        if isinstance(statement, ast.Import):
+            for alias in statement.names:
                 yield alias.name
-        elif isinstance(node, ast.ImportFrom):
-            base = _base_of(node, package_parts)
-            for alias in node.names:
+        else:
+            base = _base_of(statement, package_parts)
+            for alias in statement.names:
                 yield f"{base}.{alias.name}"
-        pending += ast.iter_child_nodes(node)
+
+
+# Parsing takes most of the time, and both graphs need it.
+@functools.cache
+def _import_statements(source: str) -> list[tuple[ImportStatement, bool]]:
+    """Return the imports of a source, and whether only a type checker sees them."""
+    statements: list[tuple[ImportStatement, bool]] = []
+    pending: list[tuple[ast.AST, bool]] = [(ast.parse(source), False)]
+    while pending:
+        node, is_for_types = pending.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            statements.append((node, is_for_types))
+        elif _is_for_types(node):
+            pending += [(child, True) for child in node.body]
+            pending += [(child, is_for_types) for child in node.orelse]
+        elif not isinstance(node, ast.expr):  # no expression holds a statement
+            for child in ast.iter_child_nodes(node):
+                pending.append((child, is_for_types))
+    return statements
 
 
 def _is_for_types(node: ast.AST) -> TypeGuard[ast.If]:

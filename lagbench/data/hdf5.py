@@ -282,7 +282,8 @@ def read_attribute(owner: h5py.HLObject, name: str) -> object:
     """
     if not h5py.h5a.exists(owner.id, name.encode()):
         return None
-    value = owner.attrs[name]
+    # The attribute `attrs` of a file opens the root group anew for each attribute.
+    value = h5py.AttributeManager(owner)[name]
     if isinstance(value, h5py.Empty):
         if value.dtype.kind in "SO":
             return ""

@@ -94,7 +94,7 @@ def read_single_value(owner: h5py.HLObject, name: str) -> object:
     if length > MAX_ATTRIBUTE:
         return UnusableAttribute(f"{length} bytes")
 
-    value: Any = owner.attrs[name]
+    value: Any = h5py.AttributeManager(owner)[name]
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.item()
     if isinstance(value, bytes):
