@@ -273,6 +273,7 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_bench_of_the_solver(lagbench: Command, original: LocalSplit) -> None:
     """The solver is timed in a process of its own; nothing else can be timed, and no
     local split.

@@ -448,6 +448,7 @@ GATED_FOR_TRAINING: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options", "steps", "share"),
     [

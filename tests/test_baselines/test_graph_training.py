@@ -657,6 +657,7 @@ def test_terms_that_count_start_alive(
 OPERATORS = ["gns", "supergat", "gat", "gatv2", "pointnet", "transformer"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", of_this_turn(OPERATORS, turns=3))
 def test_every_operator_learns_a_swirl(name: str) -> None:
     """After forty steps a rollout is better than constant velocity in every frame.

@@ -88,7 +88,9 @@ def scored(
     return card.scores["submission"][name].mean
 
 
-@pytest.mark.parametrize("baseline", ["gns", "mlp"])
+@pytest.mark.parametrize(
+    "baseline", [pytest.param("gns", marks=pytest.mark.slow), "mlp"]
+)
 def test_digits_of_the_scorer_in_a_full_box(
     run: Run,
     generated: GenerationResult,

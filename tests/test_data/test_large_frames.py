@@ -87,6 +87,7 @@ def peak_memory(folder: Path, frames: int) -> int:
     return 1024 * int(result.stdout)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
     """Writing, hashing and the statistics of 30 frames take what 6 take."""
     short = peak_memory(tmp_path / "short", 6)

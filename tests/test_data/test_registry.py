@@ -193,7 +193,7 @@ def edited(tmp_path: Path, change: Change) -> Path:
     data.pop("measured", None)
     change(data["splits"])
     path = tmp_path / "datasets.yaml"
-    path.write_text(yaml.safe_dump(data))
+    path.write_text(yaml.dump(data, Dumper=yaml.CSafeDumper))
     return path
 
 

@@ -341,6 +341,7 @@ def test_arrowheads_point_where_a_wall_slides(tmp_path: Path) -> None:
     assert mirror_difference < 0.2 * difference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ending", "head"),
     [

@@ -111,6 +111,18 @@ PARTICLES = {
 }
 
 
+# Two pages hold all kinds of figures; the browser opens these two as well.
+EVERY_PAGE = pytest.mark.parametrize(
+    "split",
+    [
+        "cavity",
+        "multimaterial",
+        pytest.param("curl-noise", marks=pytest.mark.slow),
+        pytest.param("fluid", marks=pytest.mark.slow),
+    ],
+)
+
+
 def expected_figures(split: str) -> dict[str, str]:
     """Return the figures that a report on a split must have."""
     if split in PARTICLES:
@@ -192,7 +204,7 @@ def assert_harmless(reading: Reading) -> None:
         assert style.text.count("{") == style.text.count("}")
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@EVERY_PAGE
 def test_page_is_whole_and_harmless(page: Page, split: str) -> None:
     """Elements close in order, links lead somewhere, nothing runs; 3 MB hold it."""
     html = page(split)
@@ -215,7 +227,7 @@ def test_page_is_whole_and_harmless(page: Page, split: str) -> None:
     assert "script-src" not in policy
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@EVERY_PAGE
 def test_every_figure_of_the_thesis_has_its_counterpart(page: Page, split: str) -> None:
     """Captions name the figure of the thesis, and figures are numbered in order."""
     reading = read_html(page(split))
@@ -232,7 +244,7 @@ def test_every_figure_of_the_thesis_has_its_counterpart(page: Page, split: str) 
     assert len(reading.named("figcaption")) == count
 
 
-@pytest.mark.parametrize("split", SPLITS)
+@EVERY_PAGE
 def test_every_figure_can_be_read_aloud(page: Page, split: str) -> None:
     """Pictures have a text, drawings a title, charts a description too."""
     html = page(split)

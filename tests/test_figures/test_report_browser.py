@@ -46,8 +46,9 @@ def report(request: pytest.FixtureRequest, home: Path) -> Path:
     return page_of(home, request.param)
 
 
-@pytest.mark.parametrize("width", [1280, 390, 320])
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(
+    ("width", "dark"), [(1280, False), (1280, True), (390, False), (320, True)]
+)
 def test_page_opens_in_silence(
     running: Browser,
     report: Path,
@@ -62,10 +63,11 @@ def test_page_opens_in_silence(
     assert page.value("document.scripts.length") == 0
     with Image.open(io.BytesIO(page.screenshot())) as picture:
         grey = np.asarray(picture.convert("L"))
-        pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+        colours = picture.convert("RGB").getcolors(maxcolors=2**24)
     is_dark = float(np.median(grey)) / 255.0 < 0.3
     assert is_dark == dark
-    assert len(np.unique(pixels, axis=0)) > 50
+    assert colours is not None
+    assert len(colours) > 50
     page.press("Tab")
     assert page.focus_shows("a[href^='#part-']")
     assert page.messages == []

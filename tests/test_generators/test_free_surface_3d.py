@@ -373,9 +373,9 @@ def test_free_flight_is_a_parabola() -> None:
     ball = Ball(0.1)
     rng = np.random.default_rng(0)
     body = Body(ball, np.array((0.4, 0.6, 0.5)))
-    position = sample_points(rng, body, 300)
+    position = sample_points(rng, body, 400)
     velocity = (0.5, 0.25, -0.25)
-    state = liquid(position, alike(velocity, 300), ball.measure)
+    state = liquid(position, alike(velocity, 400), ball.measure)
     solver = start(state)
     substeps = 60
     solver.advance(substeps)

@@ -222,6 +222,7 @@ def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mark"]
 
 
+@pytest.mark.slow
 def test_unfit_workers_are_refused(tmp_path: Path, unmeasured: Registry) -> None:
     """Taichi and HDF5 want a process for themselves: exit code 5, and the command for
     such workers.

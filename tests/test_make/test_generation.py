@@ -685,6 +685,7 @@ print(peak, sorted(heavy))
 
 
 # One for each solver: curl noise has that of the cavity.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("split", "scenario"),
     [

@@ -90,6 +90,7 @@ def test_a_hostile_file_is_refused(
     assert os.listdir(tmp_path) == ["model.onnx"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", STOPPED, ids=lambda make: make.__name__)
 def test_a_greedy_model_is_stopped(
     make: Callable[[Path], Path],

@@ -220,6 +220,7 @@ def assert_every_frame_counted_once(reports: list[Progress], bench: ScoreBench) 
     assert reports[-1].done == reports[-1].total
 
 
+@pytest.mark.slow
 def test_workers_write_the_same_bytes(
     bench: ScoreBench,
     persistence_card: ScoreCard,
