@@ -436,7 +436,7 @@ def test_the_loss_of_an_operator_is_the_mean_over_layers() -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch, while it traces
-@pytest.mark.parametrize("operator", of_this_turn([GNS, SuperGAT], turns=2))
+@pytest.mark.parametrize("operator", of_this_turn([GNS, SuperGAT], turns=3))
 def test_compiled_layers_give_the_same_gradients(operator: type[Operator]) -> None:
     """They give the same values too, for any number of edges."""
     plain = network(operator)
