@@ -168,6 +168,15 @@ def list_members(
     return members, count
 
 
+def open_variable(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Return a variable of a file that is open for reading.
+
+    ``group[name]`` would ask for the mode of the file each time, which takes longer
+    than to open the variable.
+    """
+    return h5py.Dataset(h5py.h5d.open(group.id, name.encode()), readonly=True)
+
+
 def read_layout(dataset: h5py.Dataset) -> str:
     """Return how the values are stored.
 
@@ -221,7 +230,7 @@ def list_variables(file: h5py.File) -> dict[str, h5py.Dataset]:
             raise DataError(f"{name!r} is a {kind}")
         if kind != "variable":
             continue
-        variable = file[name]
+        variable = open_variable(file, name)
         layout = read_layout(variable)
         if layout not in INSIDE:
             raise DataError(f"the values of {name!r} lie elsewhere: {layout}")

@@ -28,6 +28,7 @@ from .hdf5 import (
     MAX_LINKS,
     hdf5_errors,
     list_members,
+    open_variable,
     read_dimensions,
     read_layout,
 )
@@ -346,7 +347,7 @@ def check_structure(
     arrays = {}
     with hdf5_errors(path):
         for name in _list_arrays(file, path, expected):
-            dataset = file[name]
+            dataset = open_variable(file, name)
             array = describe_array(dataset, has_dims=False)
             issue = (
                 find_storage_issue(array, length=length, cache=expected.cache)

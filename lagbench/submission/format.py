@@ -15,7 +15,7 @@ from typing import Any
 
 import h5py
 
-from lagbench.data.hdf5 import MAX_LINKS, hdf5_errors, list_members
+from lagbench.data.hdf5 import MAX_LINKS, hdf5_errors, list_members, open_variable
 from lagbench.data.structure import (
     MAX_ATTRIBUTE,
     ArrayInfo,
@@ -280,7 +280,7 @@ def inspect_file(file: h5py.File, path: Path) -> FileInfo:
         if links.get(name) != "variable":
             continue
         with hdf5_errors(path, name):
-            dataset = file[name]
+            dataset = open_variable(file, name)
             array = describe_array(dataset)
             # A scalar has no dimensions to check.
             arrays[name] = array if array.shape else replace(array, shape=None)
