@@ -386,7 +386,7 @@ def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("nodes", [1, 2])
+@pytest.mark.parametrize("nodes", of_this_turn([1, 2], turns=2))
 def test_two_processes_make_the_weights_of_one(
     lagbench: Command,
     tmp_path: Path,

@@ -123,9 +123,9 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(
         )
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as split:
         shorter = split.sel(scenario=0)
-        from_split = plot_frame(shorter, -1, tmp_path / "split.png")
+        from_split = plot_frame(shorter, -1, tmp_path / "split.png", kind="vorticity")
     file = tmp_path / "fluid/tiny/v3/train/0000.nc"
-    from_file = plot_frame(file, 3, tmp_path / "file.png")
+    from_file = plot_frame(file, 3, tmp_path / "file.png", kind="vorticity")
     assert from_split.read_bytes() == from_file.read_bytes()
 
 
@@ -166,12 +166,12 @@ def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) 
         frame_interval=0.25,
     )
     file = adopted.folder / "full/v1/test/0002.nc"
-    from_file = plot_frame(file, 3, tmp_path / "file.png")
+    from_file = plot_frame(file, 3, tmp_path / "file.png", kind="vorticity")
     expected = from_file.read_bytes()
     with open_split(str(adopted.folder)) as split, xr.open_dataset(file) as data:
         of_split = split.isel(scenario=0)
         for source in (of_split, data):
-            picture = plot_frame(source, 3, tmp_path / "data.png")
+            picture = plot_frame(source, 3, tmp_path / "data.png", kind="vorticity")
             assert picture.read_bytes() == expected
 
 
@@ -249,8 +249,8 @@ def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> Non
 
 def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
     """Twice the pixels per inch are twice the pixels a side."""
-    coarse_path = plot_frame(swirl, 0, tmp_path / "64.png", dpi=64)
-    fine_path = plot_frame(swirl, 0, tmp_path / "128.png", dpi=128)
+    coarse_path = plot_frame(swirl, 0, tmp_path / "64.png", dpi=64, kind="vorticity")
+    fine_path = plot_frame(swirl, 0, tmp_path / "128.png", dpi=128, kind="vorticity")
     height, width, _ = read_pixels(coarse_path).shape
     fine_height, fine_width, _ = read_pixels(fine_path).shape
     assert fine_height == pytest.approx(2 * height, abs=1)
@@ -366,14 +366,14 @@ def test_vector_pictures_have_the_same_bytes_twice(
 def test_another_ending_is_refused(swirl: Path, tmp_path: Path) -> None:
     """Nothing is written."""
     with pytest.raises(UsageError):
-        plot_frame(swirl, 0, tmp_path / "x.jpg")
+        plot_frame(swirl, 0, tmp_path / "x.jpg", kind="vorticity")
     assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_that_cannot_be_written_names_its_option(swirl: Path) -> None:
     """Where a file is in the way, the fix is the option that names the picture."""
     with pytest.raises(WorkFailedError) as caught:
-        plot_frame(swirl, 0, swirl / "x.png")
+        plot_frame(swirl, 0, swirl / "x.png", kind="vorticity")
     assert "--output" in str(caught.value.fix)
 
 
