@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import platform
 from collections.abc import Mapping
@@ -121,9 +122,6 @@ class TrainingJob:
         """Return the content of training.json; ``counts`` are entered too."""
         info = self.info
         budget = self.budget(log)
-        versions = {"python": platform.python_version()}
-        for name in LIBRARIES:
-            versions[name] = version(name)
         return {
             "format": LOG_FORMAT,
             "baseline": self.recipe.baseline,
@@ -136,12 +134,22 @@ class TrainingJob:
             "parameters": count_parameters(model),
             "processes": self.processes,
             "hardware": hardware(self.device),
-            "versions": versions,
+            "versions": dict(_library_versions()),
             "budget": budget.model_dump(mode="json"),
             "track": track_of(info.size, budget),
             **counts,
             **asdict(log),
         }
+
+
+# Each look reads the description of an installed library, and a training stores often.
+@functools.cache
+def _library_versions() -> Mapping[str, str]:
+    """Return the versions of Python and of the libraries that a training depends on."""
+    versions = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        versions[name] = version(name)
+    return versions
 
 
 def _sum_hours(seconds: float | None, start_hours: float | None) -> float | None:

@@ -621,7 +621,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
     ("baseline", "setting", "lower"),
     [
         ("wrong", "training.steps=2", r"lower --set training\.batch"),
-        ("gns", "model.latent=10000000", "latent"),
+        ("gns", "model.latent=100000000000", "latent"),
         ("var", "model.lags=1000000000", "lags"),
     ],
 )
@@ -634,7 +634,7 @@ def test_out_of_memory(
 ) -> None:
     """The message says which option to lower.
 
-    Memory is full at a step, or before any step by a model of 10^15 numbers.
+    Memory is full at a step, or before any step by the first matrix of a model.
     """
     monkeypatch.setattr(Wrong, "loss", lambda *_: {"motion": torch.zeros(2**50)})
     with pytest.raises(WorkFailedError, match=rf"out of memory(.|\n)*{lower}"):
