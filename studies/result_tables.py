@@ -127,7 +127,11 @@ def deciding_model(results: SplitResults) -> str | None:
 
 def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
     """Return which solvers a model beats that is cheaper than all of them."""
-    sentence = f"On {results.where} no classical solver is as cheap as the best model."
+    name_of_model = label(model)
+    sentence = (
+        f"On {results.where} no classical solver is as cheap as {name_of_model}, the"
+        " best model."
+    )
     error = results.methods[model].scores[results.ranking].mean
     behind = []
     equal = []
@@ -143,7 +147,7 @@ def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
             ahead.append(label(name))
         else:
             equal.append(label(name))
-    places = place_among_solvers(behind=behind, equal=equal, ahead=ahead)
+    places = place_among_solvers(name_of_model, behind=behind, equal=equal, ahead=ahead)
     return " ".join([sentence, *places])
 
 

@@ -236,10 +236,11 @@ class Conclusion:
 
     @property
     def measure(self) -> str:
-        """The ratio in words, as in "0.86×"; empty where there is none."""
+        """Name and ratio of the model, as in "GNS: 0.86×"; the name alone without."""
+        name = self.row.entry.name
         if self.row.against_classical is None:
-            return ""
-        return _format_ratio(self.row.against_classical)
+            return name
+        return f"{name}: {_format_ratio(self.row.against_classical)}"
 
 
 def judge(tab: Tab) -> Conclusion | None:
@@ -336,9 +337,10 @@ def conclude(tab: Tab) -> str:
     if conclusion.verdict is LearningVerdict.PAYS:
         cost = cost_of(row)
         if cost is not None and cost.speed_up is not None and cost.speed_up < 1.0:
+            times = text(1.0 / cost.speed_up, 2)
             sentences.append(
-                f"A frame costs it {text(1.0 / cost.speed_up, 2)} times as much as it "
-                "costs the simulator that made the data."
+                f"A frame of the model costs {times} times as much as a frame of the "
+                "simulator that made the data."
             )
     else:
         sentences += _name_exception(tab)
@@ -373,26 +375,36 @@ def _place_among_solvers(row: BoardRow, tab: Tab) -> list[str]:
             ahead.append(reference.name)
         else:
             equal.append(reference.name)
-    return place_among_solvers(behind=behind, equal=equal, ahead=ahead)
+    return place_among_solvers(row.entry.name, behind=behind, equal=equal, ahead=ahead)
 
 
 def place_among_solvers(
-    *, behind: Sequence[str], equal: Sequence[str], ahead: Sequence[str]
+    model: str,
+    *,
+    behind: Sequence[str],
+    equal: Sequence[str],
+    ahead: Sequence[str],
 ) -> list[str]:
     """Return sentences about the mean error of a model beside those of solvers.
 
-    >>> place_among_solvers(behind=["coarse"], equal=[], ahead=["fine"])
-    ['Its mean error is less than that of coarse.', 'The error of fine is smaller.']
+    >>> for sentence in place_among_solvers(
+    ...     "GNS", behind=["coarse"], equal=[], ahead=["fine"]
+    ... ):
+    ...     print(sentence)
+    The mean error of GNS is less than that of coarse.
+    It is greater than that of fine.
     """
-    sentences = []
+    comparisons = []
     if behind:
-        sentences.append(f"Its mean error is less than that of {join_names(behind)}.")
+        comparisons.append(f"is less than that of {join_names(behind)}")
     if equal:
-        sentences.append(f"Its mean error equals that of {join_names(equal)}.")
-    if len(ahead) == 1:
-        sentences.append(f"The error of {ahead[0]} is smaller.")
-    elif ahead:
-        sentences.append(f"The errors of {join_names(ahead)} are smaller.")
+        comparisons.append(f"equals that of {join_names(equal)}")
+    if ahead:
+        comparisons.append(f"is greater than that of {join_names(ahead)}")
+    sentences = []
+    for number, comparison in enumerate(comparisons):
+        subject = "It" if number else f"The mean error of {model}"
+        sentences.append(f"{subject} {comparison}.")
     return sentences
 
 
@@ -432,9 +444,7 @@ def summarise(overview: SizeOverview) -> list[str]:
         conclusion = judge(tab)
         if conclusion is None:
             continue
-        data_set = tab.size.split
-        if conclusion.measure:
-            data_set += f" ({conclusion.measure})"
+        data_set = f"{tab.size.split} ({conclusion.measure})"
         key = conclusion.verdict, conclusion.model
         data_sets.setdefault(key, []).append(data_set)
     for verdict, words_of_verdict in SUMMARIES.items():
@@ -443,7 +453,26 @@ def summarise(overview: SizeOverview) -> list[str]:
             if verdict_of_names is verdict:
                 sentence = words_of_verdict.format(names=join_names(names), model=model)
                 sentences.append(sentence)
+    without_skill = _find_data_sets_without_skill(overview)
+    if without_skill:
+        sentences.append(
+            f"No entry has a skill above 0 on {join_names(without_skill)}: the best "
+            "naive baseline has less error than every entry."
+        )
     return sentences
+
+
+def _find_data_sets_without_skill(overview: SizeOverview) -> list[str]:
+    """Return the splits with entries of a known skill, none of them above 0."""
+    splits = []
+    for tab in overview.tabs:
+        skills = []
+        for row in tab.rows:
+            if row.active and row.skill is not None:
+                skills.append(row.skill.mean)
+        if skills and max(skills) <= 0.0:
+            splits.append(tab.size.split)
+    return splits
 
 
 def _name_leader(overview: SizeOverview) -> str:

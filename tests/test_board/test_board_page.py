@@ -399,6 +399,17 @@ def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
     assert "the most accurate model of known cost has less error" in shown
     shown = text_of_overview(page_of(board, first_tab(board, accurate)))
     assert "the most accurate model has less error" in shown
+    assert "Learning pays on cavity (Accurate: 0.50×)" in shown
+
+
+def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> None:
+    """Rank 1 says nothing there."""
+    row = compared(board, "Model", error=1.0, ratio=DEAR)
+    for skill, is_told in ((-0.2, True), (0.2, False)):
+        value = replace(row.values[board.tabs[0].ranking], mean=skill)
+        tab = first_tab(board, replace(row, skill=value))
+        shown = text_of_overview(page_of(board, tab))
+        assert ("No entry has a skill above 0 on cavity" in shown) is is_told
 
 
 def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
@@ -434,16 +445,16 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
     assert conclude(tab) == (
         "On cavity full no classical solver is as cheap as Model, the most accurate "
-        "model. Its mean error is less than that of mid and coarse. The error of fine "
-        "is smaller."
+        "model. The mean error of Model is less than that of mid and coarse. It is "
+        "greater than that of fine."
     )
     shown = text_of_overview(page_of(board, tab))
-    assert "No classical solver is as cheap as the most accurate model on" in shown
+    assert "as cheap as the most accurate model on cavity (Model)." in shown
 
     tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
     sentences = conclude(tab)
-    assert "Its mean error equals that of twin." in sentences
-    assert "The errors of finer and fine are smaller." in sentences
+    assert "The mean error of Model equals that of twin." in sentences
+    assert "It is greater than that of finer and fine." in sentences
 
 
 def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
@@ -456,7 +467,7 @@ def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
             seconds_per_frame=1.0, device="a", solver_seconds_per_frame=speed_up
         )
         sentences = conclude(first_tab(board, with_entry(row, cost=cost)))
-        assert ("A frame costs it 2 times as much" in sentences) is is_told
+        assert ("A frame of the model costs 2 times as much" in sentences) is is_told
 
 
 def test_slow_solvers_are_marked(board: Board) -> None:
