@@ -859,16 +859,15 @@ def _make_curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
 def make_curve(score: Score) -> Curve:
     """Return mean, lowest and highest of a metric over scenarios per frame.
 
-    Some metrics have a value at every tenth frame: the other frames are left out, they
-    are no gaps.
+    Some metrics have a value at every tenth frame, and the shipped scores of reference
+    predictors at some of these: the other frames are left out, they are no gaps.
     """
     is_measured = np.isfinite(score.per_frame).any(axis=0)
-    measured = np.flatnonzero(is_measured)
-    step = int(np.diff(measured).min(initial=len(score.frames)))
-    first = 0
-    if len(measured):
-        first = int(measured[0]) % step
-    sampled = range(first, len(score.frames), step)
+    measured = np.flatnonzero(is_measured).tolist()
+    sampled = list(range(len(score.frames)))
+    is_sparse = bool(measured) and np.diff(measured).min(initial=len(sampled)) > 1
+    if is_sparse:
+        sampled = measured
     chosen = []
     for i in spaced(len(sampled), CURVE_FRAMES):
         chosen.append(sampled[i])

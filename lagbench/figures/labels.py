@@ -18,9 +18,12 @@ CAPITAL_WIDTH = 10.0
 LETTER_WIDTH = 7.2
 
 # Shift of a label from the middle of its dot, and the share of it that lies to the
-# left. Labels above and below clear the dots that stand in one row with theirs.
+# left. Labels above and below clear the dots that stand in one row with theirs, those
+# farther away the dots that stand a little higher or lower.
 ABOVE = -11.0
 BELOW = 19.0
+FAR_ABOVE = -20.0
+FAR_BELOW = 28.0
 SHIFTS = (
     (9.0, 4.0, 0.0),
     (-9.0, 4.0, 1.0),
@@ -30,6 +33,12 @@ SHIFTS = (
     (-6.0, BELOW, 0.0),
     (6.0, ABOVE, 1.0),
     (6.0, BELOW, 1.0),
+    (0.0, FAR_ABOVE, 0.5),
+    (0.0, FAR_BELOW, 0.5),
+    (-6.0, FAR_ABOVE, 0.0),
+    (-6.0, FAR_BELOW, 0.0),
+    (6.0, FAR_ABOVE, 1.0),
+    (6.0, FAR_BELOW, 1.0),
 )
 
 ANCHORS = {0.0: "", 0.5: "middle", 1.0: "end"}

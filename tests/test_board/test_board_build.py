@@ -321,6 +321,25 @@ def test_curves_of_sampled_metrics_are_lines() -> None:
     assert list(curve.mean) == list(range(29))
 
 
+def test_curves_of_metrics_kept_at_some_sampled_frames_are_lines() -> None:
+    """The shipped scores of a reference predictor have a tenth frame here and there."""
+    kept = [9, 29, 39, 59, 109]
+    per_frame = np.full((1, 148), np.nan)
+    per_frame[:, kept] = np.arange(5.0)
+    curve = make_curve(made_up(per_frame))
+    assert curve.frames == (19, 39, 49, 69, 119)
+    assert list(curve.mean) == list(range(5))
+
+
+def test_curves_of_metrics_of_every_frame_keep_their_gaps() -> None:
+    """A frame without a value is a gap."""
+    per_frame = np.ones((2, 50))
+    per_frame[:, 20:30] = np.nan
+    curve = make_curve(made_up(per_frame))
+    assert len(curve.frames) == 50
+    assert np.isnan(curve.mean).sum() == 10
+
+
 def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """A scenario that one seed has no value for takes the other's; none stays
     undefined.

@@ -246,6 +246,15 @@ def test_a_lonely_dot_has_its_label_to_the_right() -> None:
     assert second.box.right < 395.0
 
 
+def test_a_label_evades_neighbours_that_stand_a_little_lower() -> None:
+    """It moves away from them: the first of a group of dots has its name."""
+    dots = [(200.0, 150.0), (185.0, 154.0), (215.0, 152.0), (200.0, 136.0)]
+    names = ["a model with a name", "", "", ""]
+    first, *_ = place_labels(names, dots, plot=PLOT_BOX)
+    assert first is not None
+    assert first.box.bottom <= 200.0
+
+
 def test_a_dot_without_room_for_a_label_says_its_name() -> None:
     """Of many dots at one place the first is labelled; the others have a title."""
     plot = empty_plot()
