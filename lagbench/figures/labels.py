@@ -117,8 +117,15 @@ def place_labels(
 def _find_room(
     name: str, x: float, y: float, *, plot: LabelBox, occupied: Sequence[LabelBox]
 ) -> Label | None:
+    candidates = []
     for right, down, left_share in SHIFTS:
-        label = Label(name, x + right, y + down, left_share)
+        candidates.append(Label(name, x + right, y + down, left_share))
+    # a long name near the rim ends there, above or below its dot
+    for down in (ABOVE, BELOW):
+        at_rim = Label(name, plot.right, y + down, 1.0)
+        if at_rim.box.left <= x:
+            candidates.append(at_rim)
+    for label in candidates:
         box = label.box
         is_within = (
             box.left >= plot.left

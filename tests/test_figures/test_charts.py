@@ -255,6 +255,15 @@ def test_a_label_evades_neighbours_that_stand_a_little_lower() -> None:
     assert first.box.bottom <= 200.0
 
 
+def test_a_long_label_near_the_rim_ends_there() -> None:
+    """Where dots beside it leave no other room."""
+    dots = [(290.0, 148.0), (199.0, 128.0), (192.0, 156.0), (233.0, 171.0)]
+    names = ["NeuralMPM trained at m", "", "", ""]
+    first, *_ = place_labels(names, dots, plot=PLOT_BOX)
+    assert first is not None
+    assert first.box.right == PLOT_BOX.right
+
+
 def test_a_dot_without_room_for_a_label_says_its_name() -> None:
     """Of many dots at one place the first is labelled; the others have a title."""
     plot = empty_plot()
