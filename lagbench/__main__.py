@@ -42,6 +42,9 @@ PIPE_CLOSED = 141
 RESUMABLE_COMMANDS = {"demo", "generate", "download", "train", "season"}
 """Commands that go on where they stopped."""
 
+GROUPS = ("leaderboard", "season")
+"""Words before the names of their commands."""
+
 COMMANDS_WITHOUT_SIZE = {
     "lagbench score",
     "lagbench validate",
@@ -183,9 +186,9 @@ def _command_line_errors() -> Iterator[None]:
 def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copies of click)
     """Return an error of click's parser as one of ours."""
     context = getattr(error, "ctx", None)
-    command = "lagbench"
-    if context is not None and context.parent is not None:
-        command = f"lagbench {_command_words(context)}"
+    command = _guess_command()
+    if context is not None:
+        command = f"lagbench {_command_words(context)}".rstrip()
     message = str(error.format_message()).rstrip(".")
     help_hint = f"`{command} --help` lists what there is"
     kind = type(error).__name__
@@ -218,12 +221,28 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
             fix=f"add {name}; {help_hint}",
         )
     if kind == "BadParameter":
+        # The help of a group shall load no other module.
+        from .data.field_errors import describe_expectation
+
+        detail = _first_detail(error)
         return UsageError(
             f"{_parameter_name(error)} has a value that does not fit",
             where=command,
-            expected=str(error.message).rstrip("."),
-            got=_wrong_value(error),
+            expected=describe_expectation(detail) if detail else message,
+            got=_quote_word(repr(detail["input"])) if detail else None,
             fix=f"give another value; {help_hint}",
+        )
+    if kind == "BadOptionUsage":
+        name = error.option_name
+        has_value = "not take a value" in message
+        return UsageError(
+            f"{name} takes no value" if has_value else f"{name} has no value",
+            where=command,
+            expected=f"{name} alone" if has_value else f"{name} and a value",
+            got=" ".join(map(_quote_word, sys.argv[1:])) or None,
+            fix=f"leave the value out; {help_hint}"
+            if has_value
+            else f"add a value behind {name}; {help_hint}",
         )
     extra_words = _EXTRA_WORDS.search(message)
     if extra_words is not None and context is not None:
@@ -263,6 +282,18 @@ def _extra_words_error(
     )
 
 
+def _guess_command() -> str:
+    """Return the words of a command as they were typed, where click tells none."""
+    words = ["lagbench"]
+    for word in sys.argv[1:]:
+        if word.startswith("-"):
+            break
+        words.append(word)
+        if word not in GROUPS:
+            break
+    return " ".join(words)
+
+
 def _command_words(context: Any) -> str:  # noqa: ANN401 (two copies of click)
     """Return the words of a command below the program's name."""
     words: list[str] = []
@@ -282,13 +313,12 @@ def _parameter_name(error: Any) -> str:  # noqa: ANN401 (two copies of click)
     return str(error.param.metavar or error.param.name)
 
 
-def _wrong_value(error: Any) -> str | None:  # noqa: ANN401 (two copies of click)
-    """Return the value that a parameter does not take, where its parser tells it."""
+def _first_detail(error: Any) -> Any:  # noqa: ANN401 (two copies of click)
+    """Return what pydantic says of a wrong value; None where it did not check it."""
     cause = error.__cause__ or error.__context__
     if not hasattr(cause, "errors"):
         return None
-    details = cause.errors()
-    return _quote_word(repr(details[0].get("input")))
+    return cause.errors()[0]
 
 
 def _quote_word(word: str) -> str:

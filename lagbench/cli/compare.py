@@ -35,8 +35,8 @@ def compare_command(
         str,
         typer.Argument(
             metavar="B",
-            help="The same, or the name of a reference predictor or of an entry of the "
-            "leaderboard.",
+            help="A predictions.nc or its scores; or the name of a reference predictor "
+            "or of an entry of the leaderboard.",
         ),
     ],
     metric: Annotated[

@@ -303,7 +303,8 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
             where=name,
             expected="arrays of numbers",
             got=dtype,
-            fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
+            fix="save plain arrays: np.save(FILE, array.astype('float32')); "
+            "lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
     # NumPy reserves memory for what the header claims before it reads.
     available_bytes = length - stream.tell()

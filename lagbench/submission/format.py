@@ -419,7 +419,7 @@ def _check_variables(info: FileInfo, issues: IssueCollector) -> None:
         kind = info.links.get(name, "")
         if kind == "variable" or kind.endswith("link"):
             continue
-        if kind:
+        if kind or not stored_names:
             fix = USE_TEMPLATE
         else:
             fix = suggest_name(quote(name), stored_names)
