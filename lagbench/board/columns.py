@@ -142,7 +142,7 @@ def cost_of(row: TableRow) -> EntryCost | None:
         measured = row.verified.cost
         return EntryCost.model_construct(
             seconds_per_frame=measured.seconds_per_frame,
-            device=f"one core, {measured.machine}",
+            device=measured.machine,
             solver_seconds_per_frame=measured.solver,
         )
     return row.entry.cost

@@ -311,7 +311,7 @@ def _compare(row: BoardRow, ratio: Value) -> str:
     """Return a ratio with its interval and its solver, in words."""
     interval = ""
     if not math.isnan(ratio.low + ratio.high):
-        interval = f" (95 %: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
+        interval = f" (95\u00a0%: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
     return (
         f"{_format_ratio(ratio)}{interval} the error of {row.solver}, the best "
         "classical solver that costs no more per frame"

@@ -31,6 +31,10 @@ from lagbench.figures.html import (
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (
+    AGAINST_CLASSICAL,
+    SKILL,
+    SKILL_ON_SHIFT,
+    Column,
     cost_of,
     format_ranks,
     format_value,
@@ -55,7 +59,14 @@ from .overview import (
 )
 from .page_data import page_data
 from .table import draw_table, fold_button
-from .table_view import LABELS, SLOW, TableView, make_table
+from .table_view import (
+    DIVERGED,
+    LABELS,
+    SLOW,
+    UNDER_TRAINED,
+    TableView,
+    make_table,
+)
 
 SCRIPTS = (
     "data",
@@ -91,7 +102,9 @@ is the one that mkdocs makes in a clone. Links to missing files are left out.
 """
 
 TAKE_PART = """\
-# the data, bit for bit
+# once, in a clone of the repository
+pip install -c constraints.txt '.[generate,plots,baselines]'
+# the data, bit for bit; so for every split
 lagbench generate --split cavity --size mini
 # or write the file yourself
 lagbench predict weights.pt -o predictions.nc
@@ -126,6 +139,14 @@ OVERVIEW_NOTES = (
     "are drawn again (95 %). Variants of a method are folded behind it, without a "
     "rank.",
 )
+
+LEVEL_MEANINGS = {
+    Level.AS_SUBMITTED: "the maintainers did not follow the scores",
+    Level.SCORED_AGAIN: "the maintainers scored the predictions of the submitter again",
+    Level.REPRODUCED: "the maintainers ran the model and got the same scores",
+    Level.BLIND: "the model was also scored on scenarios drawn after it was frozen",
+}
+"""What the maintainers did with an entry, in words behind the name of its level."""
 
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
 
@@ -692,6 +713,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "Click a row for curves, maps, a film, every number and the command that makes "
         "it again. Ranks follow the ranking metric."
     )
+    for column in _columns_to_explain(tab):
+        yield _explain(column.label, column.meaning)
     if tab.pictured is not None:
         count = _count(tab.pictured, "method", "methods")
         yield escaped(
@@ -716,9 +739,14 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         f"{claim} Shaded rows are reference predictors, never ranked: naive baselines, "
         "which predict without learning and without equations, and classical solvers."
     )
+    levels = {level_of(row) for row in tab.rows}
+    if levels:
+        meanings = []
+        for level in sorted(levels, key=lambda level: level.rank):
+            meanings.append(f"{level}: {LEVEL_MEANINGS[level]}")
+        yield _explain("scores", f"{'; '.join(meanings)}.")
     if any(reference.is_slow for reference in tab.references):
-        label, meaning = SLOW
-        yield join([tag("strong", label), ": ", meaning])
+        yield _explain(*SLOW)
     yield escaped(
         "Mean over test scenarios and seeds; below it the 95 % interval, of both "
         "resampled together. ↓ lower, ↑ higher, ◎ closer to the perfect value is "
@@ -733,10 +761,27 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "times. Those of the shaded rows are of another run. A speed-up below 1× means "
         "slower than the simulator."
     )
+    if any(row.failed_gates for row in tab.rows):
+        yield _explain(*UNDER_TRAINED)
+    if any(row.diverged for row in tab.rows):
+        yield _explain(*DIVERGED)
     raised: set[str] = set()
     for row in tab.rows:
         for flag in (*row.flags, *row.warnings):
             raised.add(flag.name)
     for name in sorted(raised.intersection(LABELS)):
-        label, meaning = LABELS[name]
-        yield join([tag("strong", label), ": ", meaning])
+        yield _explain(*LABELS[name])
+
+
+def _columns_to_explain(tab: Tab) -> Iterator[Column]:
+    """Yield the columns of the first view whose heading alone says too little."""
+    if any(row.skill is not None for row in tab.rows):
+        yield SKILL
+    if any(row.against_classical is not None for row in tab.rows):
+        yield AGAINST_CLASSICAL
+    if any(row.on_shift is not None for row in tab.rows):
+        yield SKILL_ON_SHIFT
+
+
+def _explain(label: str, meaning: str) -> Markup:
+    return join([tag("strong", label), ": ", meaning])

@@ -72,6 +72,15 @@ SLOW = (
 )
 """Label and meaning of the mark beside a classical solver of a high cost."""
 
+UNDER_TRAINED = (
+    "under-trained",
+    "Its weights fail a gate of competence and take part in no claim.",
+)
+"""Label and meaning of the mark beside an entry whose weights fail a gate."""
+
+DIVERGED = ("diverged", "Rollouts are frozen at their last finite frame.")
+"""Label and meaning of the mark beside an entry with rollouts that ended early."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
@@ -355,21 +364,17 @@ def chips_of(row: BoardRow) -> Iterator[Chip]:
             "ranked.",
         )
     if row.failed_gates:
-        yield Chip(
-            kind="warn",
-            label="under-trained",
-            meaning="Its weights fail a gate of competence and take part in no claim: "
-            f"{', '.join(row.failed_gates)}.",
-        )
+        label, meaning = UNDER_TRAINED
+        gates = ", ".join(row.failed_gates)
+        yield Chip(kind="warn", label=label, meaning=f"{meaning} Failed: {gates}.")
     for flag in row.flags:
         yield _chip_of(flag, kind="bad", most_reasons=len(flag.reasons))
     for warning in row.warnings:
         yield _chip_of(warning, kind="warn", most_reasons=MOST_REASONS)
     if row.diverged:
+        label, meaning = DIVERGED
         yield Chip(
-            kind="warn",
-            label="diverged",
-            meaning=f"{row.diverged} rollouts are frozen at their last finite frame.",
+            kind="warn", label=label, meaning=f"{meaning} Rollouts: {row.diverged}."
         )
 
 

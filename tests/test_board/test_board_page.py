@@ -348,7 +348,7 @@ def test_a_sentence_says_whether_learning_pays(
     assert sentence.startswith(beginning)
     assert "Model, the most accurate model, has" in sentence
     assert f"{ratio:.2f}×".replace("1.50", "1.5") in sentence
-    assert ("(95 %: " in sentence) is not math.isnan(low)
+    assert ("(95\u00a0%: " in sentence) is not math.isnan(low)
     assert conclude(first_tab(board, board.tabs[0].rows[0])) == ""
 
 
@@ -421,6 +421,19 @@ def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
     sentences = conclude(first_tab(board, under_trained, accurate))
     assert "Young" not in sentences
     assert conclude(first_tab(board, under_trained)) == ""
+
+
+def test_the_notes_explain_marks_levels_and_columns(board: Board) -> None:
+    """A reader without a pointer has no titles: what the tab shows stands below it."""
+    row = compared(
+        board, "Young", error=0.5, ratio=GOOD, failed_gates=("bias",), verified=None
+    )
+    page = page_of(board, first_tab(board, row))
+    labels = [element.text for element in read_html(page).named("strong")]
+    for label in ("under-trained", "÷ classical", "scores"):
+        assert label in labels
+    assert "as submitted: the maintainers did not follow the scores." in page
+    assert "reproduced: " not in page
 
 
 def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
