@@ -37,6 +37,8 @@ _HOST_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-]):/+([^/]*)")
 _IPV6_HOST = re.compile(r"\[[0-9A-Fa-f:.]+(?:%\w+)?\](?::[0-9]*)?")
 _PORT = re.compile(r"[0-9]{1,5}")
 _LAST_PORT = 65535
+_SCHEME_WITH_PORT = re.compile(r"(?:^|[^a-z0-9+.-])(?:https?|s?ftp)$", re.IGNORECASE)
+_LONGEST_SCHEME = len("https")
 
 SPLIT_NAMED = "SPLIT or --split"
 """Where a user names a split, for messages."""
@@ -116,14 +118,17 @@ def hide_user(text: str, mark: str = "...@") -> str:
     """Return a text with a mark for the users and passwords of the addresses in it.
 
     Messages are printed, logged and sent to others. A password may hold any characters
-    but blanks, so after a user with a colon all is hidden up to the last ``@``. But a
-    number from 1 to 65535 between the colon and the first slash is a port, as every
-    reader of addresses takes it: an ``@`` behind it belongs to the path.
+    but blanks, so after a user with a colon all is hidden up to the last ``@``. But in
+    addresses of http, https, ftp and sftp, a number from 1 to 65535 between the colon
+    and the first slash is a port, as every reader of addresses takes it: an ``@``
+    behind it belongs to the path. Those of stores, such as s3, have no port.
 
     >>> hide_user("ftp://ann:se/cret@host/data does not answer")
     'ftp://...@host/data does not answer'
     >>> hide_user("http://nas:8000/data@v2 does not answer")
     'http://nas:8000/data@v2 does not answer'
+    >>> hide_user("s3://KEY:1/secret@bucket does not answer")
+    's3://...@bucket does not answer'
     """
     if "@" not in text:
         return text
@@ -143,7 +148,10 @@ def _hide_user_in_word(word: str, mark: str) -> str:
         begin = match.start(1)
         parts.append(word[end:begin])
         end = begin
-        if ":" in host and not _is_host_with_port(host):
+        scheme_begin = max(0, match.start() - _LONGEST_SCHEME - 1)
+        scheme = word[scheme_begin : match.start()]
+        may_have_port = _SCHEME_WITH_PORT.search(scheme) is not None
+        if ":" in host and not (may_have_port and _is_host_with_port(host)):
             parts.append(mark)
             end = last + 1
             break

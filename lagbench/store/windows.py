@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from itertools import accumulate
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,7 +74,7 @@ class FrameStore:
     """
 
     def __init__(
-        self, size: Size, paths: Mapping[int, Path], *, cache_bytes: int = CACHE_BYTES
+        self, size: Size, paths: Mapping[int, Path], *, cache_bytes: float = CACHE_BYTES
     ) -> None:
         self._size = size
         self._paths = dict(paths)
@@ -343,13 +344,38 @@ def check_whole(value: object, name: str) -> None:
     try:
         operator.index(value)  # type: ignore[arg-type]
     except TypeError:
+        fix = f"give a whole number, as in {name}=2"
+        if isinstance(value, str):
+            fix = f"give a number without quotes, as in {name}=2"
+        elif isinstance(value, Real) and float(value).is_integer():
+            fix = f"write {name}={int(value)}, not {name}={value}"
         raise UsageError(
             f"{name} is no whole number",
             where=name,
             expected="a whole number",
             got=repr(value)[:80],
-            fix=f"give a number without quotes, as in {name}=2",
+            fix=fix,
         ) from None
+
+
+def _check_bytes(value: object, name: str) -> None:
+    """Refuse a size of memory that is no number from 0; infinity is one.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if isinstance(value, int | float | np.integer | np.floating) and value >= 0:
+        return
+    fix = f"give bytes, as in {name}=1e9, or leave {name} out"
+    if isinstance(value, str):
+        fix = f"give a number without quotes, as in {name}=1e9"
+    raise UsageError(
+        f"{name} is no number from 0",
+        where=name,
+        expected="a number >= 0 [bytes]",
+        got=repr(value)[:80],
+        fix=fix,
+    )
 
 
 class WindowReader:
@@ -373,14 +399,14 @@ class WindowReader:
         history: int | None = None,
         future: int = 1,
         registry: Registry | None = None,
-        cache_bytes: int = CACHE_BYTES,
+        cache_bytes: float = CACHE_BYTES,
         origin: bool = False,
         verify: bool = False,
     ) -> None:
         if history is not None:
             check_whole(history, "history")
         check_whole(future, "future")
-        check_whole(cache_bytes, "cache_bytes")
+        _check_bytes(cache_bytes, "cache_bytes")
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
         if isinstance(subset, str) or not isinstance(subset, Iterable):
             subset = (subset,)
@@ -412,13 +438,13 @@ class WindowReader:
                 got=f"history {self.history}, future {future}",
                 fix=f"leave history out for the task's {tier.task.input_frames}",
             )
-        if not frame_counts or cache_bytes < 0:
+        if not frame_counts:
             raise UsageError(
                 "no windows can be read like that",
                 where=where,
-                expected="a subset at least, and cache_bytes >= 0",
-                got=f"{len(frame_counts)} scenarios, cache_bytes {cache_bytes}",
-                fix="name a subset, as in subset='train'; leave cache_bytes out",
+                expected="a subset at least",
+                got="0 scenarios",
+                fix="name a subset, as in subset='train'",
             )
         if not len(self):
             raise UsageError(
@@ -527,7 +553,7 @@ def windows(
     history: int | None = None,
     future: int = 1,
     registry: Registry | None = None,
-    cache_bytes: int = CACHE_BYTES,
+    cache_bytes: float = CACHE_BYTES,
     origin: bool = False,
     verify: bool = False,
 ) -> Windows:

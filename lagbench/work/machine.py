@@ -17,6 +17,7 @@ import importlib
 import importlib.util
 import json
 import math
+import operator
 import os
 import platform
 import signal
@@ -26,7 +27,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from importlib.metadata import version
 from typing import Any, NamedTuple, Self
 
@@ -122,15 +123,20 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
     """
     if workers is None:
         return default or available_cores()
-    if not isinstance(workers, int) or workers < 1:
-        raise UsageError(
-            "at least one worker is needed",
-            where="--workers",
-            expected="a whole number from 1",
-            got=repr(workers),
-            fix="leave it out: one per core is taken",
-        )
-    return workers
+    what = "the number of workers is no whole number"
+    with suppress(TypeError):
+        count = operator.index(workers)
+        if count >= 1 and not isinstance(workers, bool):
+            return count
+        if count < 1:
+            what = "at least one worker is needed"
+    raise UsageError(
+        what,
+        where="--workers",
+        expected="a whole number from 1",
+        got=repr(workers)[:80],
+        fix="leave it out: one per core is taken",
+    )
 
 
 def limit_process(*, memory: int, seconds: int) -> None:

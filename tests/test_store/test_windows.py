@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import pickle
 import resource
@@ -853,10 +854,13 @@ def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
         ({"history": 0}, "at least one given frame"),
         ({"history": "2"}, "expected: a whole number.*got: '2'"),
         ({"future": 1.5}, "expected: a whole number.*got: 1.5"),
-        ({"cache_bytes": None}, "expected: a whole number.*got: None"),
+        ({"history": 2.0}, "got: 2.0.*write history=2, not history=2.0"),
+        ({"cache_bytes": None}, "expected: a number >= 0.*got: None"),
+        ({"cache_bytes": "1e9"}, "got: '1e9'.*without quotes"),
+        ({"cache_bytes": math.nan}, "expected: a number >= 0.*got: nan"),
         ({"subset": 3}, "no subset 3"),
         ({"subset": []}, "0 scenarios"),
-        ({"cache_bytes": -1}, "cache_bytes -1"),
+        ({"cache_bytes": -1}, "expected: a number >= 0.*got: -1"),
         (
             {"subset": "valid"},
             "1 of 1 scenarios are not there.*missing: 3.*lagbench generate",
@@ -874,6 +878,13 @@ def test_options_without_data_are_refused(
     all_options: dict[str, Any] = location | right_options | options
     with pytest.raises(LagbenchError, match="(?s)" + words):
         WindowDataset(**all_options)
+
+
+@pytest.mark.parametrize("limit", [0, 1e9, math.inf, np.float32(2.0**20)])
+def test_a_cache_has_any_number_of_bytes(location: Location, limit: float) -> None:
+    """``1e9`` and infinity were refused, with advice for a text in quotes."""
+    data = WindowDataset("cavity", history=6, cache_bytes=limit, **location)
+    assert data[0].position.shape[1] == 7
 
 
 def write_train(root: Path) -> Path:

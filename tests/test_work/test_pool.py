@@ -9,7 +9,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pool_tasks
 import pytest
 from cluster_bench import gone
@@ -131,6 +133,18 @@ def test_fewer_than_one_worker_is_refused() -> None:
     assert worker_count(None) == available_cores() >= 1
     assert worker_count(None, default=1) == 1
     assert worker_count(3, default=1) == 3
+
+
+def test_workers_are_a_whole_number_of_any_type() -> None:
+    """A whole number of NumPy was refused, and True was one worker."""
+    count = worker_count(np.int64(2))  # type: ignore[arg-type]
+    assert type(count) is int
+    assert count == 2
+    values: list[Any] = [True, 2.0, "2"]
+    for value in values:
+        with pytest.raises(UsageError, match="no whole number") as caught:
+            worker_count(value)
+        assert caught.value.where == "--workers"
 
 
 def test_errors_of_ours_arrive_whole() -> None:
