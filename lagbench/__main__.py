@@ -8,9 +8,10 @@ import importlib
 import io
 import os
 import re
+import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar
@@ -72,6 +73,8 @@ MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 
 _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
 """What click says of words that are neither arguments nor options."""
+
+_NEGATIVE_NUMBER = re.compile(r"-[0-9.].*")
 
 MOST_LETTERS = 60  # of a word of the command line in a message
 
@@ -204,12 +207,16 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
             )
         possible = ", ".join(error.possibilities or ())
         suggestion = f"did you mean {possible}? " if possible else ""
+        fix = f"{suggestion}{help_hint}"
+        # The value of a setting may be a negative number.
+        if _NEGATIVE_NUMBER.fullmatch(error.option_name):
+            fix = _advise_on_settings(sys.argv) or fix
         return UsageError(
             "no such option",
             where=command,
             expected="an option of this command",
             got=error.option_name,
-            fix=f"{suggestion}{help_hint}",
+            fix=fix,
         )
     if kind == "MissingParameter":
         name = _parameter_name(error)
@@ -264,22 +271,49 @@ def _extra_words_error(
     """Return the error for words that are neither arguments nor options."""
     usage = " ".join([command, *context.command.collect_usage_pieces(context)])
     fix = f"leave them out, or put quotes around a text with blanks; `{command} --help`"
-    for option, setting, value in zip(
-        sys.argv, sys.argv[1:], sys.argv[2:], strict=False
-    ):
-        if option != "--set" or value.startswith("-"):
-            continue
-        if "=" not in setting:
-            fix = f"write it with =, without blanks: --set {setting}={value}"
-        elif "=" in value:
-            fix = f"write --set before each: --set {setting} --set {value}"
     return UsageError(
         "too many words",
         where=command,
         expected=usage,
         got=_quote_word(words),
-        fix=fix,
+        fix=_advise_on_settings(sys.argv) or fix,
     )
+
+
+def _advise_on_settings(words: Sequence[str]) -> str | None:
+    """Return how to write the settings of a command; None where that is no mistake.
+
+    Settings are often written with blanks around the =, without it, or without --set
+    before the second one.
+
+    >>> _advise_on_settings(["train", "--set", "training.steps", "=", "10"])
+    'write settings with = and without blanks: --set training.steps=10'
+    """
+    settings: list[str] = []
+    has_mistake = False
+    is_setting = False
+    for number, word in enumerate(words):
+        if word.startswith("-") and not _NEGATIVE_NUMBER.fullmatch(word):
+            is_setting = word == "--set"
+        elif not is_setting:
+            continue
+        elif words[number - 1] == "--set":
+            settings.append(word)
+        elif settings[-1].endswith("=") or word.startswith("="):
+            settings[-1] += word
+            has_mistake = True
+        elif "=" not in settings[-1]:
+            settings[-1] += f"={word}"
+            has_mistake = True
+        elif "=" in word:
+            settings.append(word)
+            has_mistake = True
+        else:
+            is_setting = False
+    if not has_mistake:
+        return None
+    options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
+    return f"write settings with = and without blanks: {options}"
 
 
 def _guess_command() -> str:
@@ -424,7 +458,7 @@ def _output_errors() -> Iterator[None]:
 def _short_warnings() -> Iterator[None]:
     """Print warnings for users in one line; those for developers keep their place.
 
-    A warning that is raised again is printed once.
+    A package that cannot be loaded is printed once, however often it is asked for.
     """
     with warnings.catch_warnings():
         show_in_full = warnings.showwarning
@@ -438,9 +472,10 @@ def _short_warnings() -> Iterator[None]:
         ) -> None:
             if category.__module__.startswith("lagbench."):
                 text = escape_unprintable(str(message))
-                if text not in printed_texts:
-                    typer.echo(f"warning: {text}", err=True)
+                if category.__name__ == "PluginWarning" and text in printed_texts:
+                    return
                 printed_texts.add(text)
+                typer.echo(f"warning: {text}", err=True)
             else:
                 show_in_full(message, category, *place, **more)
 

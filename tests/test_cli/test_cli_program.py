@@ -58,6 +58,25 @@ def test_a_broken_package_is_warned_of_once(
     assert f"({module_file}, line 1)" in result.stderr
 
 
+@pytest.mark.filterwarnings("always")
+def test_other_warnings_are_printed_as_often_as_they_come(
+    package: Callable[..., Path], bench: ScoreBench, run: Run, tmp_path: Path
+) -> None:
+    """Two trainings in a command may have the same text; one of them was silent."""
+    lines = (
+        "import warnings",
+        "Own = type('Own', (UserWarning,), {'__module__': 'lagbench.own'})",
+        "for _ in range(2):",
+        "    warnings.warn('the same text', Own)",
+        "METRICS = ()",
+    )
+    package("metrics", "warning_metric:METRICS", "\n".join(lines))
+    predictions = bench.submit(tmp_path / "still.nc", still)
+    result = run("score", predictions, "--root", bench.root)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count("the same text") == 2
+
+
 def test_an_unknown_command_exits_2(run: Run) -> None:
     result = run("genrate")
     assert result.exit_code == 2
