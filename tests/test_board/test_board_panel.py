@@ -135,6 +135,12 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
     assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(
         tab.scenarios
     )
+    shapes = page.value(
+        "[...document.querySelectorAll('#panel [data-figure=scenarios] .key .spot')]"
+        ".map(s => s.getAttribute('d') ?? `circle ${s.getAttribute('r')}`)"
+    )
+    assert len(shapes) == 1 + len(tab.references)
+    assert len(set(shapes)) == len(shapes)
     assert page.value(count.format("energy", ".chart .line")) == 4
     fields = page.value(
         "[...document.querySelectorAll('#panel canvas')].map(c =>"

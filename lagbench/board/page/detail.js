@@ -71,16 +71,19 @@ function drawScenarios(tab, row) {
   const holder = el("div");
   const show = (by) => holder.replaceChildren(key(rows.map(([kind, one]) => [kind, short(one.name)]), spot), scenarioChart(tab, by, rows));
   if (options.length) show(options[0][0]);
-  return figure("Every test scenario", holder, "Means over the horizon. Hollow: reference predictors.", {
+  return figure("Every test scenario", holder, "Means over the horizon. Grey: reference predictors.", {
     tools: options.length > 1 ? chooser("of", options, options[0][0], show) : null,
     name: "scenarios",
   });
 }
 
+const MOST_LABELS = 16; // scenarios with a label below the chart
+
 function scenarioChart(tab, by, rows) {
   const held = rows.map(([kind, row]) => [kind, short(row.name), row.spread[by] ? [...numbersOf(row.spread[by])] : []]);
   const count = tab.scenarios.length;
-  const places = { low: -0.5, high: count - 0.5, share: (value) => (value + 0.5) / count, factor: "", ticks: tab.scenarios.map((id, i) => ({ value: i, label: String(id) })) };
+  const every = Math.ceil(count / MOST_LABELS);
+  const places = { low: -0.5, high: count - 0.5, share: (value) => (value + 0.5) / count, factor: "", ticks: tab.scenarios.map((id, i) => ({ value: i, label: i % every ? "" : String(id) })) };
   const plot = new Plot(places, spanning(held.flatMap(([, , values]) => values)), { xLabel: "scenario", yLabel: columnOf(tab, by).quantity });
   [...held].reverse().forEach(([kind, name, values]) => values.forEach((value, i) => {
     if (!Number.isFinite(value)) return;
@@ -91,9 +94,22 @@ function scenarioChart(tab, by, rows) {
   return plot.draw(`${columnOf(tab, by).label} of every test scenario`, held.map(([, name, values]) => `${name}: ${values.map((v) => written(v)).join(", ")}`).join(". "));
 }
 
-/** Return a mark: a dot for an entry, hollow ones of two shapes for reference predictors. */
+/** Shapes of marks of reference predictors around their middle, after the circle. */
+const SHAPES = [
+  "m-4 0l4 -4l4 4l-4 4Z",
+  "m0 -4.5l4.2 7.5h-8.4Z",
+  "m-3.4 -3.4h6.8v6.8h-6.8Z",
+  "m0 4.5l4.2 -7.5h-8.4Z",
+  "m-4 0h8m-4 -4v8",
+  "m-3 -3l6 6m0 -6l-6 6",
+  "m-4 0h8",
+  "m-4 0h8m-4 -4v8m-2.8 -6.8l5.6 5.6m0 -5.6l-5.6 5.6",
+];
+
+/** Return a mark: a dot for an entry, a hollow shape of its own for a reference predictor. */
 function spot(kind, x = 11, y = 5) {
-  if (/^reference.*[13579]$/.test(kind)) return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
+  const number = /^reference.*?(\d)$/.exec(kind)?.[1] ?? 0;
+  if (number > 0) return svg("path", { d: `M${x.toFixed(1)} ${y.toFixed(1)}${SHAPES[number - 1]}`, class: `spot ${kind}` });
   return svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: kind === "s0" ? 5 : 3.8, class: `spot ${kind}` });
 }
 
