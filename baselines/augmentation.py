@@ -361,13 +361,20 @@ def _multiply(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def add_walk_noise(
-    position: Tensor, history: int, std: float, generator: torch.Generator
+    position: Tensor, history: int, std: float | Tensor, generator: torch.Generator
 ) -> Tensor:
     """Return the positions of windows with noise on their history.
 
     The noise of velocities is a walk of ``history - 1`` steps of
     ``std / sqrt(history - 1)`` each. That of positions [length] is its sum, 0 in the
     first frame. The frames after the history move along.
+
+    Args:
+        position: positions [length], shape [particle, frame, axis].
+        history: frames that a model sees.
+        std: deviation of the noise on the last velocity [length/frame], a number or
+            one for each particle, shape [particle, 1, 1].
+        generator: source of the noise.
     """
     particles, frame_count, dimension = position.shape
     velocity_count = history - 1
@@ -410,8 +417,28 @@ def velocity_towards_path(
     return velocity * limit / divisor
 
 
-def augment(model: Baseline, batch: Batch, generator: torch.Generator) -> Batch:
-    """Return the batch as a random mirror image, with noise, as the options say."""
+def draw_noise_levels(most: float, batch: Batch, generator: torch.Generator) -> Tensor:
+    """Draw a deviation for each window, uniformly up to the largest one.
+
+    The result holds that of each particle's window, shape [particle, 1, 1].
+    """
+    level = torch.rand(batch.windows, generator=generator, device=generator.device)
+    sample = batch.sample.to(level.device)
+    return most * level[sample][:, None, None]
+
+
+def augment(
+    model: Baseline,
+    batch: Batch,
+    generator: torch.Generator,
+    *,
+    noise_spread: bool = False,
+) -> Batch:
+    """Return the batch as a random mirror image, with noise, as the options say.
+
+    With ``noise_spread`` each window has noise of a deviation of its own, from none to
+    the option ``noise_std``.
+    """
     symmetry = model.options.symmetry
     noise_std = model.options.noise_std
     if symmetry is not Symmetry.NONE:
@@ -421,6 +448,9 @@ def augment(model: Baseline, batch: Batch, generator: torch.Generator) -> Batch:
         )
         batch = mirror_batch(batch, matrix, model.info.bounds)
     if noise_std > 0.0:
-        position = add_walk_noise(batch.position, model.history, noise_std, generator)
+        deviation: float | Tensor = noise_std
+        if noise_spread:
+            deviation = draw_noise_levels(noise_std, batch, generator)
+        position = add_walk_noise(batch.position, model.history, deviation, generator)
         batch = replace(batch, position=position)
     return batch

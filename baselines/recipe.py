@@ -213,6 +213,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "shift": False,
         "body_force": False,
         "obstacle": False,
+        "noise_spread": False,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

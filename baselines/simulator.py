@@ -252,6 +252,7 @@ class GraphNetworkOptions(Options):
         {
             "forgetful",
             "noise_std",
+            "noise_spread",
             "loss",
             "loss_norm",
             "link_weight",
@@ -276,6 +277,9 @@ class GraphNetworkOptions(Options):
     # deviation of the noise on the last given velocity, per component [length/frame];
     # some times that of an acceleration is good: with less, rollouts drift away
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
+    # whether each window draws the deviation of its noise, from none to noise_std: the
+    # model then learns from true states and from far ones
+    noise_spread: bool = False
     loss: LossWeights = LossWeights()  # weights of the six terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
     # weight of an operator's link prediction; the operator's own when None
@@ -443,7 +447,9 @@ class GraphNetwork(Baseline):
         They are means over the steps.
         """
         if generator is not None:
-            batch = augment(self, batch, generator)
+            batch = augment(
+                self, batch, generator, noise_spread=self.options.noise_spread
+            )
             if self.options.noise_std > 0.0:
                 position = self._keep_inside(batch.position)
                 batch = replace(batch, position=position)

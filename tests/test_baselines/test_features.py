@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from simple_models import RADIUS, batch, info, jittered, swirl
 from torch.testing import assert_close
 
@@ -12,6 +13,7 @@ from lagbench.baselines.augmentation import (
     Symmetry,
     add_walk_noise,
     draw_mirror_matrices,
+    draw_noise_levels,
     mirror_batch,
 )
 from lagbench.baselines.baseline import Batch
@@ -288,6 +290,30 @@ def test_the_target_makes_up_for_the_noise() -> None:
     true_acceleration = true_velocity.diff(dim=1)[:, 4]
     expected = true_acceleration - velocity_noise[:, 4]
     assert_close(acceleration, expected, atol=1e-15, rtol=0)
+
+
+def test_each_window_draws_the_deviation_of_its_noise() -> None:
+    """Levels are uniform up to the largest, the same for all particles of a window."""
+    windows = two_swirls()
+    source = generator(2)
+    drawn = []
+    for _ in range(1000):
+        level = draw_noise_levels(0.5, windows, source)
+        assert level.shape == (len(windows.position), 1, 1)
+        for window in range(windows.windows):
+            of_window = level[windows.sample == window]
+            assert len(of_window.unique()) == 1
+            drawn.append(float(of_window[0]))
+    assert stats.kstest(np.array(drawn) / 0.5, "uniform").pvalue > 1e-3
+
+
+def test_levels_scale_the_noise_of_their_window() -> None:
+    """The same draws, times the level of the particle."""
+    truth = torch.zeros(3, 8, 2)
+    level = torch.tensor([0.0, 0.5, 1.0])[:, None, None]
+    scaled = add_walk_noise(truth, 6, level, generator(3))
+    whole = add_walk_noise(truth, 6, 1.0, generator(3))
+    assert_close(scaled, level * whole)
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,7 @@ OTHER = {
         "pushforward": 2,
         "recovery": 4.0,
         "noise_std": 0.5,
+        "noise_spread": True,
         "forgetful": 0.7,
         "loss_norm": "l1",
     },
