@@ -329,6 +329,14 @@ class GraphNetwork(Baseline):
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         check_moving_walls(options.wall_velocity, info)
+        if options.noise_spread and options.noise_std == 0.0:
+            raise UsageError(
+                "there is no noise to spread",
+                where="model.noise_spread",
+                expected="model.noise_std above 0, the largest deviation",
+                got=f"model.noise_std={options.noise_std}",
+                fix="--set model.noise_std=1e-3, or leave model.noise_spread out",
+            )
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
                 f"{self.method} predicts no links",
@@ -491,9 +499,11 @@ class GraphNetwork(Baseline):
         # Operators have losses of their own in training only; nobody needs them here.
         was_training = self.training
         self.eval()
-        for _ in range(frame_count):
-            state, _ = self.step(state)
-        self.train(was_training)
+        try:
+            for _ in range(frame_count):
+                state, _ = self.step(state)
+        finally:
+            self.train(was_training)
         return state, frame_count
 
     def _step_terms(

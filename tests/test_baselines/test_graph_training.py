@@ -40,6 +40,7 @@ from lagbench.baselines.simulator import (
 from lagbench.data import grid as scoring
 from lagbench.data.grid import Grid
 from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.torch import WindowDataset, collate
 
@@ -343,6 +344,33 @@ def test_an_oracle_has_no_loss_after_own_steps() -> None:
         terms = model(batch(frames), seeded(seed))
         for name in TERMS:
             assert float(terms[name]) < 2e-5
+
+
+def test_noise_may_spread_over_its_levels() -> None:
+    """An untrained network leaves fluid at rest: the noise of its velocity is lost.
+
+    So the error is the square of the noise: with levels from none to the largest, a
+    third of it on average.
+    """
+    at_rest = np.repeat(swirl(0, 1), 8, axis=0)
+    windows = batch(*[at_rest] * 8)
+    means = {}
+    for spread in (False, True):
+        options = {"layers": 1, "latent": 4, "noise_spread": spread}
+        model = network(noise_std=1e-3, clamp=False, **options)
+        errors = []
+        for seed in range(25):
+            terms = model(windows, seeded(seed))
+            errors.append(float(terms["acceleration"].detach()))
+        means[spread] = np.mean(errors)
+    assert means[True] / means[False] == pytest.approx(1 / 3, rel=0.3)
+
+
+def test_no_noise_cannot_spread() -> None:
+    """The option says how noise is drawn, and there is none."""
+    with pytest.raises(UsageError) as caught:
+        network(noise_std=0.0, noise_spread=True)
+    assert caught.value.where == "model.noise_spread"
 
 
 def test_steps_without_gradients_predict_no_links(
