@@ -25,7 +25,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from lagbench.data.field_errors import describe_expectation
 from lagbench.data.yamlfile import read_yaml
@@ -144,14 +151,15 @@ class TrainingOptions(Settings):
             raise ValueError("give steps or epochs, not both")
         return data
 
-    @model_validator(mode="after")
-    def _check_subsets(self) -> TrainingOptions:
-        if {"test", "valid"} & set(self.windows) or not self.windows:
+    @field_validator("windows")
+    @classmethod
+    def _check_subsets(cls, windows: tuple[str, ...]) -> tuple[str, ...]:
+        if {"test", "valid"} & set(windows) or not windows:
             raise ValueError(
-                f"windows={self.windows}: a model is trained on train (and extra), "
-                f"never on test, and not on valid, by which its weights are chosen"
+                "[train] or [train, extra]: never test, and not valid, by which the "
+                "weights are chosen"
             )
-        return self
+        return windows
 
     def total_steps(self, windows: int, *, processes: int = 1) -> int:
         """Return the optimiser steps of the training."""
@@ -537,6 +545,8 @@ def _parse_setting(text: str) -> Layer:
     groups = ("model", "training")
     if not equals or not path or group not in groups:
         hint = "name group, key and value, as in --set training.steps=100"
+        if path and group in groups:
+            hint = f"name its value: --set {text}=VALUE"
         if equals and path:
             hint = suggest_name(group, groups)
         elif equals:
@@ -550,7 +560,8 @@ def _parse_setting(text: str) -> Layer:
         )
     try:
         layer: Any = yaml.safe_load(value_text)
-    except yaml.YAMLError as error:
+    # PyYAML raises other types too, as for numbers of thousands of digits.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise UsageError(
             "the value is no YAML",
             where=f"--set {key}",

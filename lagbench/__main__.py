@@ -29,6 +29,7 @@ from .cli.commands import (
 )
 from .errors import (
     LagbenchError,
+    UnreadableFileError,
     UsageError,
     WorkFailedError,
     escape_unprintable,
@@ -70,6 +71,9 @@ VANISHED_ERRORS = {
 
 MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 """What a library says that finds no memory while it is loaded."""
+
+_UNREADABLE_PATH = re.compile(r"'(.+)' is not readable")
+"""What click says of a file without permission."""
 
 _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
 """What click says of words that are neither arguments nor options."""
@@ -175,6 +179,7 @@ def _command_line_errors() -> Iterator[None]:
 
     Raises:
         UsageError: an option or a command is unknown, missing, or has a wrong value.
+        UnreadableFileError: a file may not be read.
     """
     try:
         yield
@@ -186,7 +191,7 @@ def _command_line_errors() -> Iterator[None]:
         raise _translate_click_error(error) from None
 
 
-def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copies of click)
+def _translate_click_error(error: Any) -> LagbenchError:  # noqa: ANN401 (two copies of click)
     """Return an error of click's parser as one of ours."""
     context = getattr(error, "ctx", None)
     command = _guess_command()
@@ -231,11 +236,20 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
         # The help of a group shall load no other module.
         from .data.field_errors import describe_expectation
 
+        unreadable_path = _UNREADABLE_PATH.search(message)
+        if unreadable_path is not None:
+            return UnreadableFileError(
+                "cannot open the file",
+                where=unreadable_path[1],
+                expected="a file that you may read",
+                got="no permission to read it",
+                fix="see who owns it, or name another",
+            )
         detail = _first_detail(error)
         return UsageError(
             f"{_parameter_name(error)} has a value that does not fit",
             where=command,
-            expected=describe_expectation(detail) if detail else message,
+            expected=describe_expectation(detail) if detail else str(error.message),
             got=_quote_word(repr(detail["input"])) if detail else None,
             fix=f"give another value; {help_hint}",
         )

@@ -306,7 +306,11 @@ def check_regular(
         else:
             kind = "a device, socket or pipe"
         raise UnreadableFileError(
-            "not a file", where=str(path), expected="a file", got=kind, fix=fix
+            "not a file",
+            where=str(path),
+            expected="a file",
+            got=kind,
+            fix=fix or "name a file",
         )
     if longest is not None and status.st_size > longest:
         raise UnreadableFileError(
@@ -314,7 +318,7 @@ def check_regular(
             where=str(path),
             expected=f"at most {longest} bytes",
             got=f"{status.st_size} bytes",
-            fix=fix,
+            fix=fix or "name a file that lagbench wrote",
         )
     return status.st_size
 

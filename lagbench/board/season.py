@@ -216,7 +216,9 @@ def read_season(folder: Folder, name: str) -> Season:
             where=str(folder.path),
             expected=", ".join(known) or "a season that is closed",
             got=ascii(name),
-            fix=suggest_name(name, known) or f"lagbench season close {name}",
+            fix=suggest_name(name, known)
+            if known
+            else "begin one: lagbench season close NAME --size mini",
         )
     season, issues = examine(Season, load_plain(file, longest=MOST_SEASON_BYTES))
     if season is None:

@@ -195,7 +195,8 @@ def _blame_named_files(*names: str | Path) -> Iterator[None]:
             expected=error.expected
             or "a scenario file, as lagbench generate writes it",
             got=error.got,
-            fix="name another file, or a split: lagbench plot cavity --size tiny",
+            fix="name another file, or a split: lagbench plot cavity --size tiny; "
+            "predictions are drawn by lagbench score FILE --report FOLDER",
         ) from error
 
 

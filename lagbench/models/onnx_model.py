@@ -128,7 +128,8 @@ class OnnxModel:
                 where=str(self.path),
                 expected="an ONNX model as docs/submitting.md describes it",
                 got=answer["failed"],
-                fix="export it again and run it with onnxruntime first",
+                fix=f"export it for {self.size.split} {self.size.name}, by the options "
+                "split and size of export_onnx, or run it with onnxruntime first",
             )
         return answer
 

@@ -217,6 +217,11 @@ HINTS = {
     f"{TRAIN} gns --set training.steps=1 more": "leave them out",
     f"{TRAIN} gns --set training.steps=many": "expected: a whole number",
     "score good.nc nan.nc": "lagbench compare",
+    f"{TRAIN} gns --set model.latent": "--set model.latent=VALUE",
+    f"{TRAIN} gns --set training.steps={'9' * 5000}": "the value is no YAML",
+    f"{TRAIN} gns --set training.windows=[test]": "where: gns.yaml",
+    "predict near -o x.nc": "fix: name a file",
+    "plot good.nc -o x.png": "--report",
     "score good.nc --workers 0": "expected: a number not less than 1",
     "generate cavity --workers two": "expected: a whole number",
     f"{ADOPT} runs.npy --radius big": "expected: a number",
@@ -247,7 +252,7 @@ def test_a_mistake_is_told_with_what_mends_it(
     words = shlex.split(command)
     monkeypatch.setattr("sys.argv", ["lagbench", *words])
     result = run(*words)
-    assert result.exit_code in {1, 2, 4}
+    assert result.exit_code in {1, 2, 3, 4}
     assert has_all_parts(result.output), result.output
     assert HINTS[command] in result.output
     assert "Input should" not in result.output
@@ -287,6 +292,26 @@ def test_a_size_that_the_file_states_is_not_asked_for(
     assert has_all_parts(result.stderr), result.stderr
     assert "leave --size out" in result.stderr
     assert "did you mean" not in result.stderr
+
+
+@pytest.mark.parametrize("command", ["score", "validate", "adopt"])
+def test_a_file_without_permission_is_unreadable(
+    command: str,
+    run: Callable[..., Result],
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The exit code is that of other files that cannot be read."""
+    monkeypatch.chdir(files)
+    may_access = os.access
+
+    def refuse(path: str | Path, mode: int, **options: bool) -> bool:
+        return Path(path).name != "nan.nc" and may_access(path, mode, **options)
+
+    monkeypatch.setattr("os.access", refuse)
+    result = run(command, "nan.nc")
+    assert result.exit_code == 3
+    assert has_all_parts(result.output), result.output
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")
