@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from itertools import accumulate
-from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -347,8 +346,8 @@ def check_whole(value: object, name: str) -> None:
         fix = f"give a whole number, as in {name}=2"
         if isinstance(value, str):
             fix = f"give a number without quotes, as in {name}=2"
-        elif isinstance(value, Real) and float(value).is_integer():
-            fix = f"write {name}={int(value)}, not {name}={value}"
+        elif isinstance(value, float | np.floating) and float(value).is_integer():
+            fix = f"write {name}={int(float(value))}, not {name}={value}"
         raise UsageError(
             f"{name} is no whole number",
             where=name,
