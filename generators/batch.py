@@ -8,6 +8,7 @@ one scenario.
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,9 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.errors import LagbenchError, UsageError, WorkFailedError
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    find_place_in_extension,
+)
 
-from .constants import blamed_on_parameters, solver_constants, split_module
+from .constants import blamed_on_parameters, place_of, solver_constants, split_module
 from .draws import generator
 from .solver import Health, Solver, build
 from .split import Device, FreeSurfaceParameters, InitialState, SolverParameters
@@ -37,6 +43,9 @@ STRIDE = 4_000_000
 # particles of the initial states that a process keeps, 65 bytes each: a perturbed run
 # starts from the state of a scenario that was simulated some tasks before
 KEPT_PARTICLES = 1 << 17
+
+# of a whole number in an attribute of a file, its sign left out
+MOST_BITS = 63
 
 Report = Callable[[int], None]
 """Called with the substeps done since the last call, summed over scenarios."""
@@ -103,7 +112,17 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
         try:
             state: object = module.initial_state(size, scenario, rng)
         except WorkFailedError as error:
-            raise _relocate(error, place) from error
+            line = find_place_in_extension(error, size.generator)
+            if line is None:
+                raise _relocate(error, place) from error
+            raise WorkFailedError(
+                error.what,
+                where=f"{place}, {line}",
+                expected=error.expected,
+                got=error.got,
+                fix="mend this line of the module, or the parameters that it uses: "
+                f"{place_of(size)}",
+            ) from error
 
     where = f"{size.generator}.initial_state"
     if not isinstance(state, InitialState):
@@ -135,12 +154,12 @@ def _check_values(state: InitialState, where: str) -> None:
     """
     for name in ("area", "viscosity", "friction"):
         value = getattr(state, name)
-        if not isinstance(value, Real) or not np.isfinite(float(value)):
+        if not _is_finite_number(value):
             raise UsageError(
                 f"the {name} of an initial state is no number",
                 where=where,
                 expected="a finite number",
-                got=repr(value)[:80],
+                got=_describe_value(value),
                 fix=f"give InitialState a number as {name}: docs/extending.md",
             )
 
@@ -155,16 +174,36 @@ def _check_values(state: InitialState, where: str) -> None:
             fix=fix,
         )
     for name, value in parameters.items():
-        is_number = isinstance(value, Real) and np.isfinite(float(value))
         is_text = isinstance(value, str) and value != ""
-        if not isinstance(name, str) or not (is_number or is_text):
+        is_storable = is_text or _is_finite_number(value)
+        if isinstance(value, int) and value.bit_length() > MOST_BITS:
+            is_storable = False
+        if not isinstance(name, str) or not is_storable:
             raise UsageError(
                 "a parameter of an initial state cannot be stored",
                 where=f"{where}, parameter {name!r}",
-                expected="a finite number, or a text that is not empty",
-                got=repr(value)[:80],
+                expected="a finite number (a whole one of 63 bits at most), or a text "
+                "that is not empty",
+                got=_describe_value(value),
                 fix=fix,
             )
+
+
+def _is_finite_number(value: object) -> bool:
+    """Return whether a value is a number that a float can hold; True is none."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def _describe_value(value: object) -> str:
+    """Return a value for a message; Python prints no thousands of digits."""
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        return f"a whole number of {value.bit_length()} bits"
+    return repr(value)[:80]
 
 
 def _relocate(error: LagbenchError, where: str) -> LagbenchError:

@@ -118,7 +118,7 @@ def check_constants(
             raise _missing_parameter(field.name, kind, size)
 
 
-def _place_of(size: Size) -> str:
+def place_of(size: Size) -> str:
     """Return where a size is described, for messages."""
     return f"{size.file}, splits.{size.split}, size {size.name}"
 
@@ -135,7 +135,7 @@ def _missing_parameter(
         fix = f"did you mean {similar_names[0]!r}?"
     return UnreadableFileError(
         "a parameter is missing",
-        where=f"{_place_of(size)}, parameter {name}",
+        where=f"{place_of(size)}, parameter {name}",
         expected=name,
         got=", ".join(similar_names) or "no name like it",
         fix=fix,
@@ -163,7 +163,7 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
     if not is_possible:
         raise UnreadableFileError(
             "a parameter has no possible value",
-            where=f"{_place_of(size)}, parameter {field.name}",
+            where=f"{place_of(size)}, parameter {field.name}",
             expected=expected,
             got=repr(value),
             fix="correct it in the file of the split",
@@ -185,7 +185,7 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        places = [_place_of(size), find_place_in_extension(error, size.generator)]
+        places = [place_of(size), find_place_in_extension(error, size.generator)]
         raise UnreadableFileError(
             error.what,
             where=", ".join(place for place in places if place),
@@ -204,13 +204,13 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
                 expected="no exception",
                 got=f"{type(error).__name__}: {error}",
                 fix="mend this line of the module, or the parameters that it uses: "
-                f"{_place_of(size)}",
+                f"{place_of(size)}",
             ) from error
         if not isinstance(error, PARAMETER_ERRORS):
             raise
         raise UnreadableFileError(
             f"{work} failed with these parameters",
-            where=_place_of(size),
+            where=place_of(size),
             expected=f"parameters that {size.generator} can use",
             got=f"{type(error).__name__}: {error}{_list_texts(size)}",
             fix="compare the parameters with those in the datasets.yaml of lagbench",

@@ -69,6 +69,21 @@ def test_an_exception_of_initial_state_is_told_with_file_and_line(
     assert "Traceback" not in str(caught.value)
 
 
+@pytest.mark.parametrize("bound", ["float('nan')", "1e9"])
+def test_a_drawn_value_without_exact_form_is_told_with_file_and_line(
+    bound: str, package: Install
+) -> None:
+    """The message said "check the ranges in datasets.yaml", which is ours."""
+    change = f"uniform(rng, 0.2, {bound})"
+    size, module_file = own_size(package, WIDTH, change)
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(size, 3)
+    where = str(caught.value.where)
+    assert line_of(module_file, change) in where
+    assert "scenario 3" in where
+    assert str(size.file) in str(caught.value.fix)
+
+
 def test_a_parameter_that_is_not_there_is_told_with_both_places(
     package: Install,
 ) -> None:
@@ -109,6 +124,13 @@ def test_a_module_that_fails_at_import_is_told_with_file_and_line(
         (HEIGHT, '"height": None'),
         (HEIGHT, '"height": np.ones(3)'),
         (HEIGHT, '"height": ""'),
+        (HEIGHT, '"height": True'),
+        (HEIGHT, '"height": np.True_'),
+        (HEIGHT, '"height": 2**63'),
+        (HEIGHT, '"height": 10**400'),
+        (HEIGHT, '"height": 10**5000'),
+        ("area=width * height", "area=10**400"),
+        ("area=width * height", "area=True"),
         (HEIGHT, "3: height"),
         ('parameters={"width": width, "height": height}', "parameters=[1.0]"),
     ],
