@@ -28,7 +28,6 @@ from lagbench.errors import (
 from lagbench.submission.issues import quote
 
 from .entry import Entry, Meta, Status
-from .fields import PATTERNS
 from .folder import Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
@@ -249,10 +248,7 @@ def _issue_from(kind: type[BaseModel], item: ErrorDetails) -> SchemaIssue:
     if item["type"] == "missing":
         return SchemaIssue(where=where, what="this key is missing", got="no such key")
 
-    pattern = item.get("ctx", {}).get("pattern", "")
-    if pattern in PATTERNS:
-        what = f"is not {PATTERNS[pattern]}"
-    elif is_own_sentence(item):
+    if is_own_sentence(item):
         what = describe_expectation(item)
     else:
         what = f"is not {describe_expectation(item)}"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import unicodedata
-from collections.abc import Mapping
 from typing import Annotated
 from urllib.parse import urlsplit
 
@@ -21,15 +20,6 @@ WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"
 SHA256 = r"^[0-9a-f]{64}$"
 RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
 LABEL = r"^[a-z0-9_]+$"
-
-PATTERNS: Mapping[str, str] = {
-    ID: "small letters, digits and single hyphens, as in my-model",
-    WEB: "an http:// or https:// address, without spaces and quotes",
-    SHA256: "64 hexadecimal digits",
-    RELEASE: "a version, as in 1.0.0",
-    LABEL: "small letters, digits and underscores",
-}
-"""Patterns in words: people do not read regular expressions."""
 
 LONGEST_ID = 60
 LONGEST_TEXT = 1000

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from lagbench.errors import format_count
+
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
@@ -29,17 +31,16 @@ EXPECTATIONS = {
     "string_type": "a text",
     "string_sub_type": "a text",
     "string_unicode": "a text in UTF-8",
-    "string_too_short": "a text of at least {min_length} characters",
-    "string_too_long": "a text of at most {max_length} characters",
-    "string_pattern_mismatch": "a text of the form {pattern}",
+    "string_too_short": "a text of at least {min_characters}",
+    "string_too_long": "a text of at most {max_characters}",
     "bytes_type": "bytes",
     "list_type": "a list in brackets",
     "tuple_type": "a list in brackets",
     "set_type": "a list in brackets",
     "frozen_set_type": "a list in brackets",
     "iterable_type": "a list in brackets",
-    "too_short": "at least {min_length} values",
-    "too_long": "at most {max_length} values",
+    "too_short": "at least {min_values}",
+    "too_long": "at most {max_values}",
     "dict_type": "keys with values",
     "mapping_type": "keys with values",
     "model_type": "keys with values",
@@ -67,8 +68,42 @@ EXPECTATIONS = {
 }
 """What was expected, by the type of pydantic's error.
 
-Words in braces come from its context.
+Words in braces come from its context; counts have their nouns.
 """
+
+OTHER = "a value of another type or form"
+"""What was expected, where the table has no words for it."""
+
+PATTERN_WORDS = {
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits",
+    r"^[0-9a-f]{16}$": "16 hexadecimal digits",
+    r"^[1-9]\d*\.\d+\.\d+$": "a version, as in 1.0.0",
+    r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$": "a version, as in 1.0.0",
+    r"^https?://[^\s/]\S*$": "an http:// or https:// address, without spaces",
+    r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$": (
+        "an http:// or https:// address, without spaces and quotes"
+    ),
+    r"^[a-z0-9]+(-[a-z0-9]+)*$": (
+        "small letters, digits and single hyphens, as in my-model"
+    ),
+    r"^[a-z0-9_]+$": "small letters, digits and underscores",
+    r"^[a-z0-9_]{1,60}$": "1 to 60 small letters, digits and underscores",
+    r"^[a-z][a-z0-9_-]*$": (
+        "small letters, digits, underscores and hyphens; a letter first"
+    ),
+    r"^[a-z][a-z0-9_-]{0,63}$": (
+        "1 to 64 small letters, digits, underscores and hyphens; a letter first"
+    ),
+    r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$": (
+        "1 to 64 letters, digits, dots, underscores and hyphens; a letter or digit "
+        "first"
+    ),
+    r"^[A-Za-z0-9._/*-]{1,100}$": "1 to 100 letters, digits and characters of ._/*-",
+    r"^[!-~]{1,200}$": "1 to 200 characters of ASCII, without blanks",
+    r"^[ -~]{1,100}$": "1 to 100 characters of ASCII",
+    r"^[ -~]{1,1000}$": "1 to 1000 characters of ASCII",
+}
+"""Our patterns in words: people do not read regular expressions."""
 
 
 def describe_expectation(detail: ErrorDetails) -> str:
@@ -81,10 +116,16 @@ def describe_expectation(detail: ErrorDetails) -> str:
     """
     if is_own_sentence(detail):
         return detail["msg"].partition(", ")[2]
-    expectation = EXPECTATIONS.get(detail["type"])
-    if expectation is None:
-        return detail["msg"].removeprefix("Input should be ")
-    return expectation.format_map(detail.get("ctx", {}))
+    context = detail.get("ctx", {})
+    if detail["type"] == "string_pattern_mismatch":
+        return PATTERN_WORDS.get(context["pattern"], OTHER)
+    words = dict(context)
+    for end in ("min", "max"):
+        count = context.get(f"{end}_length")
+        if isinstance(count, int):
+            words[f"{end}_values"] = format_count(count, "value")
+            words[f"{end}_characters"] = format_count(count, "character")
+    return EXPECTATIONS.get(detail["type"], OTHER).format_map(words)
 
 
 def describe_input(detail: ErrorDetails) -> str:

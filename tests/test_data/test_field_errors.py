@@ -3,18 +3,41 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
+from uuid import UUID
 
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core.core_schema import ErrorType
 
 import lagbench
-from lagbench.data.field_errors import describe_expectation, describe_input
+from lagbench.data.field_errors import (
+    EXPECTATIONS,
+    OTHER,
+    PATTERN_WORDS,
+    describe_expectation,
+    describe_input,
+)
 
 PACKAGE = Path(lagbench.__file__).parent
+
+CONTEXT = (
+    "gt",
+    "ge",
+    "lt",
+    "le",
+    "multiple_of",
+    "min_length",
+    "max_length",
+    "expected",
+    "error",
+    "expected_schemes",
+)
+"""What pydantic adds to its errors, as far as the table asks for it."""
 
 
 class Inner(BaseModel):
@@ -42,17 +65,21 @@ class Inner(BaseModel):
         (bool, "maybe", "true or false"),
         (str, 3, "a text"),
         (Annotated[str, Field(min_length=2)], "a", "a text of at least 2 characters"),
-        (Annotated[str, Field(pattern="^a$")], "b", "a text of the form ^a$"),
+        (Annotated[str, Field(min_length=1)], "", "a text of at least 1 character"),
+        (Annotated[str, Field(pattern="^a$")], "b", OTHER),
+        (Annotated[str, Field(pattern="^[0-9a-f]{64}$")], "b", "64 hexadecimal digits"),
         (list[int], 3, "a list in brackets"),
         (tuple[int, ...], "3", "a list in brackets"),
         (Annotated[list[int], Field(min_length=2)], [1], "at least 2 values"),
-        (Annotated[list[int], Field(max_length=1)], [1, 2], "at most 1 values"),
+        (Annotated[list[int], Field(max_length=1)], [1, 2], "at most 1 value"),
         (dict[str, int], 3, "keys with values"),
         (Inner, 3, "keys with values"),
         (Inner, {}, "a value of this key"),
         (Inner, {"key": 1, "more": 2}, "no such key"),
         (Literal["a", "b"], "c", "'a' or 'b'"),
         (date, "soon", "a date, as in 2026-01-31"),
+        (set[int], [[]], "a whole number"),
+        (UUID, "3", OTHER),
     ],
 )
 def test_an_error_is_told_in_our_words(
@@ -61,6 +88,52 @@ def test_an_error_is_told_in_our_words(
     with pytest.raises(ValidationError) as caught:
         TypeAdapter(kind).validate_python(value)
     assert describe_expectation(caught.value.errors()[0]) == expected
+
+
+@pytest.mark.parametrize("kind", get_args(ErrorType))
+def test_no_error_of_pydantic_is_told_in_its_words(kind: str) -> None:
+    """Types that the table did not have were told with the text of pydantic."""
+    if kind in {"value_error", "assertion_error"}:  # these are sentences of ours
+        return
+    context = dict.fromkeys(CONTEXT, 3)
+    detail: Any = {
+        "type": kind,
+        "loc": (),
+        "msg": "Input should be pydantic's",
+        "input": None,
+        "ctx": context | {"pattern": "^[0-9a-f]{64}$"},
+    }
+    expectation = describe_expectation(detail)
+    assert expectation
+    assert "pydantic" not in expectation
+    if kind not in EXPECTATIONS and kind != "string_pattern_mismatch":
+        assert expectation == OTHER
+
+
+def test_each_pattern_has_words() -> None:
+    """Users of the registry saw regular expressions."""
+    patterns = set()
+    for folder, _, names in os.walk(PACKAGE, followlinks=True):
+        for name in names:
+            if name.endswith(".py"):
+                patterns |= patterns_in(Path(folder, name))
+    assert len(patterns) > 10
+    assert patterns == set(PATTERN_WORDS)
+
+
+def patterns_in(path: Path) -> set[str]:
+    """Return the patterns of a module's fields, those with names included."""
+    module = path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
+    patterns = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.keyword) or node.arg != "pattern":
+            continue
+        if isinstance(node.value, ast.Constant):
+            patterns.add(str(node.value.value))
+        elif isinstance(node.value, ast.Name):
+            names = vars(importlib.import_module(f"lagbench.{module}"))
+            patterns.add(names[node.value.id])
+    return patterns
 
 
 def test_the_value_of_a_missing_key_is_not_the_whole_file() -> None:
