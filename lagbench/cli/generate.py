@@ -138,7 +138,7 @@ def _season_places(
     from lagbench.board.season import read_season, season_registry, season_root
     from lagbench.board.season_scores import read_scores
 
-    folder = Folder(find_board(board))
+    folder = Folder(find_board(board, reads=True))
     season = read_season(folder, name)
     scores = read_scores(folder, season)
     registry = season_registry(

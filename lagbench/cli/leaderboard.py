@@ -157,7 +157,7 @@ def check_command(
         sizes = _sizes_to_measure(root, split, size)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = check_board(
-            find_board(board),
+            find_board(board, reads=not recording),
             page=page,
             base=base,
             own=own or (),
@@ -244,7 +244,7 @@ def picture_command(
             got=output,
             fix=f"-o {output.stem or 'cost'}.svg",
         )
-    folder = find_board(board)
+    folder = find_board(board, reads=True)
     if not shipped(tier):
         # without references the picture of no entry would be empty
         choose_data_sets(Folder(folder).data_sets(), tier.split, tier.name)
@@ -493,7 +493,7 @@ def show_command(
     split = None
     if split_argument or split_option:
         split = choose_split(split_argument, split_option)
-    folder = find_board(board)
+    folder = find_board(board, reads=True)
     data_sets = Folder(folder).data_sets()
     scope = scope_of_tables(metric or (), wide=wide)
     if as_json:

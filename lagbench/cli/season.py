@@ -166,7 +166,7 @@ def run_command(
     4: blind scenarios are missing, or not those of the season
     5: out of memory or disk
     """
-    board = find_board(board)
+    board = find_board(board, reads=check)
     if not check and not quiet:
         print_note(f"results go to {board}")
     with progress_bar(quiet=quiet or as_json) as progress:
@@ -224,7 +224,7 @@ def show_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Print public and blind skill of a season, and their gap."""
-    board = find_board(board)
+    board = find_board(board, reads=True)
     folder = Folder(board)
     season = read_season(folder, name)
     scores = read_scores(folder, season)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
 
 from lagbench.errors import UsageError
@@ -18,29 +20,37 @@ DEFAULT_BOARDS = (
 """The leaderboard in the working folder, and that of a clone."""
 
 MOST_NAMES = 1000
-"""Names of a folder among which leaderboards are looked for."""
+"""Names of a folder that are compared with a wrong one."""
 
 MOST_BOARDS = 3
-"""Leaderboards that a hint lists."""
+"""Folders beside a wrong one that a hint may list."""
 
 
-def find_board(board: str | Path | None = None) -> Path:
+def find_board(board: str | Path | None = None, *, reads: bool = False) -> Path:
     """Return the folder of a leaderboard.
 
     Args:
         board: the named folder; ``leaderboard`` in the working folder when
             None, else that of the clone.
+        reads: whether the caller only reads it. Where the named folder is no
+            leaderboard, the message then offers the default one.
 
     Raises:
         UsageError: the named folder is no leaderboard, or no default is there.
     """
+    defaults = [folder for folder in DEFAULT_BOARDS if is_board(folder)]
     if board is not None:
-        require_board(board)
-        return Path(board)
-    for folder in DEFAULT_BOARDS:
-        if (folder / SUBMISSIONS).is_dir():
-            return folder
-    raise no_board()
+        if is_board(Path(board)):
+            return Path(board)
+        raise no_board(Path(board), offered=defaults if reads else ())
+    if not defaults:
+        raise no_board()
+    return defaults[0]
+
+
+def is_board(folder: Path) -> bool:
+    """Return whether a folder has entries, or room for them."""
+    return (folder / SUBMISSIONS).is_dir()
 
 
 def require_board(board: str | Path, *, fix: str | None = None) -> None:
@@ -49,16 +59,28 @@ def require_board(board: str | Path, *, fix: str | None = None) -> None:
     Raises:
         UsageError: the folder has no entries.
     """
-    if not (Path(board) / SUBMISSIONS).is_dir():
+    if not is_board(Path(board)):
         raise no_board(Path(board), fix)
 
 
-def no_board(folder: Path = DEFAULT_BOARDS[0], fix: str | None = None) -> UsageError:
-    """Return the error for a folder that is no leaderboard."""
+def no_board(
+    folder: Path = DEFAULT_BOARDS[0],
+    fix: str | None = None,
+    *,
+    offered: Sequence[Path] = (),
+) -> UsageError:
+    """Return the error for a folder that is no leaderboard.
+
+    Args:
+        folder: the folder.
+        fix: what to do; to name another folder when None.
+        offered: leaderboards to offer where none has a similar name.
+    """
     fix = fix or "run it from the root of the clone, or name it: --board FOLDER"
-    boards = [str(board) for board in find_boards_near(folder)]
+    boards = find_boards_near(folder) or offered[:1]
     if boards:
-        fix = f"there is a leaderboard in {', '.join(boards)}: name it; or {fix}"
+        names = ", ".join(map(str, boards))
+        fix = f"there is a leaderboard in {names}: name it; or {fix}"
     got = "no such folder"
     if folder.is_dir():
         got = "a folder without it"
@@ -74,14 +96,10 @@ def no_board(folder: Path = DEFAULT_BOARDS[0], fix: str | None = None) -> UsageE
 
 
 def find_boards_near(folder: Path) -> list[Path]:
-    """Return leaderboards in a folder, beside it, and those that are the default."""
-    candidates = []
-    for place in (folder, folder.parent):
-        with suppress(OSError):
-            names = sorted(os.listdir(place))[:MOST_NAMES]
-            candidates += [place / name for name in names]
-    boards: dict[Path, Path] = {}
-    for candidate in (*candidates, *DEFAULT_BOARDS):
-        if (candidate / SUBMISSIONS).is_dir():
-            boards.setdefault(candidate.resolve(), candidate)
-    return list(boards.values())[:MOST_BOARDS]
+    """Return the leaderboard in a folder, and those beside it with similar names."""
+    candidates = [folder / DEFAULT_BOARDS[0]]
+    with suppress(OSError):
+        names = sorted(os.listdir(folder.parent))[:MOST_NAMES]
+        similar_names = get_close_matches(folder.name, names, n=MOST_BOARDS)
+        candidates += [folder.parent / name for name in similar_names]
+    return [candidate for candidate in candidates if is_board(candidate)]

@@ -373,7 +373,7 @@ def list_entries(board: str | Path | None) -> tuple[Path | None, dict[Place, Pat
         UsageError: the named folder is no leaderboard.
     """
     try:
-        folder = find_board(board)
+        folder = find_board(board, reads=True)
     except UsageError:
         # without a leaderboard, files are compared still
         if board is not None:
