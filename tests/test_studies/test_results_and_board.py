@@ -46,7 +46,7 @@ def _require_same_verdict(tab: Tab, results: SplitResults) -> None:
         LearningVerdict.PAYS: "Learning pays on",
         LearningVerdict.OPEN: "the question is open",
         LearningVerdict.DOES_NOT_PAY: "Learning does not pay on",
-        LearningVerdict.NO_SOLVER: "no classical solver is as cheap as the best model",
+        LearningVerdict.NO_SOLVER: "no classical solver is as cheap as",
     }
     verdict = verdict_on_learning([results])
     for own_verdict, words_of_verdict in words.items():
