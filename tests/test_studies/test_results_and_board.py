@@ -100,4 +100,4 @@ def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats(
     verdict = verdict_on_learning([results])
     assert beaten
     assert f"less than that of {' and '.join(beaten)}." in verdict
-    assert f"The error of {' and '.join(ahead)} is smaller." in verdict
+    assert f"It is greater than that of {' and '.join(ahead)}." in verdict
