@@ -8,6 +8,7 @@ again stands elsewhere: in verified.yaml.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -145,7 +146,7 @@ def mean_cost(
 
 
 def _rounded_mean(values: Sequence[float]) -> float:
-    return round_digits(sum(values) / len(values), 6)
+    return round_digits(math.fsum(values) / len(values), 6)
 
 
 class EntryBudget(Budget):

@@ -145,7 +145,7 @@ def _make_overview(
             skills.append(row.skill.mean)
     mean_skill = math.nan
     if skills:
-        mean_skill = sum(skills) / len(skills)
+        mean_skill = math.fsum(skills) / len(skills)
     return MethodOverview(
         method=method,
         rows=rows,

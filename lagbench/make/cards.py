@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -311,8 +312,8 @@ def _task_table(size: Size, manifest: Manifest) -> str:
         if entry.twin_floor:
             limits.append(entry.twin_floor)
     if limits:
-        first = sum(limit[0] for limit in limits) / len(limits)
-        last = sum(limit[-1] for limit in limits) / len(limits)
+        first = math.fsum(limit[0] for limit in limits) / len(limits)
+        last = math.fsum(limit[-1] for limit in limits) / len(limits)
         at_first = f"{first:.3g} at the first predicted frame"
         text = f"position RMSE {at_first}, {last:.3g} at the last"
         rows.append(("perturbed run, which starts 2^-20 away", text))

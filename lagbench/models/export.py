@@ -177,19 +177,39 @@ def _sums_of_index_add() -> Iterator[None]:
 def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
     """Refuse a file that predicts something else than the model.
 
-    Exporters translate some operations wrongly, without an error. The file runs here as
-    it runs when an entry is reproduced.
+    Exporters translate some operations wrongly, without an error. The file runs with
+    the same session options as where an entry is reproduced.
     """
-    session, names = open_session(str(path))
-    values = {}
-    for name, tensor in inputs.items():
-        if name in names:
-            values[name] = tensor.numpy()
-    (exported,) = session.run([OUTPUT], values)
     with torch.no_grad():
         expected = wrapped(*inputs.values()).numpy()
+    try:
+        session, names = open_session(str(path))
+        values = {}
+        for name, tensor in inputs.items():
+            if name in names:
+                values[name] = tensor.numpy()
+        (exported,) = session.run([OUTPUT], values)
+    except MemoryError:
+        raise
+    except Exception as error:  # onnxruntime raises its own types
+        reason = str(error).split("\n")[0][:200]
+        raise UsageError(
+            "the exported model does not run",
+            where="export_onnx",
+            expected="a model that onnxruntime can run",
+            got=f"{type(error).__name__}: {reason}",
+            fix="replace the operation, or compute in float32 where it has float64",
+        ) from error
+    if exported.shape != expected.shape:
+        raise UsageError(
+            "the exported model predicts another number of positions",
+            where="export_onnx",
+            expected=f"shape {expected.shape}",
+            got=f"shape {exported.shape}",
+            fix="let the step do the same operations whenever it is called",
+        )
     difference = float(np.abs(exported - expected).max())
-    if exported.shape != expected.shape or not difference <= MOST_DIFFERENCE:
+    if not difference <= MOST_DIFFERENCE:
         raise UsageError(
             "the exported model does not predict what the model does",
             where="export_onnx",

@@ -261,6 +261,47 @@ def test_what_an_onnx_model_is_not_given_is_told(
     assert not list(tmp_path.iterdir())
 
 
+def without_kernel(window: Batch) -> torch.Tensor:
+    """Return the last positions; onnxruntime has no erf of float64."""
+    now = window.position[:, -1]
+    return now + 0.0 * torch.erf(now.double()).float()
+
+
+def shorter_in_the_file(window: Batch) -> torch.Tensor:
+    """Return the last positions; the file leaves three of them out."""
+    now = window.position[:, -1]
+    if torch.onnx.is_in_onnx_export():
+        return now[3:]
+    return now
+
+
+@pytest.mark.parametrize(
+    ("step", "what"),
+    [
+        (without_kernel, "does not run"),
+        (shorter_in_the_file, "another number of positions"),
+    ],
+)
+def test_a_file_that_cannot_stand_for_the_model_is_refused(
+    step: Callable[[Batch], torch.Tensor],
+    what: str,
+    tmp_path: Path,
+    generated: GenerationResult,
+) -> None:
+    """The errors of onnxruntime and of NumPy were raised as they came."""
+    with pytest.raises(UsageError, match=what) as caught:
+        export_onnx(
+            step,
+            tmp_path / "model.onnx",
+            split=SIZE.split,
+            size=SIZE.name,
+            root=generated.root,
+        )
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_step_over_a_grid_of_particles_is_exported(
     tmp_path: Path, generated: GenerationResult
 ) -> None:
