@@ -12,6 +12,8 @@ import pytest
 from exchange_readers import straight_runs
 from typer.testing import Result
 
+from lagbench.baselines.catalogue import list_names
+
 Run = Callable[..., Result]
 
 FEW_STEPS = (
@@ -71,6 +73,38 @@ def test_the_printed_commands_train(
         assert trained.exit_code == 0, trained.stderr
         baselines.add(words[words.index("--baseline") + 1])
     assert baselines == {"gns", "neuralmpm"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("baseline", list_names())
+def test_every_baseline_takes_the_printed_recipe(
+    baseline: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recipe fitted graph networks only.
+
+    The one baseline that needs a viscosity refuses these data, which have none.
+    """
+    monkeypatch.chdir(tmp_path)
+    paths = write_runs(tmp_path, "walls")
+    options = ("--radius", "0.1", "--frame-interval", "0.1")
+    adopted = run("adopt", *paths, "-o", "own", *options)
+    assert adopted.exit_code == 0, adopted.stderr
+
+    commands = [line.strip() for line in adopted.stdout.splitlines()]
+    (recipe_command,) = [line for line in commands if line.startswith("echo ")]
+    subprocess.run(recipe_command, shell=True, check=True)
+    train_command = next(
+        line for line in commands if line.startswith("lagbench train ")
+    )
+    words = shlex.split(train_command)[1:]
+    words[words.index("--baseline") + 1] = baseline
+    few_steps = () if baseline.startswith("var") else FEW_STEPS
+    trained = run(*words, *few_steps)
+    if baseline == "hybrid-projection":
+        assert trained.exit_code == 4
+        assert "the viscosity is not known" in trained.stderr
+    else:
+        assert trained.exit_code == 0, trained.stderr
 
 
 def test_a_model_of_whole_frames_refuses_unequal_counts(
