@@ -320,8 +320,8 @@ def lead_out(splits: dict[str, Any]) -> None:
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
         (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
         (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),
-        (within("cavity", version="1.0"), ("cavity.version", "a text of the form")),
-        (lead_out, ("cavity.sizes", "../x", "a text of the form")),
+        (within("cavity", version="1.0"), ("cavity.version", "a version, as in 1.0.0")),
+        (lead_out, ("cavity.sizes", "../x", "a letter first")),
         (
             tiny(substeps_per_frame="many"),
             ("tiny.parameters.substeps_per_frame", ">= 1", "'many'"),
