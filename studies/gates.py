@@ -50,6 +50,7 @@ BOARD_WEIGHTS = Path("leaderboard/weights")
 METHODS = (
     "gns",
     "gns-pushforward",
+    "gns-spread",
     "supergat",
 )  # graph networks that are measured by default
 FRAME_STEP = 20  # frames between the windows of a scenario
