@@ -275,7 +275,8 @@ class GraphNetworkOptions(Options):
     forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
     target: GraphTarget = GraphTarget.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame];
-    # some times that of an acceleration is good: with less, rollouts drift away
+    # with noise_spread the largest one. Rollouts drift away with little noise, and
+    # single steps get worse with much: docs/baselines.md has figures
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
     # whether each window draws the deviation of its noise, from none to noise_std: the
     # model then learns from true states and from far ones

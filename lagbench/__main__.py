@@ -197,74 +197,17 @@ def _translate_click_error(error: Any) -> LagbenchError:  # noqa: ANN401 (two co
     command = _guess_command()
     if context is not None:
         command = f"lagbench {_command_words(context)}".rstrip()
-    message = str(error.format_message()).rstrip(".")
-    help_hint = f"`{command} --help` lists what there is"
+    translations = {
+        "NoSuchOption": _unknown_option_error,
+        "MissingParameter": _missing_parameter_error,
+        "BadParameter": _bad_parameter_error,
+        "BadOptionUsage": _option_value_error,
+    }
     kind = type(error).__name__
-    if kind == "NoSuchOption":
-        if error.option_name == "--size" and command in COMMANDS_WITHOUT_SIZE:
-            return UsageError(
-                "no such option",
-                where=command,
-                expected="files, which state their size",
-                got=error.option_name,
-                fix="leave --size out; `lagbench template` and `lagbench predict` take "
-                "the size and write it into predictions",
-            )
-        possible = ", ".join(error.possibilities or ())
-        suggestion = f"did you mean {possible}? " if possible else ""
-        fix = f"{suggestion}{help_hint}"
-        # The value of a setting may be a negative number.
-        if _NEGATIVE_NUMBER.fullmatch(error.option_name):
-            fix = _advise_on_settings(sys.argv) or fix
-        return UsageError(
-            "no such option",
-            where=command,
-            expected="an option of this command",
-            got=error.option_name,
-            fix=fix,
-        )
-    if kind == "MissingParameter":
-        name = _parameter_name(error)
-        return UsageError(
-            f"{name} is missing",
-            where=command,
-            expected=getattr(error.param, "help", None) or f"a value of {name}",
-            got="nothing",
-            fix=f"add {name}; {help_hint}",
-        )
-    if kind == "BadParameter":
-        # The help of a group shall load no other module.
-        from .data.field_errors import describe_expectation
+    if kind in translations:
+        return translations[kind](error, command)
 
-        unreadable_path = _UNREADABLE_PATH.search(message)
-        if unreadable_path is not None:
-            return UnreadableFileError(
-                "cannot open the file",
-                where=unreadable_path[1],
-                expected="a file that you may read",
-                got="no permission to read it",
-                fix="see who owns it, or name another",
-            )
-        detail = _first_detail(error)
-        return UsageError(
-            f"{_parameter_name(error)} has a value that does not fit",
-            where=command,
-            expected=describe_expectation(detail) if detail else str(error.message),
-            got=_quote_word(repr(detail["input"])) if detail else None,
-            fix=f"give another value; {help_hint}",
-        )
-    if kind == "BadOptionUsage":
-        name = error.option_name
-        has_value = "not take a value" in message
-        return UsageError(
-            f"{name} takes no value" if has_value else f"{name} has no value",
-            where=command,
-            expected=f"{name} alone" if has_value else f"{name} and a value",
-            got=" ".join(map(_quote_word, sys.argv[1:])) or None,
-            fix=f"leave the value out; {help_hint}"
-            if has_value
-            else f"add a value behind {name}; {help_hint}",
-        )
+    message = str(error.format_message()).rstrip(".")
     extra_words = _EXTRA_WORDS.search(message)
     if extra_words is not None and context is not None:
         return _extra_words_error(context, command, extra_words[1])
@@ -272,8 +215,101 @@ def _translate_click_error(error: Any) -> LagbenchError:  # noqa: ANN401 (two co
         message[:1].lower() + message[1:],
         where=command,
         expected="a command, its arguments and its options",
-        got=" ".join(map(_quote_word, sys.argv[1:])) or None,
-        fix=help_hint,
+        got=_typed_words(),
+        fix=_name_help(command),
+    )
+
+
+def _name_help(command: str) -> str:
+    """Return the hint that names the help of a command."""
+    return f"`{command} --help` lists what there is"
+
+
+def _typed_words() -> str | None:
+    """Return the words behind ``lagbench``; None where there are none."""
+    return " ".join(map(_quote_word, sys.argv[1:])) or None
+
+
+def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN401
+    """Return the error for an option that a command does not have."""
+    if error.option_name == "--size" and command in COMMANDS_WITHOUT_SIZE:
+        return UsageError(
+            "no such option",
+            where=command,
+            expected="files, which state their size",
+            got=error.option_name,
+            fix="leave --size out; `lagbench template` and `lagbench predict` take "
+            "the size and write it into predictions",
+        )
+    fix = _name_help(command)
+    possible = ", ".join(error.possibilities or ())
+    if possible:
+        fix = f"did you mean {possible}? {fix}"
+    # The value of a setting may be a negative number.
+    if _NEGATIVE_NUMBER.fullmatch(error.option_name):
+        fix = _advise_on_settings(sys.argv) or fix
+    return UsageError(
+        "no such option",
+        where=command,
+        expected="an option of this command",
+        got=error.option_name,
+        fix=fix,
+    )
+
+
+def _missing_parameter_error(error: Any, command: str) -> UsageError:  # noqa: ANN401
+    """Return the error for an argument or an option that a command needs."""
+    name = _parameter_name(error)
+    return UsageError(
+        f"{name} is missing",
+        where=command,
+        expected=getattr(error.param, "help", None) or f"a value of {name}",
+        got="nothing",
+        fix=f"add {name}; {_name_help(command)}",
+    )
+
+
+def _bad_parameter_error(error: Any, command: str) -> LagbenchError:  # noqa: ANN401
+    """Return the error for a value that does not fit, or for a file without access."""
+    # The help of a group shall load no other module.
+    from .data.field_errors import describe_expectation
+
+    unreadable_path = _UNREADABLE_PATH.search(str(error.format_message()))
+    if unreadable_path is not None:
+        return UnreadableFileError(
+            "cannot open the file",
+            where=unreadable_path[1],
+            expected="a file that you may read",
+            got="no permission to read it",
+            fix="see who owns it, or name another",
+        )
+    detail = _first_detail(error)
+    return UsageError(
+        f"{_parameter_name(error)} has a value that does not fit",
+        where=command,
+        expected=describe_expectation(detail) if detail else str(error.message),
+        got=_quote_word(repr(detail["input"])) if detail else None,
+        fix=f"give another value; {_name_help(command)}",
+    )
+
+
+def _option_value_error(error: Any, command: str) -> UsageError:  # noqa: ANN401
+    """Return the error for a flag with a value, or an option without its value."""
+    name = error.option_name
+    if "not take a value" in str(error.format_message()):
+        return UsageError(
+            f"{name} takes no value",
+            where=command,
+            expected=f"{name} alone",
+            got=_typed_words(),
+            fix=f"leave the value out; {_name_help(command)}",
+        )
+    return UsageError(
+        f"{name} has no value",
+        where=command,
+        expected=f"{name} and a value",
+        got=_typed_words(),
+        fix=f"add a value behind {name}; {_name_help(command)}",
     )
 
 

@@ -239,19 +239,30 @@ HINTS = {
 """What the message about a mistake contains, by command."""
 
 
-@pytest.mark.parametrize("command", HINTS)
-def test_a_mistake_is_told_with_what_mends_it(
-    command: str,
+@pytest.fixture
+def type_command(
     run: Callable[..., Result],
     bench: ScoreBench,
     files: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+) -> Callable[[str], Result]:
+    """Return what runs a command as if it were typed beside the files."""
     monkeypatch.chdir(files)
     monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
-    words = shlex.split(command)
-    monkeypatch.setattr("sys.argv", ["lagbench", *words])
-    result = run(*words)
+
+    def run_typed(command: str) -> Result:
+        words = shlex.split(command)
+        monkeypatch.setattr("sys.argv", ["lagbench", *words])
+        return run(*words)
+
+    return run_typed
+
+
+@pytest.mark.parametrize("command", HINTS)
+def test_a_mistake_is_told_with_what_mends_it(
+    command: str, type_command: Callable[[str], Result]
+) -> None:
+    result = type_command(command)
     assert result.exit_code in {1, 2, 3, 4}
     assert has_all_parts(result.output), result.output
     assert HINTS[command] in result.output
@@ -265,19 +276,10 @@ def has_all_parts(message: str) -> bool:
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_told_with_all_that_is_needed(
-    mistake: str,
-    run: Callable[..., Result],
-    bench: ScoreBench,
-    files: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    mistake: str, type_command: Callable[[str], Result], bench: ScoreBench
 ) -> None:
-    monkeypatch.chdir(files)
-    monkeypatch.setenv("LAGBENCH_ROOT", str(bench.root))
     scenario = bench.size.path(bench.root, 3)
-    command = MISTAKES[mistake].replace("SCENARIO", str(scenario))
-    words = shlex.split(command)
-    monkeypatch.setattr("sys.argv", ["lagbench", *words])
-    result = run(*words)
+    result = type_command(MISTAKES[mistake].replace("SCENARIO", str(scenario)))
     assert result.exit_code in {1, 2, 3, 4, 5}
     assert has_all_parts(result.stderr), result.stderr
 
