@@ -8,10 +8,9 @@ import importlib
 import io
 import os
 import re
-import shlex
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar
@@ -27,6 +26,7 @@ from .cli.commands import (
     SEASON_COMMANDS,
     CommandEntry,
 )
+from .cli.typed_settings import NEGATIVE_NUMBER, advise_on_settings
 from .errors import (
     LagbenchError,
     UnreadableFileError,
@@ -77,8 +77,6 @@ _UNREADABLE_PATH = re.compile(r"'(.+)' is not readable")
 
 _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
 """What click says of words that are neither arguments nor options."""
-
-_NEGATIVE_NUMBER = re.compile(r"-[0-9.].*")
 
 MOST_LETTERS = 60  # of a word of the command line in a message
 
@@ -246,8 +244,8 @@ def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN4
     if possible:
         fix = f"did you mean {possible}? {fix}"
     # The value of a setting may be a negative number.
-    if _NEGATIVE_NUMBER.fullmatch(error.option_name):
-        fix = _advise_on_settings(sys.argv) or fix
+    if NEGATIVE_NUMBER.fullmatch(error.option_name):
+        fix = advise_on_settings(sys.argv) or fix
     return UsageError(
         "no such option",
         where=command,
@@ -326,44 +324,8 @@ def _extra_words_error(
         where=command,
         expected=usage,
         got=_quote_word(words),
-        fix=_advise_on_settings(sys.argv) or fix,
+        fix=advise_on_settings(sys.argv) or fix,
     )
-
-
-def _advise_on_settings(words: Sequence[str]) -> str | None:
-    """Return how to write the settings of a command; None where that is no mistake.
-
-    Settings are often written with blanks around the =, without it, or without --set
-    before the second one.
-
-    >>> _advise_on_settings(["train", "--set", "training.steps", "=", "10"])
-    'write settings with = and without blanks: --set training.steps=10'
-    """
-    settings: list[str] = []
-    has_mistake = False
-    is_setting = False
-    for number, word in enumerate(words):
-        if word.startswith("-") and not _NEGATIVE_NUMBER.fullmatch(word):
-            is_setting = word == "--set"
-        elif not is_setting:
-            continue
-        elif words[number - 1] == "--set":
-            settings.append(word)
-        elif settings[-1].endswith("=") or word.startswith("="):
-            settings[-1] += word
-            has_mistake = True
-        elif "=" not in settings[-1]:
-            settings[-1] += f"={word}"
-            has_mistake = True
-        elif "=" in word:
-            settings.append(word)
-            has_mistake = True
-        else:
-            is_setting = False
-    if not has_mistake:
-        return None
-    options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
-    return f"write settings with = and without blanks: {options}"
 
 
 def _guess_command() -> str:

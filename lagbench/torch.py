@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from lagbench.arguments import check_arguments
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
-from lagbench.store.windows import CACHE_BYTES, WindowReader, check_whole
+from lagbench.store.windows import CACHE_BYTES, WindowReader
 from lagbench.store.windows import Window as ArrayWindow
 from lagbench.tensors import Batch, TensorWindow, collate
 
@@ -138,6 +139,7 @@ class WindowSampler(Sampler[int]):
         UsageError: the ranks are more than the windows, or the rank is not one of them.
     """
 
+    @check_arguments
     def __init__(
         self,
         data: WindowDataset,
@@ -276,6 +278,7 @@ is ``batch.body_force[:, batch.frames]`` where a force drives the flow.
 """
 
 
+@check_arguments
 def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
     """Feed a model with its own predictions; gradients pass through all frames.
 
@@ -292,7 +295,6 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
         UsageError: frames below 1 or beyond the known forcing, or the model returns no
             [particle, axis].
     """
-    check_whole(frames, "frames")
     # Beyond the known forcing a model would take the last known one.
     longest = max(1, frames)
     for forcing in (given.wall_velocity, given.body_force):
@@ -336,6 +338,7 @@ def _check_step_result(position: object, shape: torch.Size) -> None:
         )
 
 
+@check_arguments
 def predict(
     step: Step,
     split: str | Path,
@@ -373,8 +376,6 @@ def predict(
             that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
-    if history is not None:
-        check_whole(history, "history")
     data = WindowDataset(
         split, subset=subset, size=size, root=root, future=0, registry=registry
     )

@@ -27,7 +27,7 @@ PACKAGE = Path(lagbench.__file__).parent
 STUDIES = PACKAGE.parent / "studies"
 
 LAYERS = (
-    ("addresses", "errors", "atomic"),
+    ("addresses", "arguments", "errors", "atomic"),
     ("work",),
     ("data",),
     ("store",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from lagbench.errors import SPLIT_NAMED, UsageError
+
+from .typed_settings import advise_on_settings, check_typed_settings
 
 
 def parse_root(text: str) -> Path:
@@ -100,8 +103,11 @@ def choose_split(argument: str | None, option: str | None) -> str:
     """Return the split that a user names by the argument SPLIT or the option --split.
 
     Raises:
-        UsageError: no split is named, or two different ones.
+        UsageError: no split is named, or two different ones, or the value of a setting
+            stands where the name of a split should.
     """
+    if argument is not None:
+        check_typed_settings(sys.argv)
     fix = "name one, as in --split cavity; `lagbench list` shows all splits"
     names = {name for name in (argument, option) if name is not None}
     if not names:
@@ -118,7 +124,7 @@ def choose_split(argument: str | None, option: str | None) -> str:
             where=SPLIT_NAMED,
             expected="one split: by SPLIT, by --split, or twice the same",
             got=" and ".join(sorted(names)),
-            fix=fix,
+            fix=advise_on_settings(sys.argv) or fix,
         )
     return names.pop()
 

@@ -12,6 +12,7 @@ from typing import Any, Unpack
 import h5py
 import numpy as np
 
+from lagbench.arguments import check_arguments
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.structure import Structure, check_structure
@@ -57,6 +58,7 @@ MOST_TRAJECTORIES = 100_000
 """Most trajectories of an HDF5 file that are looked at."""
 
 
+@check_arguments
 def adopt(
     sources: str | Path | Sequence[str | Path],
     *,
@@ -242,6 +244,7 @@ def _refuse_duplicates(rows: Sequence[Row]) -> None:
         path_of[row] = path
 
 
+@check_arguments
 def import_split(
     source: str | Path,
     *,

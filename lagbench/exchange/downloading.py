@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.addresses import ARCHIVES, describe
+from lagbench.arguments import check_arguments
 from lagbench.data.layout import MANIFEST_NAME, format_ids, scenario_path
 from lagbench.data.local import locate_new, suggest_repair
 from lagbench.data.lock import dataset_lock
@@ -73,6 +74,7 @@ class DownloadResult:
     verdict: str  # how the hashes compare with datasets.yaml, in words
 
 
+@check_arguments
 def download(
     split: str | Path,
     size: str | None = None,

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.local import locate, suggest_repair
@@ -71,6 +72,7 @@ class ExportResult:
     bytes: int  # length of the files together [bytes]
 
 
+@check_arguments
 def export(
     split: str | Path,
     size: str | None = None,

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lagbench.arguments import check_arguments
 from lagbench.data.local import locate, suggest_repair
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 SCENARIO_ENDING = ".nc"  # of a source that is a file, not a split
 
 
+@check_arguments
 def plot(
     source: str | Path,
     *,
@@ -69,6 +71,7 @@ def plot(
         return plot_frame(file, frame, output, kind=kind, dpi=dpi, registry=registry)
 
 
+@check_arguments
 def animate(
     source: str | Path,
     *,

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.arguments import check_arguments
 from lagbench.data.checksums import (
     HASHED_SUBSETS,
     dataset_hash,
@@ -127,6 +128,7 @@ class VerificationResult:
             )
 
 
+@check_arguments
 def verify(
     split: str,
     size: str | None = None,

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
+from lagbench.arguments import check_arguments
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, check_installed
@@ -39,6 +40,7 @@ DYNAMIC_AXES = {
 """Axes whose length differs from scenario to scenario."""
 
 
+@check_arguments
 def export_onnx(
     step: Step,
     path: str | Path,

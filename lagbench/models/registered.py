@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lagbench.arguments import check_arguments
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
@@ -20,6 +21,7 @@ RECIPE = "own-training"
 """Name of the recipe of a model that `lagbench train` did not train."""
 
 
+@check_arguments
 def build_registered(
     baseline: str,
     *,
@@ -47,6 +49,7 @@ def build_registered(
     return find(baseline).model.build(options or {}, info)
 
 
+@check_arguments
 def export_safetensors(
     model: Baseline, path: str | Path, *, baseline: str, seed: int = 0, step: int = 0
 ) -> Path:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lagbench.data.checksums import round_digits
+from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.frame import TaskConfig
@@ -141,7 +142,23 @@ class ScoreCard:
         return self.scores[SUBMISSION]
 
     def against(self, row: str) -> Comparison:
-        """Compare the submission with a reference in the ranking metric."""
+        """Compare the submission with a reference in the ranking metric.
+
+        Args:
+            row: name of the reference, as in ``scores``.
+
+        Raises:
+            UsageError: no reference of that name was scored beside the submission.
+        """
+        references = [name for name in self.scores if name != SUBMISSION]
+        if row not in references:
+            raise UsageError(
+                f"no reference {row!r} beside the submission",
+                where="against, row",
+                expected="the name of a reference that was scored beside it",
+                got=ascii(row),
+                fix=suggest_name(str(row), references),
+            )
         return compare(self.submission[self.ranking], self.scores[row][self.ranking])
 
     def at(self, path: Path, *more: Path) -> ScoreCard:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lagbench.arguments import check_arguments
 from lagbench.data.local import locate, locate_split, suggest_split_of
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
@@ -220,6 +221,7 @@ class _ScoringOptions:
     examine: Callable[[str, str], None] | None = None
 
 
+@check_arguments
 def compare(
     first: str | Path,
     second: str | Path,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.local import (
     DESCRIPTION,
@@ -59,6 +60,7 @@ WORTH_WORKERS = 1_000_000
 """Least particles times predicted frames for which worker processes are worth it."""
 
 
+@check_arguments
 def score(
     predictions: str | Path,
     *,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from lagbench.arguments import check_arguments
 from lagbench.data import registry
 from lagbench.data.box import AXES
 from lagbench.data.local import locate, suggest_repair
@@ -38,6 +39,7 @@ def list_splits() -> tuple[str, ...]:
     return tuple(sorted(registry.load().splits))
 
 
+@check_arguments
 def load_manifest(
     split: str | Path, *, size: str | None = None, root: str | Path | None = None
 ) -> Manifest:
@@ -66,6 +68,7 @@ def load_manifest(
     return manifest
 
 
+@check_arguments
 def open_split(
     split: str | Path,
     *,

@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.arguments import check_arguments
 from lagbench.data.contents import check_contents, registered_hash
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
@@ -334,46 +335,20 @@ class Window(NamedTuple):
     obstacle: NDArray[np.float32] | None = None
 
 
-def check_whole(value: object, name: str) -> None:
-    """Refuse an argument that is no whole number, such as a text.
+def _check_bytes(value: float, name: str) -> None:
+    """Refuse a size of memory below 0; infinity is one.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is below 0 or no number.
     """
-    try:
-        operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        fix = f"give a whole number, as in {name}=2"
-        if isinstance(value, str):
-            fix = f"give a number without quotes, as in {name}=2"
-        elif isinstance(value, float | np.floating) and float(value).is_integer():
-            fix = f"write {name}={int(float(value))}, not {name}={value}"
-        raise UsageError(
-            f"{name} is no whole number",
-            where=name,
-            expected="a whole number",
-            got=repr(value)[:80],
-            fix=fix,
-        ) from None
-
-
-def _check_bytes(value: object, name: str) -> None:
-    """Refuse a size of memory that is no number from 0; infinity is one.
-
-    Raises:
-        UsageError: it is none.
-    """
-    if isinstance(value, int | float | np.integer | np.floating) and value >= 0:
+    if value >= 0:
         return
-    fix = f"give bytes, as in {name}=1e9, or leave {name} out"
-    if isinstance(value, str):
-        fix = f"give a number without quotes, as in {name}=1e9"
     raise UsageError(
         f"{name} is no number from 0",
         where=name,
         expected="a number >= 0 [bytes]",
         got=repr(value)[:80],
-        fix=fix,
+        fix=f"give bytes, as in {name}=1e9, or leave {name} out",
     )
 
 
@@ -388,6 +363,7 @@ class WindowReader:
     and content hash are compared, its values are not hashed.
     """
 
+    @check_arguments
     def __init__(
         self,
         split: str | Path,
@@ -402,9 +378,6 @@ class WindowReader:
         origin: bool = False,
         verify: bool = False,
     ) -> None:
-        if history is not None:
-            check_whole(history, "history")
-        check_whole(future, "future")
         _check_bytes(cache_bytes, "cache_bytes")
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
         if isinstance(subset, str) or not isinstance(subset, Iterable):
@@ -543,6 +516,7 @@ class Windows(WindowReader):
         return self.read(index)
 
 
+@check_arguments
 def windows(
     split: str | Path,
     *,

@@ -20,6 +20,7 @@ from typing import Any
 
 import h5py
 
+from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.local import load_rooted_registry, resolve_root, suggest_split_of
 from lagbench.data.registry import Registry, Size
@@ -106,6 +107,7 @@ def seconds_for(path: Path) -> float:
     return byte_count / BYTES_PER_SECOND
 
 
+@check_arguments
 def validate(
     path: str | Path,
     *,

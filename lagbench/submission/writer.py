@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
@@ -76,6 +77,7 @@ class PredictionsWriter:
         DataError: the hash of the data set is not known.
     """
 
+    @check_arguments
     def __init__(
         self,
         path: str | Path,
@@ -467,6 +469,7 @@ def _no_positions(where: str, got: str) -> UsageError:
     )
 
 
+@check_arguments
 def write(
     path: str | Path,
     positions: Mapping[int, ArrayLike] | ArrayLike,
@@ -590,6 +593,7 @@ class TemplateResult:
     bytes: int
 
 
+@check_arguments
 def template(
     split: str | Path,
     size: str | None = None,

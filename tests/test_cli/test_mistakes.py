@@ -214,6 +214,15 @@ HINTS = {
     f"{TRAIN} gns --set training.steps 10 --set training.batch = 2 model.a=1": (
         "--set training.steps=10 --set training.batch=2 --set model.a=1"
     ),
+    "train --baseline gns --set training.steps 10 --split curl-noise": (
+        "fix: write settings with = and without blanks: --set training.steps=10"
+    ),
+    "train --baseline gns --set training.steps 10 --size tiny": (
+        "fix: write settings with = and without blanks: --set training.steps=10"
+    ),
+    "train --baseline gns --set training.steps= 10 --split curl-noise": (
+        "fix: write settings with = and without blanks: --set training.steps=10"
+    ),
     f"{TRAIN} gns --set training.steps=1 more": "leave them out",
     f"{TRAIN} gns --set training.steps=many": "expected: a whole number",
     "score good.nc nan.nc": "lagbench compare",

@@ -1017,3 +1017,8 @@ def test_lines_say_how_much_better_a_submission_is(
     assert size == pytest.approx(abs(difference), rel=1e-3)
     is_better = difference < 0.0
     assert is_better == (word == "better")
+
+    # a name that is no reference beside it was a KeyError
+    with pytest.raises(UsageError) as caught:
+        card.against("persistance")
+    assert caught.value.where == "against, row"

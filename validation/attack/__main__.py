@@ -12,7 +12,7 @@ one. Prints a table of targets and counts, and the number of every failed case;
 ``--only N`` repeats one of them. ``--valid`` runs every command on the valid files,
 which must succeed. Exit code 0: no case failed; 1: some did.
 
-With the same seed, case N is the same whatever the number of cases is.
+With the same seed and targets, case N is the same whatever the number of cases is.
 """
 
 from __future__ import annotations
@@ -62,6 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     targets = list_targets(valid)
     if options.valid:
         return _try_valid_files(targets, valid, work)
+    if options.target:
+        targets = [target for target in targets if target.name in options.target]
+        if not targets:
+            raise SystemExit("no such target")
     plan = _plan(targets, options.seed)
 
     numbers: Sequence[int] = range(options.first, options.first + options.cases)
@@ -98,6 +102,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--valid", action="store_true", help="run the commands on the valid files"
     )
+    parser.add_argument(
+        "--target", action="append", help="name of a target, instead of all; repeatable"
+    )
     parser.add_argument("--verbose", action="store_true", help="print every case")
     return parser
 
@@ -132,7 +139,8 @@ def _try_valid_files(targets: Sequence[Target], valid: Path, work: Path) -> int:
     for target in targets:
         for command in dict.fromkeys(target.commands):
             folder = _copy_valid_files(valid / target.source, work)
-            outcome = run_command(command, folder, work)
+            words = (*command, *target.read_words(folder))
+            outcome = run_command(words, folder, work, is_installed=target.is_installed)
             sys.stdout.write(f"{target.name}: `{' '.join(command)}`: {outcome.code}\n")
             if outcome.code != 0:
                 exit_code = 1
@@ -164,7 +172,13 @@ def _run_case(
     mutation(victim, rng)
 
     before = take_snapshot(folder)
-    outcome = run_command(command, folder, work, model_seconds=target.model_seconds)
+    outcome = run_command(
+        (*command, *target.read_words(folder)),
+        folder,
+        work,
+        model_seconds=target.model_seconds,
+        is_installed=target.is_installed,
+    )
     failures = find_failures(outcome, before, take_snapshot(folder))
     if outcome.code == 0:
         if target.is_hashed:

@@ -46,6 +46,26 @@ def write_trajectories(folder: Path, dimension: int) -> None:
         np.savez(folder / f"{number}.npz", position=position, material=material)
 
 
+def write_walled_trajectories(folder: Path, dimension: int) -> None:
+    """Write trajectories between moving walls, each with other numbers of particles."""
+    folder.mkdir(parents=True)
+    for number in range(TRAJECTORIES):
+        particles = SIDE[dimension] ** dimension - 7 * number
+        frames = FRAMES - number
+        # the drift of a periodic box, shrunk: no particle reaches a wall
+        start = trajectory(number, dimension)[0, :particles]
+        phases = 0.05 * np.arange(frames)[:, None, None]
+        position = 0.1 + 0.8 * start + 0.02 * np.sin(phases + 6 * start)
+        wall_velocity = np.zeros((frames, 2 * dimension, dimension), np.float32)
+        wall_velocity[:, -1, 0] = 0.1
+        np.savez(
+            folder / f"{number}.npz",
+            position=position.astype(np.float32),
+            material=np.zeros(particles, np.int64),
+            wall_velocity=wall_velocity,
+        )
+
+
 def write_gns(folder: Path, dimension: int) -> None:
     """Write a data set as GNS code bases do: metadata and an npz for each subset."""
     folder.mkdir(parents=True)
@@ -185,6 +205,51 @@ def velocities_that_lie(path: Path, rng: np.random.Generator) -> None:
 
     _edit(path, change)
 
+
+def wrong_walls(path: Path, rng: np.random.Generator) -> None:
+    """Move walls wrongly: no numbers, other shapes or types, or far too fast."""
+    kind = int(rng.integers(9))
+
+    def change(arrays: Arrays) -> None:
+        walls = arrays["wall_velocity"]
+        choices = (
+            walls * np.nan,
+            walls + np.inf,
+            walls + 1e30,
+            walls[:-1],
+            walls[:, :-1],
+            walls[..., :-1],
+            walls[0],
+            walls.astype("U8"),
+            np.float32(1.0),
+        )
+        arrays["wall_velocity"] = choices[kind]
+
+    _edit(path, change)
+
+
+def other_number(path: Path, rng: np.random.Generator) -> None:
+    """Have one particle, none, or as many as no box holds; or one frame or two."""
+    kind = int(rng.integers(6))
+
+    def change(arrays: Arrays) -> None:
+        position = arrays["position"]
+        choices = (
+            position[:, :1],
+            position[:, :0],
+            np.repeat(position, 200, axis=1),
+            position[:1],
+            position[:2],
+            position[:, :, ::-1].copy(order="F"),
+        )
+        arrays["position"] = choices[kind]
+        arrays["material"] = np.zeros(choices[kind].shape[1], np.int64)
+        arrays["wall_velocity"] = arrays["wall_velocity"][: choices[kind].shape[0]]
+
+    _edit(path, change)
+
+
+WALLED_ARRAYS: tuple[Mutation, ...] = (wrong_walls, other_number)
 
 ARRAYS: tuple[Mutation, ...] = (
     wrong_numbers,

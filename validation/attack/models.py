@@ -291,7 +291,36 @@ def other_baseline(path: Path, rng: np.random.Generator) -> None:
     _edit_weights(path, edit)
 
 
+def hostile_record(path: Path, rng: np.random.Generator) -> None:
+    """Store a description that is no JSON, no mapping, deep, long or contradictory."""
+    content = torch.load(path, weights_only=True)
+    about = content["about"]
+    texts: tuple[Any, ...] = (
+        "",
+        "null",
+        "[]",
+        "3",
+        about[:-1],
+        about + about,
+        "[" * 100_000,
+        '{"a": ' * 50_000,
+        about.replace("{", '{"baseline": "mlp", ', 1),
+        about.replace("0", "9" * 5_000, 1),
+        about.replace("1", "1e999", 1),
+        about.replace('"', '"\\u202e', 1),
+        about + " " * (1 << 24),
+        3,
+        None,
+        [about],
+        torch.zeros(3),
+    )
+    content["about"] = texts[rng.integers(len(texts))]
+    torch.save(content, path)
+
+
 WEIGHTS: tuple[Mutation, ...] = (
+    hostile_record,
+    hostile_record,
     remove_from_weights,
     wrong_option,
     wrong_option,

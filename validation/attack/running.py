@@ -53,6 +53,7 @@ def run_command(
     logs: Path,
     *,
     model_seconds: float = 0.0,
+    is_installed: bool = False,
 ) -> Outcome:
     """Run ``lagbench ARGUMENTS`` in a folder, in a fork of this process.
 
@@ -62,11 +63,14 @@ def run_command(
         logs: folder for what the command prints.
         model_seconds: processor time that the command grants a model, beyond
             :data:`MOST_SECONDS` [s].
+        is_installed: whether packages in the working folder count as installed.
     """
     most_seconds = (MOST_SECONDS + model_seconds) * _waiting_processes()
     started = time.monotonic()
     process = os.fork()
     if process == 0:
+        if is_installed:
+            sys.path.insert(0, str(folder))
         _become_command(arguments, folder, logs)
     code: int | None = None
     is_late = False

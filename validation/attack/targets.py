@@ -29,9 +29,16 @@ from lagbench.data.registry import load
 from lagbench.models.onnx_model import LOAD_SECONDS, SECONDS_PER_FRAME
 from lagbench.scoring.boards import SUBMISSIONS
 
-from .arrays import ARRAYS, write_gns, write_trajectories
+from .arrays import (
+    ARRAYS,
+    WALLED_ARRAYS,
+    write_gns,
+    write_trajectories,
+    write_walled_trajectories,
+)
 from .models import ONNX, write_straight_on
 from .models import WEIGHTS as WEIGHT_MUTATIONS
+from .modules import MODULES, SETTINGS
 from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
 from .running import run_command
 from .safetensors_files import SAFETENSORS, write_small_network
@@ -41,6 +48,11 @@ SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise")
 
 COMMITTED_ENTRIES = ("gns", "hybrid-projection")
 """Entries of the committed leaderboard, cavity mini, whose records are attacked."""
+
+EXAMPLE = Path(__file__).parents[2] / "docs/examples/dam_break"
+"""A split of a user's own."""
+
+SETTING_WORDS = ("--set", "training.seed=1", "--set", "model.evaluations=5")
 
 PLACE = Path("cavity/mini")
 SEASON = "spring"
@@ -80,6 +92,16 @@ class Target:
     # whether a file of other bytes must be refused
     is_hashed: bool = False
     check: Check | None = None  # what a success must fulfil
+    # whether the victim holds more words of the command, a line for each
+    has_words: bool = False
+    # whether packages in the working folder count as installed
+    is_installed: bool = False
+
+    def read_words(self, folder: Path) -> list[str]:
+        """Return the words of the command that the victim holds."""
+        if not self.has_words:
+            return []
+        return (folder / self.victim).read_text().split("\n")
 
 
 # --- checks of what was accepted ------------------------------------------------------
@@ -202,8 +224,11 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
     for dimension in (2, 3):
         write_trajectories(folder / f"arrays-{dimension}/runs", dimension)
         write_gns(folder / f"gns-{dimension}/data", dimension)
+        write_walled_trajectories(folder / f"walls-{dimension}/runs", dimension)
     (folder / "arrays-2/describe.yaml").write_text(DESCRIPTION)
     _make_falling_split(folder, run)
+    _install_own_split(folder / "own-split")
+    (folder / "models/settings.txt").write_text("\n".join(SETTING_WORDS))
     for path in folder.glob("scored-*"):
         shutil.rmtree(path)
     (folder / "complete").touch()
@@ -266,6 +291,19 @@ def _make_falling_split(folder: Path, run: Callable[..., str]) -> None:
     shutil.rmtree(runs)
 
 
+def _install_own_split(folder: Path) -> None:
+    """Copy the example of a split of a user's own, as a package in a folder."""
+    copy_tree(EXAMPLE / "dam_break", folder / "dam_break")
+    about = folder / "dam_break-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: dam_break\nVersion: 1\n"
+    )
+    (about / "entry_points.txt").write_text(
+        "[lagbench.generators]\ndam-break = dam_break\n"
+    )
+
+
 # --- targets --------------------------------------------------------------------------
 
 
@@ -325,7 +363,13 @@ def list_targets(folder: Path) -> list[Target]:
             check=find_wrong_score,
         )
         targets.append(target)
-    return [*targets, *_board_targets(folder), *_array_targets()]
+    return [
+        *targets,
+        *_board_targets(folder),
+        *_array_targets(),
+        *_walled_targets(),
+        *_typed_targets(),
+    ]
 
 
 def _seconds_of_rollout() -> float:
@@ -521,5 +565,78 @@ def _array_targets() -> list[Target]:
             mutations=(*YAML, *YAML, *BYTES, *PLACES),
             commands=[("score", "p.nc", "--split", "own/", "-o", "scores", "-q")],
             weight=5,
+        ),
+    ]
+
+
+def _walled_targets() -> list[Target]:
+    """Return the targets on trajectories between walls, with unequal numbers."""
+    targets = []
+    boxes = {2: "0,1,0,1", 3: "0,1,0,1,0,1"}
+    for dimension in (2, 3):
+        command = (
+            *("adopt", "runs", "-o", "own", "--radius", "0.1", "-q"),
+            *("--frame-interval", "0.1", "--bounds", boxes[dimension]),
+        )
+        target = Target(
+            name=f"adopt: walls and varying numbers, {dimension}-D",
+            source=f"walls-{dimension}",
+            victim="runs/1.npz",
+            mutations=(*ARRAYS, *WALLED_ARRAYS, *WALLED_ARRAYS, *BYTES, *PLACES),
+            commands=[command],
+            weight=8,
+            check=find_wrong_values,
+        )
+        targets.append(target)
+    return targets
+
+
+def _typed_targets() -> list[Target]:
+    """Return the targets on what a user types: settings, and a split of their own."""
+    train = (
+        *("train", "--baseline", "hybrid-projection", "--split", "curl-noise"),
+        *("--size", "tiny", "--recipe", "recipe.yaml", "-o", "r", "-q"),
+    )
+    generate = ("generate", "dam-break", "--size", "tiny", "--root", "data")
+    submit = (
+        *("submit", "p.nc", "--from", "meta.yaml", "--weights", "model.onnx"),
+        *("--replace", *BOARD, "-q"),
+    )
+    return [
+        Target(
+            name="settings",
+            source="models",
+            victim="settings.txt",
+            mutations=SETTINGS,
+            commands=[train],
+            weight=12,
+            has_words=True,
+        ),
+        Target(
+            name="module of a split",
+            source="own-split",
+            victim="dam_break/__init__.py",
+            mutations=(*MODULES, *MODULES, *BYTES, *PLACES),
+            commands=[(*generate, "--dry-run"), ("list", "dam-break")],
+            weight=10,
+            is_installed=True,
+        ),
+        Target(
+            name="registry file of a split",
+            source="own-split",
+            victim="dam_break/dam_break.yaml",
+            mutations=BOARD_TEXT,
+            commands=[(*generate, "--dry-run"), ("list", "dam-break")],
+            weight=8,
+            is_installed=True,
+        ),
+        Target(
+            name="ONNX model of a new entry",
+            source="board",
+            victim="model.onnx",
+            mutations=(*ONNX, *BYTES, *PLACES),
+            commands=[submit],
+            weight=6,
+            model_seconds=_seconds_of_rollout(),
         ),
     ]

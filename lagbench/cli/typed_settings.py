@@ -1,0 +1,68 @@
+"""Settings as a user typed them: --set with blanks, or without its =."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Sequence
+
+from lagbench.errors import UsageError
+
+NEGATIVE_NUMBER = re.compile(r"-[0-9.].*")
+"""A word that begins as an option does, and is the value of a setting."""
+
+
+def advise_on_settings(words: Sequence[str]) -> str | None:
+    """Return how to write the settings of a command; None where that is no mistake.
+
+    Settings are often written with blanks around the =, without it, or without --set
+    before the second one.
+
+    >>> advise_on_settings(["train", "--set", "training.steps", "=", "10"])
+    'write settings with = and without blanks: --set training.steps=10'
+    """
+    settings: list[str] = []
+    has_mistake = False
+    is_setting = False
+    for number, word in enumerate(words):
+        if word.startswith("-") and not NEGATIVE_NUMBER.fullmatch(word):
+            is_setting = word == "--set"
+        elif not is_setting:
+            continue
+        elif words[number - 1] == "--set":
+            settings.append(word)
+        elif settings[-1].endswith("=") or word.startswith("="):
+            settings[-1] += word
+            has_mistake = True
+        elif "=" not in settings[-1]:
+            settings[-1] += f"={word}"
+            has_mistake = True
+        elif "=" in word:
+            settings.append(word)
+            has_mistake = True
+        else:
+            is_setting = False
+    if not has_mistake:
+        return None
+    options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
+    return f"write settings with = and without blanks: {options}"
+
+
+def check_typed_settings(words: Sequence[str]) -> None:
+    """Refuse a setting without its =, whose value looks like an argument.
+
+    Raises:
+        UsageError: there is one.
+    """
+    for number, word in enumerate(words[1:], start=1):
+        is_setting = words[number - 1] == "--set"
+        if is_setting and "=" not in word and not word.startswith("-"):
+            following = " ".join(words[number + 1 : number + 2])
+            raise UsageError(
+                "a setting has no =",
+                where="--set",
+                expected="--set KEY=VALUE",
+                got=f"--set {word} {following}".rstrip(),
+                fix=advise_on_settings(words)
+                or f"write its value behind a =: --set {word}=VALUE",
+            )

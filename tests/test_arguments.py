@@ -1,0 +1,250 @@
+"""Public functions refuse arguments of a wrong kind in one way."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lagbench
+from lagbench import exchange, submission
+from lagbench import torch as lagbench_torch
+from lagbench.arguments import (
+    ALIASES,
+    UNCHECKED,
+    check_argument,
+    check_arguments,
+    list_members,
+)
+from lagbench.errors import UsageError
+from lagbench.models.export import export_onnx
+from lagbench.models.registered import build_registered, export_safetensors
+
+PUBLIC_MODULES = (lagbench, exchange, submission, lagbench_torch)
+
+WITHOUT_ARGUMENTS = {"list_splits"}
+
+INTERNAL = {
+    "Batch",
+    "Header",
+    "Predictions",
+    "TemplateResult",
+    "ValidationIssue",
+    "ValidationResult",
+    "Window",
+    "collate",
+    "tensors",
+}
+"""What users receive and do not make, and what a DataLoader calls."""
+
+
+def list_public_functions() -> dict[str, Callable[..., Any]]:
+    """Return the functions, and classes to construct, that users call."""
+    functions: dict[str, Callable[..., Any]] = {
+        "export_onnx": export_onnx,
+        "build_registered": build_registered,
+        "export_safetensors": export_safetensors,
+    }
+    for module in PUBLIC_MODULES:
+        for name in module.__all__:
+            value = getattr(module, name)
+            is_made = inspect.isfunction(value) or inspect.isclass(value)
+            is_enum = inspect.isclass(value) and hasattr(value, "__members__")
+            if is_made and not is_enum and name not in INTERNAL | WITHOUT_ARGUMENTS:
+                functions[name] = value
+    return functions
+
+
+FUNCTIONS = list_public_functions()
+
+
+def list_parameters() -> list[tuple[str, str]]:
+    """Return functions and the names of their parameters that have a kind."""
+    pairs = []
+    for name, function in FUNCTIONS.items():
+        for parameter in inspect.signature(function).parameters.values():
+            if parameter.kind is inspect.Parameter.VAR_KEYWORD:
+                continue
+            if UNCHECKED.isdisjoint(list_members(str(parameter.annotation))):
+                pairs.append((name, parameter.name))
+    return pairs
+
+
+class Wrong:
+    """A value of no kind that a function takes."""
+
+    def __repr__(self) -> str:
+        """Return what messages say of it."""
+        return "<wrong>"
+
+
+def placeholder(annotation: str) -> Any:
+    """Return a value of the first kind of an annotation."""
+    kind = list_members(annotation)[0].partition("[")[0]
+    values: dict[str, Any] = {"str": "cavity", "int": 1, "Callable": print}
+    if kind in values:
+        return values[kind]
+    return type(kind, (), {})()
+
+
+@pytest.mark.parametrize(("name", "wrong"), list_parameters())
+def test_each_parameter_of_public_functions_has_a_checked_kind(
+    name: str, wrong: str
+) -> None:
+    """Before any work, the message names the function and the argument."""
+    function = FUNCTIONS[name]
+    arguments: dict[str, Any] = {}
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name == wrong:
+            arguments[wrong] = Wrong()
+            break
+        if parameter.default is inspect.Parameter.empty:
+            arguments[parameter.name] = placeholder(str(parameter.annotation))
+    for parameter in inspect.signature(function).parameters.values():
+        is_needed = parameter.default is inspect.Parameter.empty
+        is_named = parameter.kind is not inspect.Parameter.VAR_KEYWORD
+        if is_needed and is_named and parameter.name not in arguments:
+            arguments[parameter.name] = None
+
+    with pytest.raises(UsageError) as caught:
+        function(**arguments)
+    error = caught.value
+    assert error.where == f"{name}, {wrong}"
+    assert error.expected
+    assert error.got == "<wrong>"
+    assert error.fix
+
+
+@pytest.mark.parametrize(
+    ("call", "where", "fix"),
+    [
+        (lambda: lagbench.score(3), "score, predictions", 'predictions="..."'),
+        (lambda: lagbench.compare("p.nc", 3), "compare, second", 'second="..."'),
+        (
+            lambda: lagbench.generate("cavity", "tiny", subset=3),
+            "generate, subset",
+            "leave subset out",
+        ),
+        (
+            lambda: lagbench.generate("cavity", "tiny", scenarios=3),
+            "generate, scenarios",
+            "put it into brackets: scenarios=[3]",
+        ),
+        (
+            lambda: lagbench.verify("cavity", "tiny", regenerate="1"),
+            "verify, regenerate",
+            "without quotes: regenerate=1",
+        ),
+        (
+            lambda: lagbench.verify("cavity", "tiny", regenerate=True),
+            "verify, regenerate",
+            "such a value: regenerate=2",
+        ),
+        (
+            lambda: lagbench.verify("cavity", "tiny", complete="no"),
+            "verify, complete",
+            "complete=True",
+        ),
+        (
+            lambda: lagbench.score("p.nc", extras="transport"),
+            "score, extras",
+            "brackets: extras=['transport']",
+        ),
+        (
+            lambda: lagbench.open_split("cavity", subset=None),
+            "open_split, subset",
+            'subset="..."',
+        ),
+        (lambda: lagbench_torch.WindowDataset(3), "WindowDataset, split", "split="),
+        (
+            lambda: lagbench_torch.WindowDataset("cavity", history=True),
+            "WindowDataset, history",
+            "history=2",
+        ),
+        (
+            lambda: lagbench.windows("cavity", future=2.0),
+            "windows, future",
+            "write future=2, not future=2.0",
+        ),
+        (
+            lambda: lagbench.submission.write("p.nc", {}, split=3, method="m"),
+            "write, split",
+            "split=",
+        ),
+    ],
+)
+def test_arguments_of_a_wrong_kind_are_usage_errors(
+    call: Callable[[], Any], where: str, fix: str
+) -> None:
+    """They were a bare TypeError or AttributeError of Python."""
+    with pytest.raises(UsageError) as caught:
+        call()
+    assert caught.value.where == where
+    assert fix in str(caught.value.fix)
+
+
+@pytest.mark.parametrize(
+    ("value", "annotation"),
+    [
+        (np.int64(3), "int"),
+        (np.float32(3), "float"),
+        (3, "float"),
+        (10**400, "float"),
+        (np.True_, "bool"),
+        (Path("a"), "str | Path"),
+        (range(3), "Scenarios"),
+        (np.arange(3), "Scenarios"),
+        (iter([3]), "Scenarios"),
+        (("train", "valid"), "Selection"),
+        (print, "Callable[[int], None] | None"),
+    ],
+)
+def test_values_of_the_right_kind_are_accepted(value: object, annotation: str) -> None:
+    """Numbers of NumPy count as numbers; items of an iterator are not consumed."""
+    check_argument("name", value, annotation, where="function")
+
+
+@pytest.mark.parametrize(
+    ("value", "annotation"),
+    [
+        (True, "int"),
+        (np.True_, "int"),
+        (True, "float"),
+        ("3", "int | None"),
+        (b"a", "str | Path"),
+        (1, "bool"),
+        ([3], "Selection"),
+        ([True], "Scenarios"),
+    ],
+)
+def test_values_of_a_wrong_kind_are_refused(value: object, annotation: str) -> None:
+    """True is no number, and a list is no better than what it holds."""
+    with pytest.raises(UsageError):
+        check_argument("name", value, annotation, where="function")
+
+
+def test_calls_that_do_not_fit_raise_the_error_of_python() -> None:
+    """An unknown or missing argument is told with the name of the function."""
+
+    @check_arguments
+    def draw(split: str) -> str:
+        return split
+
+    call: Any = draw
+    with pytest.raises(TypeError, match=r"draw\(\) got an unexpected keyword"):
+        call("cavity", colour="red")
+    with pytest.raises(TypeError, match=r"draw\(\) missing 1 required"):
+        call()
+    assert call("cavity") == "cavity"
+
+
+def test_aliases_are_those_of_the_modules() -> None:
+    """The texts of selections are written once more here, so they are compared."""
+    from lagbench.make import plan
+
+    assert str(plan.Selection).replace("collections.abc.", "") == ALIASES["Selection"]
+    assert str(plan.Scenarios).replace("collections.abc.", "") == ALIASES["Scenarios"]
