@@ -26,7 +26,7 @@ from .cli.commands import (
     SEASON_COMMANDS,
     CommandEntry,
 )
-from .cli.typed_settings import NEGATIVE_NUMBER, advise_on_settings
+from .cli.typed_settings import NEGATIVE_NUMBER, advise_on_lists, advise_on_settings
 from .errors import (
     LagbenchError,
     UnreadableFileError,
@@ -77,6 +77,11 @@ _UNREADABLE_PATH = re.compile(r"'(.+)' is not readable")
 
 _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
 """What click says of words that are neither arguments nor options."""
+
+_DECIMAL_COMMA = re.compile(r"[0-9]+,[0-9]+")
+
+SIZE_NAMES = frozenset({"tiny", "mini", "full"})
+"""Names of sizes that a user may write behind the split."""
 
 MOST_LETTERS = 60  # of a word of the command line in a message
 
@@ -243,6 +248,9 @@ def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN4
     possible = ", ".join(error.possibilities or ())
     if possible:
         fix = f"did you mean {possible}? {fix}"
+    if command == "lagbench train":
+        setting = "--set training.steps=100"
+        fix = f"the values of a recipe follow --set, as in {setting}; {fix}"
     # The value of a setting may be a negative number.
     if NEGATIVE_NUMBER.fullmatch(error.option_name):
         fix = advise_on_settings(sys.argv) or fix
@@ -281,13 +289,18 @@ def _bad_parameter_error(error: Any, command: str) -> LagbenchError:  # noqa: AN
             got="no permission to read it",
             fix="see who owns it, or name another",
         )
+    name = _parameter_name(error)
     detail = _first_detail(error)
+    fix = f"give another value; {_name_help(command)}"
+    if detail and _DECIMAL_COMMA.fullmatch(str(detail["input"])):
+        number = str(detail["input"]).replace(",", ".")
+        fix = f"write a decimal point: {name} {number}"
     return UsageError(
-        f"{_parameter_name(error)} has a value that does not fit",
+        f"{name} has a value that does not fit",
         where=command,
         expected=describe_expectation(detail) if detail else str(error.message),
         got=_quote_word(repr(detail["input"])) if detail else None,
-        fix=f"give another value; {_name_help(command)}",
+        fix=fix,
     )
 
 
@@ -319,12 +332,15 @@ def _extra_words_error(
     """Return the error for words that are neither arguments nor options."""
     usage = " ".join([command, *context.command.collect_usage_pieces(context)])
     fix = f"leave them out, or put quotes around a text with blanks; `{command} --help`"
+    size_names = SIZE_NAMES.intersection(words.split())
+    if size_names:
+        fix = f"name the size by an option: --size {min(size_names)}"
     return UsageError(
         "too many words",
         where=command,
         expected=usage,
         got=_quote_word(words),
-        fix=advise_on_settings(sys.argv) or fix,
+        fix=advise_on_lists(sys.argv) or advise_on_settings(sys.argv) or fix,
     )
 
 

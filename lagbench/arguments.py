@@ -265,10 +265,10 @@ def _suggest_value(name: str, value: object, members: Sequence[str]) -> str:
         if _NUMBER.fullmatch(value):
             return f"give a number without quotes: {name}={value}"
         return f"give a number without quotes, as in {name}={example}"
-    if "int" in members and isinstance(value, numbers.Real):
-        is_integral = not isinstance(value, bool) and float(value).is_integer()
-        if is_integral:
-            return f"write {name}={int(value)}, not {name}={value}"
+    if "int" in members and _is_number(value):
+        number: Any = value
+        if float(number).is_integer():
+            return f"write {name}={int(number)}, not {name}={number}"
     for member in members:
         if any(kind.accepts(value) for kind in _item_kinds(member)):
             return f"put it into brackets: {name}=[{reprlib.repr(value)}]"

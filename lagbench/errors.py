@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import os
 import re
 import stat
 import sys
@@ -48,6 +49,9 @@ MOST_NAMES = 30
 
 FIRST_NAMES = 5
 """Names that a hint lists where there are more, and none is near."""
+
+MOST_FILES = 10_000
+"""Files of a folder whose names are compared with a wrong one."""
 
 PATIENCE = 20.0
 """Time that the import of a package's module may take before a line names it [s]."""
@@ -290,7 +294,8 @@ def check_regular(
             where=str(path),
             expected="a readable file",
             got="nothing",
-            fix="check the path: relative ones start in the working folder",
+            fix=suggest_file(path)
+            or "check the path: relative ones start in the working folder",
         ) from error
     except (OSError, ValueError) as error:
         raise UnreadableFileError(
@@ -321,6 +326,22 @@ def check_regular(
             fix=fix or "name a file that lagbench wrote",
         )
     return status.st_size
+
+
+def suggest_file(path: Path) -> str | None:
+    """Return a hint that names the file of the same folder with the nearest name.
+
+    None where the folder holds no such file.
+    """
+    names = []
+    with suppress(OSError, ValueError):
+        names = os.listdir(path.parent)
+    if len(names) > MOST_FILES:
+        return None
+    close_names = difflib.get_close_matches(path.name, sorted(names), n=1, cutoff=0.75)
+    if not close_names:
+        return None
+    return f"did you mean {path.with_name(close_names[0])}?"
 
 
 def format_count(number: int, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""Settings as a user typed them: --set with blanks, or without its =."""
+"""What a user typed: settings and lists with blanks in them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from lagbench.errors import UsageError
 
 NEGATIVE_NUMBER = re.compile(r"-[0-9.].*")
 """A word that begins as an option does, and is the value of a setting."""
+
+LIST_OPTIONS = ("--subset", "--scenarios", "--bounds", "--periodic")
+"""Options that take several values in one word."""
 
 
 def advise_on_settings(words: Sequence[str]) -> str | None:
@@ -46,6 +49,25 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
         return None
     options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
     return f"write settings with = and without blanks: {options}"
+
+
+def advise_on_lists(words: Sequence[str]) -> str | None:
+    """Return how to write a list that was typed with blanks; None where there is none.
+
+    >>> advise_on_lists(["generate", "cavity", "--subset", "train", "valid"])
+    'write several values with commas: --subset train,valid'
+    """
+    for number, word in enumerate(words):
+        if word not in LIST_OPTIONS:
+            continue
+        values = []
+        for value in words[number + 1 :]:
+            if value.startswith("-") and not NEGATIVE_NUMBER.fullmatch(value):
+                break
+            values.append(value.strip(","))
+        if len(values) > 1:
+            return f"write several values with commas: {word} {','.join(values)}"
+    return None
 
 
 def check_typed_settings(words: Sequence[str]) -> None:

@@ -60,12 +60,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     valid = work / "valid"
     make_valid_files(valid, options.root, REPOSITORY / "leaderboard")
     targets = list_targets(valid)
-    if options.valid:
-        return _try_valid_files(targets, valid, work)
     if options.target:
         targets = [target for target in targets if target.name in options.target]
         if not targets:
             raise SystemExit("no such target")
+    if options.valid:
+        return _try_valid_files(targets, valid, work)
     plan = _plan(targets, options.seed)
 
     numbers: Sequence[int] = range(options.first, options.first + options.cases)

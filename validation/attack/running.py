@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data import registry
 from lagbench.data.layout import NOTES_NAME
 from lagbench.work.machine import available_cores
 
@@ -70,7 +71,9 @@ def run_command(
     process = os.fork()
     if process == 0:
         if is_installed:
+            # what this process knows of installed packages is known no more
             sys.path.insert(0, str(folder))
+            registry._load.cache_clear()
         _become_command(arguments, folder, logs)
     code: int | None = None
     is_late = False
