@@ -247,7 +247,7 @@ def check_name(name: str) -> None:
         where="--output, its last part",
         expected="small letters, digits, - and _, a letter first",
         got=name,
-        fix=f"--output {proposal}",
+        fix=f"name it so: --output {proposal}",
     )
 
 
