@@ -229,7 +229,7 @@ HINTS = {
     "generate cavity tiny": "fix: name the size by an option: --size tiny",
     "generate cavity --subset train valid": "with commas: --subset train,valid",
     "verify cavity --scenarios 1, 2": "with commas: --scenarios 1,2",
-    f"{ADOPT} runs.npy --bounds 0,1, 0,1": "with commas: --bounds 0,1,0,1",
+    f"{ADOPT} runs.npy --bounds 0,1, 0,1": "with commas and without blanks",
     "score goood.nc": "did you mean ",
     "score good.nc nan.nc": "lagbench compare",
     f"{TRAIN} gns --set model.latent": "--set model.latent=VALUE",
