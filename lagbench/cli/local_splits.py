@@ -224,7 +224,8 @@ def _parse_bounds(text: str) -> tuple[tuple[float, float], ...]:
             where="--bounds",
             expected="x0,x1,y0,y1, as in 0,2,0,1; and z0,z1 in three dimensions",
             got=ascii(text),
-            fix="give the lowest and the highest position along each axis, with commas and without blanks",
+            fix="give the lowest and the highest position along each axis, with commas "
+            "and without blanks",
         ) from None
     return tuple(zip(ends[::2], ends[1::2], strict=True))
 
