@@ -333,7 +333,7 @@ def suggest_file(path: Path) -> str | None:
 
     None where the folder holds no such file.
     """
-    names = []
+    names: list[str] = []
     with suppress(OSError, ValueError):
         names = os.listdir(path.parent)
     if len(names) > MOST_FILES:
