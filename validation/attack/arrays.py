@@ -212,7 +212,7 @@ def wrong_walls(path: Path, rng: np.random.Generator) -> None:
 
     def change(arrays: Arrays) -> None:
         walls = arrays["wall_velocity"]
-        choices = (
+        choices: tuple[NDArray[Any], ...] = (
             walls * np.nan,
             walls + np.inf,
             walls + 1e30,
@@ -221,7 +221,7 @@ def wrong_walls(path: Path, rng: np.random.Generator) -> None:
             walls[..., :-1],
             walls[0],
             walls.astype("U8"),
-            np.float32(1.0),
+            np.ones((), np.float32),
         )
         arrays["wall_velocity"] = choices[kind]
 
