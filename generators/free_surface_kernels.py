@@ -49,6 +49,7 @@ class FreeSurfaceKernels:
         self.dx = 1.0 / p.grid
         self.dt = p.dt
         self.width = p.grid + 1  # nodes along an axis
+        self.node_count = self.width**self.dimension
         self.low = p.wall
         self.high = p.grid - p.wall
         # smallest and largest coordinate of a particle
@@ -94,7 +95,7 @@ class FreeSurfaceKernels:
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
         particle_shape = (self.scenarios, self.parameters.particles)
-        node_shape = (self.scenarios, self.width**self.dimension)
+        node_shape = (self.scenarios, self.node_count)
         particle_fields = (
             self.x,
             self.carried,

@@ -91,6 +91,7 @@ class NodalStress:
         self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
         self.inv_dx = float(p.grid)
         self.width = p.grid + 1
+        self.node_count = self.width**2
         self.dt = p.dt
         self.least = (p.wall + 0.5 + _INSET) * dx  # smallest coordinate of a particle
         # largest coordinate of a particle
@@ -157,7 +158,7 @@ class NodalStress:
             self.total,
         )
         particle_shape = (self.scenarios, self.parameters.particles)
-        node_shape = (self.scenarios, self.width**2)
+        node_shape = (self.scenarios, self.node_count)
         scenario_fields = [self.walls.speed, self.spread, self.fill]
         return backend.place(
             *((particle_shape, [field]) for field in particle_fields),
@@ -192,7 +193,7 @@ class NodalStress:
     @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.rows, s, p)
+        base, offset = base_node(self.rows, s, p, self.node_count)
         scale = ti.Vector(
             [
                 self.velocity_scale,
@@ -314,7 +315,7 @@ class NodalStress:
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
         """Interpolate (v, r, Jbar), their slopes and dt a."""
-        base, offset = base_node(self.rows, s, p)
+        base, offset = base_node(self.rows, s, p, self.node_count)
         here = ti.Vector([0.0, 0.0, 0.0, 0.0])
         gain = ti.Vector([0.0, 0.0])
         slope_x = here
@@ -410,7 +411,7 @@ class NodalStress:
                 self.mirror(self.moved, 0, k)
                 self.mirror_gain(0, k)
             if average:
-                for n in range(self.width**2):
+                for n in range(self.node_count):
                     self.sum_velocity(0, n)
             for p in range(self.parameters.particles):
                 self.g2p(0, p)
@@ -448,7 +449,7 @@ class NodalStress:
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
-        self._restart_extremes(self.parameters.particles, self.width**2)
+        self._restart_extremes(self.parameters.particles, self.node_count)
 
     @ti.kernel
     def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:

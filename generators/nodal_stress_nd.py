@@ -46,6 +46,7 @@ from .transfer import (
     fixed_point_scale,
     from_fixed,
     largest,
+    node_number,
     shifted,
     spline_weights,
     stepped,
@@ -363,7 +364,7 @@ class NodalStressND:
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
         spot = self.spot[s, p]
-        lowest = ti.bit_cast(spot[3], ti.i32)
+        lowest = node_number(spot[3], self.tables.node_count)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         slope_x, slope_y, slope_z = self.load_along(self.slopes, s, p)
         # Weights carry the scale of n and J, so that v lacks the rest of its own. All
@@ -521,7 +522,7 @@ class NodalStressND:
     def g2p_flat(self, s: ti.i32, p: ti.i32) -> None:
         """Interpolate in two dimensions, node by node as :mod:`.nodal_stress` does."""
         spot = self.spot[s, p]
-        lowest = ti.bit_cast(spot[3], ti.i32)
+        lowest = node_number(spot[3], self.tables.node_count)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         here = ti.Vector([0.0, 0.0, 0.0, 0.0])
         push = here
@@ -550,7 +551,7 @@ class NodalStressND:
         particle's place among the 27 nodes, and the number of the lowest one.
         """
         spot = self.spot[s, p]
-        lowest = ti.bit_cast(spot[3], ti.i32)
+        lowest = node_number(spot[3], self.tables.node_count)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         here = ti.Vector([0.0, 0.0, 0.0, 0.0])
         push = here

@@ -146,7 +146,7 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.rows, s, p)
+        base, offset = base_node(self.rows, s, p, self.node_count)
         scale = ti.Vector(
             [
                 self.velocity_scale,
@@ -231,7 +231,7 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
         """Gather (v, r, Jbar) and their slopes."""
-        base, offset = base_node(self.rows, s, p)
+        base, offset = base_node(self.rows, s, p, self.node_count)
         here = ti.Vector.zero(ti.f32, 4)
         slope_x = here
         slope_y = here

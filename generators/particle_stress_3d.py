@@ -23,6 +23,7 @@ from .transfer import (
     accumulate,
     bounded,
     from_fixed,
+    node_number,
     spline_weights,
     stepped,
     to_fixed,
@@ -171,7 +172,7 @@ class ParticleStress3D(FreeSurfaceKernels):
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
         spot = self.spot[s, p]
-        lowest = ti.bit_cast(spot[3], ti.i32)
+        lowest = node_number(spot[3], self.node_count)
         a_x = self.pull[0][s, p]
         a_y = self.pull[1][s, p]
         a_z = self.pull[2][s, p]
@@ -285,7 +286,7 @@ class ParticleStress3D(FreeSurfaceKernels):
     def g2p(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Gather v, Jbar and r with the slopes of v; move the particle, update J."""
         spot = self.spot[s, p]
-        lowest = ti.bit_cast(spot[3], ti.i32)
+        lowest = node_number(spot[3], self.node_count)
         weight_x = self.weights[0][s, p]
         weight_y = self.weights[1][s, p]
         weight_z = self.weights[2][s, p]

@@ -95,14 +95,26 @@ def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
 
 
 @ti.func
-def base_node(rows: Template, s: ti.i32, p: ti.i32) -> Value:
+def base_node(rows: Template, s: ti.i32, p: ti.i32, node_count: Template) -> Value:
     """Return a particle's base node and its offset from the middle node [cells].
 
     Both stand in its stencil, see :func:`stencil`.
     """
-    base = ti.bit_cast(rows[0][s, p][3], ti.i32)
+    base = node_number(rows[0][s, p][3], node_count)
     offset = ti.Vector([rows[1][s, p][3], rows[2][s, p][3]])
     return base, offset
+
+
+@ti.func
+def node_number(bits: ti.f32, node_count: Template) -> Value:
+    """Return the number of a node, below ``node_count``, from a float with its bits.
+
+    The mask changes no such number. It tells LLVM that the numbers of the neighbours do
+    not overflow either: their addresses are then one address plus constants. Without it
+    each address is computed anew.
+    """
+    mask = ti.static((1 << node_count.bit_length()) - 1)
+    return ti.bit_cast(bits, ti.i32) & mask
 
 
 @ti.func
