@@ -6,7 +6,10 @@ checks the other commit out beside this one, runs both alternately in processes 
 own and prints, per split, the particle-substeps per second of processor time (best of
 the rounds) of both and their ratio. ``lagbench bench solver`` times frames as
 generation makes them, with the checks and the positions read out after each; the row
-``kernels`` is ``whole_frame.py``, substeps alone.
+``kernels`` is ``whole_frame.py``, substeps alone. ``--cases`` names rows, also those of
+other splits that both commits have::
+
+    python benchmarks/solver_against.py --against main~20 --cases curl-noise-3d fluid-3d
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from typing import Any
 from lagbench.baselines.machine import hardware
 
 HERE = Path(__file__).resolve().parent.parent
-SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
+CASES = ("kernels", "cavity", "curl-noise", "fluid", "multimaterial")
 
 
 def on_one_core(tree: Path, *arguments: str, **variables: str) -> str:
@@ -80,6 +83,7 @@ def main() -> int:
     parser.add_argument("--against", required=True, metavar="REV")
     parser.add_argument("--size", default="mini")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--cases", nargs="+", default=CASES, metavar="CASE")
     options = parser.parse_args()
     print(
         f"{hardware()['processor']}, size {options.size}; M particle-substeps/s of "
@@ -87,7 +91,7 @@ def main() -> int:
     )
     print(f"| case | {options.against} | this tree | ratio |\n|---|---|---|---|")
     with checked_out(options.against) as other:
-        for case in ("kernels", *SPLITS):
+        for case in options.cases:
             best = dict.fromkeys((other, HERE), 0.0)
             for _ in range(options.rounds):
                 for tree, so_far in best.items():
