@@ -96,6 +96,8 @@ class FreeSurfaceKernels:
         """Give the fields their memory, each an array of its own."""
         particle_shape = (self.scenarios, self.parameters.particles)
         node_shape = (self.scenarios, self.node_count)
+        # Two more: a node counts the rows of the two nodes before it as well.
+        row_shape = (self.scenarios, self.node_count + 2)
         particle_fields = (
             self.x,
             self.carried,
@@ -107,6 +109,7 @@ class FreeSurfaceKernels:
         backend.place(
             *((particle_shape, [field]) for field in particle_fields),
             *((node_shape, [field]) for field in self._node_fields()),
+            *((row_shape, [field]) for field in self._row_fields()),
             ((self.scenarios,), [self.fill, self.friction]),
         )
 
@@ -131,6 +134,10 @@ class FreeSurfaceKernels:
     def _node_fields(self) -> tuple[ti.Field, ...]:
         """Return the fields of nodes."""
         raise NotImplementedError
+
+    def _row_fields(self) -> tuple[ti.Field, ...]:
+        """Return the fields of rows of three nodes."""
+        return ()
 
     @ti.func
     def touched_nodes(self, particles: ti.i32) -> Value:

@@ -42,12 +42,13 @@ from .transfer import (
     Nothing,
     Template,
     Value,
+    add_shifted,
     bounded,
     fixed_point_scale,
     from_fixed,
     largest,
     node_number,
-    shifted,
+    row_count,
     spline_weights,
     stepped,
 )
@@ -349,18 +350,6 @@ class NodalStressND:
         return number
 
     @ti.func
-    def add(self, sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4) -> None:
-        """Add contributions, times their scales, and the bits of the shift.
-
-        :func:`settle` takes the shifts off.
-        """
-        if ti.static(self.atomic):
-            ti.atomic_add(sums[node], shifted(scaled))
-        else:
-            # Even in serial code `+=` is an atomic.
-            sums[node] = sums[node] + shifted(scaled)
-
-    @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
         spot = self.spot[s, p]
@@ -391,20 +380,16 @@ class NodalStressND:
                 along = c_z
             for k in ti.static(range(3)):
                 share = shares[k] * stepped(value, along, k - 1)
-                self.add(self.sums, ti.Vector([s, start + k]), share)
+                add_shifted(self.sums, ti.Vector([s, start + k]), share, self.atomic)
             # The fourth share is 0, so that the fourth sum counts shifts.
-            self.add(self.rows, ti.Vector([s, start + 2]), shares)
+            add_shifted(self.rows, ti.Vector([s, start + 2]), shares, self.atomic)
 
     @ti.func
     def settle(self, s: ti.i32, n: ti.i32) -> None:
         """Take the shifts off a node's sums, and add up its n from three rows."""
-        first = self.rows[s, n + 2]
-        second = self.rows[s, n + 1]
-        third = self.rows[s, n]
-        # as many shifts as particles touch the node
-        shifts = first[3] + second[3] + third[3]
+        count, shifts = row_count(self.rows, s, n)
         self.sums[s, n] = self.sums[s, n] - shifts
-        self.count[s, n] = (first[0] + second[1] + third[2]) - shifts
+        self.count[s, n] = count
 
     @ti.func
     def image_sign(self, k: Template) -> Value:

@@ -20,13 +20,13 @@ from .transfer import (
     Nothing,
     Template,
     Value,
-    accumulate,
+    add_shifted,
     bounded,
     from_fixed,
     node_number,
+    row_count,
     spline_weights,
     stepped,
-    to_fixed,
 )
 
 _AXES = (0, 1, 2)
@@ -55,16 +55,23 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.weights = [ti.Vector.field(4, ti.f32) for _ in _AXES]
         # offset from the middle node [cells], and the bits of the lowest node's number
         self.spot = ti.Vector.field(4, ti.f32)
+        # v and Jbar of the nodes at the particles
+        self.here = ti.Vector.field(4, ti.f32)
+        self.density = ti.field(ti.f32)  # r of the nodes at the particles
         self.sums = ti.Vector.field(4, ti.i64)  # n v, n J
-        self.count = ti.field(ti.i64)  # n
-        self.node = ti.Vector.field(4, ti.f32)  # v, Jbar
-        self.density = ti.field(ti.f32)  # r
+        self.rows = ti.Vector.field(4, ti.i64)  # n of three nodes in a row
+        # v, Jbar, r and three zeros: one address for what G2P reads
+        self.node = ti.Vector.field(8, ti.f32)
 
     def _particle_fields(self) -> tuple[ti.Field, ...]:
-        return *self.f, *self.pull, *self.weights, self.spot
+        single_fields = (self.spot, self.here, self.density)
+        return *self.f, *self.pull, *self.weights, *single_fields
 
     def _node_fields(self) -> tuple[ti.Field, ...]:
-        return self.sums, self.count, self.node, self.density
+        return self.sums, self.node
+
+    def _row_fields(self) -> tuple[ti.Field, ...]:
+        return (self.rows,)
 
     # The phases: each function is one phase at one particle or node.
 
@@ -77,7 +84,11 @@ class ParticleStress3D(FreeSurfaceKernels):
     def clear(self, s: ti.i32, n: ti.i32) -> None:
         """Set the sums of a node to zero, before P2G adds to them."""
         self.sums[s, n] = ti.Vector.zero(ti.i64, 4)
-        self.count[s, n] = ti.i64(0)
+
+    @ti.func
+    def clear_row(self, s: ti.i32, n: ti.i32) -> None:
+        """Set the sums of the row that ends at a node to zero."""
+        self.rows[s, n] = ti.Vector.zero(ti.i64, 4)
 
     @ti.func
     def locate(self, s: ti.i32, p: ti.i32) -> None:
@@ -193,22 +204,13 @@ class ParticleStress3D(FreeSurfaceKernels):
             share = weight_x[i] * weight_y[j]
             row_value = stepped(stepped(middle, a_x, i - 1), a_y, j - 1)
             row = lowest + (i * self.width + j) * self.width
+            weights = share * weight_z
             for k in ti.static(range(3)):
-                weight = share * weight_z[k]
-                value = stepped(row_value, a_z, k - 1)
-                node = ti.Vector([s, row + k])
-                accumulate(self.sums, node, weight * value, self.atomic)
-                self.add_count(node, weight)
-
-    @ti.func
-    def add_count(self, node: ti.math.ivec2, weight: ti.f32) -> None:
-        """Add a weight to n of a node."""
-        scaled = to_fixed(self.count_scale * weight)
-        if ti.static(self.atomic):
-            ti.atomic_add(self.count[node], scaled)
-        else:
-            # Even in serial code `+=` is an atomic.
-            self.count[node] = self.count[node] + scaled
+                value = weights[k] * stepped(row_value, a_z, k - 1)
+                add_shifted(self.sums, ti.Vector([s, row + k]), value, self.atomic)
+            # The fourth weight is 0, so that the fourth sum counts shifts.
+            counts = self.count_scale * weights
+            add_shifted(self.rows, ti.Vector([s, row + 2]), counts, self.atomic)
 
     @ti.func
     def update(
@@ -224,9 +226,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         number = self.at(i, j, k)
         state = ti.Vector([0.0, 0.0, 0.0, 1.0])
         density = 0.0
-        if self.count[s, number] > 0:
-            n = from_fixed(self.count[s, number], self.count_unit)
-            total = self.sums[s, number]
+        count, shifts = row_count(self.rows, s, number)
+        if count > 0:
+            n = from_fixed(count, self.count_unit)
+            total = self.sums[s, number] - shifts
             u = from_fixed(total[0], self.velocity_unit) / n
             v = from_fixed(total[1], self.velocity_unit) / n - self.fall
             w = from_fixed(total[2], self.velocity_unit) / n
@@ -235,10 +238,11 @@ class ParticleStress3D(FreeSurfaceKernels):
             v, w, u = self.contact(j, v, w, u, friction)
             w, u, v = self.contact(k, w, u, v, friction)
             state = ti.Vector([u, v, w, jacobian])
-            count = self.mirrored_count(s, i, j, k)
-            density = from_fixed(count, self.count_unit) * fill
-        self.node[s, number] = state
-        self.density[s, number] = density
+            mirrored = self.mirrored_count(s, i, j, k)
+            density = from_fixed(mirrored, self.count_unit) * fill
+        self.node[s, number] = ti.Vector(
+            [state[0], state[1], state[2], state[3], density, 0.0, 0.0, 0.0]
+        )
 
     @ti.func
     def contact(
@@ -279,12 +283,13 @@ class ParticleStress3D(FreeSurfaceKernels):
             place_y = ti.select(b == 1, images[1], j)
             place_z = ti.select(c == 1, images[2], k)
             if place_x >= 0 and place_y >= 0 and place_z >= 0:
-                count += self.count[s, self.at(place_x, place_y, place_z)]
+                number = self.at(place_x, place_y, place_z)
+                count += row_count(self.rows, s, number)[0]
         return count
 
     @ti.func
-    def g2p(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
-        """Gather v, Jbar and r with the slopes of v; move the particle, update J."""
+    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+        """Gather v, Jbar and r with the slopes of v."""
         spot = self.spot[s, p]
         lowest = node_number(spot[3], self.node_count)
         weight_x = self.weights[0][s, p]
@@ -300,28 +305,24 @@ class ParticleStress3D(FreeSurfaceKernels):
             row = lowest + (i * self.width + j) * self.width
             for k in ti.static(range(3)):
                 weight = share * weight_z[k]
-                part = weight * self.node[s, row + k]
+                node = self.node[s, row + k]
+                part = weight * node[:4]
                 here += part
                 slope_x += ((i - 1.0) - spot[0]) * part
                 slope_y += ((j - 1.0) - spot[1]) * part
                 slope_z += ((k - 1.0) - spot[2]) * part
-                density += weight * self.density[s, row + k]
+                density += weight * node[4]
         gradient = 4.0 * self.inv_dx
         self.slopes[0][s, p] = gradient * slope_x
         self.slopes[1][s, p] = gradient * slope_y
         self.slopes[2][s, p] = gradient * slope_z
-        self.flow(s, p, here, density, solid)
+        self.here[s, p] = here
+        self.density[s, p] = density
 
     @ti.func
-    def flow(
-        self,
-        s: ti.i32,
-        p: ti.i32,
-        here: ti.math.vec4,
-        density: ti.f32,
-        solid: Template,
-    ) -> None:
+    def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Move a particle with the grid, and update J of a liquid."""
+        here = self.here[s, p]
         x = ti.Vector([0.0, 0.0, 0.0])
         speed = 0.0
         for axis in ti.static(_AXES):
@@ -337,7 +338,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         )
         j = old + self.dt * divergence * old
         j += self.parameters.jacobian_relaxation * (here[3] - old)
-        j += self.parameters.density_coupling * (1.0 / larger(density, 1.0) - j)
+        volume = 1.0 / larger(self.density[s, p], 1.0)
+        j += self.parameters.density_coupling * (volume - j)
         j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
         ratio = j
         spread = j
@@ -436,6 +438,9 @@ class ParticleStress3D(FreeSurfaceKernels):
                 for j in range(first[1], last[1]):
                     for k in range(first[2], last[2]):
                         self.clear(0, self.at(i, j, k))
+                    # The nodes at the end lie in rows that end two nodes behind.
+                    for k in range(first[2], last[2] + 2):
+                        self.clear_row(0, self.at(i, j, k))
             for p in range(particles):
                 self.locate(0, p)
             for p in range(particles):
@@ -447,7 +452,9 @@ class ParticleStress3D(FreeSurfaceKernels):
                     for k in range(first[2], last[2]):
                         self.update(0, i, j, k, fill, friction)
             for p in range(particles):
-                self.g2p(0, p, solid)
+                self.g2p(0, p)
+            for p in range(particles):
+                self.flow(0, p, solid)
             if ti.static(solid):
                 for p in range(particles):
                     self.deform(0, p)
@@ -463,6 +470,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         ti.loop_config(parallelize=self.threads)
         for s, n in ti.ndrange(self.scenarios, width * width * width):
             self.clear(s, n)
+            self.clear_row(s, n)
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
             self.locate(s, p)
@@ -473,7 +481,8 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.update(s, i, j, k, self.fill[s], self.friction[s])
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
-            self.g2p(s, p, solid)
+            self.g2p(s, p)
+            self.flow(s, p, solid)
             if ti.static(solid):
                 self.deform(s, p)
                 self.apply_snow_plasticity(s, p)

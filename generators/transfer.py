@@ -158,6 +158,37 @@ def accumulate(
 
 
 @ti.func
+def add_shifted(
+    sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template
+) -> None:
+    """Add contributions, times their scales, and the bits of the shift.
+
+    Who reads the sums takes the shifts off, which saves a subtraction at each node of
+    each particle.
+    """
+    if ti.static(atomic):
+        ti.atomic_add(sums[node], shifted(scaled))
+    else:
+        # Even in serial code `+=` is an atomic.
+        sums[node] = sums[node] + shifted(scaled)
+
+
+@ti.func
+def row_count(rows: Template, s: ti.i32, n: ti.i32) -> Value:
+    """Return the fixed-point sum of a node's weights, and the shifts in its sums.
+
+    Particles add to ``rows`` at n + 2 the weights of three nodes in a row along the
+    last axis, of which n is the first, and a zero. Each number that is added brings the
+    bits of one shift, so that the fourth sum of a row has only shifts.
+    """
+    first = rows[s, n + 2]
+    second = rows[s, n + 1]
+    third = rows[s, n]
+    shifts = first[3] + second[3] + third[3]
+    return (first[0] + second[1] + third[2]) - shifts, shifts
+
+
+@ti.func
 def stepped(value: Value, step: Value, count: Template) -> Value:
     """Return value + count step, for a count of -1, 0 or 1."""
     result = value

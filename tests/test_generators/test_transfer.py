@@ -42,6 +42,33 @@ def evaluate(  # type: ignore[no-untyped-def] # noqa: ANN201
         out[p, 1] = transfer.largest(value[p], 1.0)
 
 
+@ti.kernel
+def read_numbers(  # type: ignore[no-untyped-def] # noqa: ANN201
+    bits: ti.types.ndarray(),  # type: ignore[valid-type]
+    numbers: ti.types.ndarray(),  # type: ignore[valid-type]
+    node_count: ti.template(),  # type: ignore[valid-type]
+):
+    for p in range(bits.shape[0]):
+        numbers[p] = transfer.node_number(bits[p], node_count)
+
+
+@ti.kernel
+def count_weights(  # type: ignore[no-untyped-def] # noqa: ANN201
+    first: ti.types.ndarray(),  # type: ignore[valid-type]
+    weights: ti.types.ndarray(),  # type: ignore[valid-type]
+    rows: ti.template(),  # type: ignore[valid-type]
+    counts: ti.types.ndarray(),  # type: ignore[valid-type]
+):
+    ti.loop_config(serialize=True)
+    for p in range(first.shape[0]):
+        row = ti.Vector([weights[p, 0], weights[p, 1], weights[p, 2], 0.0])
+        node = ti.Vector([0, first[p] + 2])
+        transfer.add_shifted(rows, node, row, False)
+    ti.loop_config(serialize=True)
+    for n in range(counts.shape[0]):
+        counts[n] = transfer.row_count(rows, 0, n)[0]
+
+
 @pytest.fixture(autouse=True)
 def taichi_runtime() -> None:
     """Start Taichi as the solver does."""
@@ -121,6 +148,30 @@ def test_fixed_point_is_numpys_rint() -> None:
     assert fixed_by_hand.tolist() == list(by_hand.values())
     expected = np.rint(value.astype(np.float64))
     np.testing.assert_array_equal(fixed, expected.astype(np.int64))
+
+
+@pytest.mark.parametrize("node_count", [1, 64, 1000, 65_536])
+def test_numbers_of_nodes_survive_as_bits(node_count: int) -> None:
+    """A float with the bits of a node's number gives that number, for every node."""
+    expected = np.arange(node_count, dtype=np.int32)
+    numbers = np.zeros_like(expected)
+    read_numbers(expected.view(np.float32), numbers, node_count)
+    np.testing.assert_array_equal(numbers, expected)
+
+
+def test_rows_count_the_weights_of_each_node() -> None:
+    """Weights added in rows of three give the sum of the weights of each node."""
+    node_count = 12
+    rng = np.random.default_rng(2)
+    first = rng.integers(0, node_count - 2, 200).astype(np.int32)
+    weights = rng.integers(0, 1000, (200, 3)).astype(np.float32)
+    rows = ti.Vector.field(4, ti.i64, shape=(1, node_count + 2))
+    counts = np.zeros(node_count, np.int64)
+    count_weights(first, weights, rows, counts)
+    expected = np.zeros(node_count, np.int64)
+    for step in range(3):
+        np.add.at(expected, first + step, weights[:, step].astype(np.int64))
+    np.testing.assert_array_equal(counts, expected)
 
 
 def test_bounds_and_extremes_meet_nan() -> None:
