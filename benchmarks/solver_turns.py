@@ -1,0 +1,131 @@
+"""The kernels of this tree against those of another commit, in turns of a second.
+
+    python benchmarks/solver_turns.py --against main~20 --cases cavity curl-noise-3d
+
+Per case two processes, one of each commit, keep their solvers and advance the first
+test scenario from its start, in turns, on the same core. So both meet the same load of
+the machine. Prints the medians of the particle-substeps per second of processor time,
+and of the ratios of the turns, with quartiles. No positions are read:
+``solver_against.py`` compares whole frames.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from solver_against import HERE, checked_out
+
+from lagbench.baselines.machine import hardware
+from lagbench.data.registry import load
+from lagbench.generators.batch import draw_initial_state
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.solver import build
+
+CASES = ("cavity", "curl-noise", "fluid", "multimaterial")
+PARTICLE_SUBSTEPS = 2_000_000  # of a turn
+
+
+def serve(split: str, size: str) -> None:
+    """Advance the solver once per line of stdin; print the rate of each turn."""
+    tier = load().size(split, size)
+    parameters = solver_constants(tier)
+    state = draw_initial_state(tier, tier.subsets["test"][0])
+    solver = build(parameters)
+    substeps = max(1, PARTICLE_SUBSTEPS // parameters.particles)
+    for _ in sys.stdin:
+        solver.load([state])
+        solver.advance(1)
+        start = time.process_time()
+        solver.advance(substeps)
+        seconds = time.process_time() - start
+        print(parameters.particles * substeps / seconds, flush=True)
+
+
+class Side:
+    """The process of one commit."""
+
+    def __init__(self, tree: Path, split: str, size: str) -> None:
+        core = min(os.sched_getaffinity(0))
+        command = [sys.executable, __file__, "--serve", split, "--size", size]
+        # HERE lends only this script: lagbench comes from the tree.
+        self._process = subprocess.Popen(
+            command,
+            cwd=tree,
+            env={**os.environ, "PYTHONPATH": str(tree)},
+            preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.take_turn()  # compiles
+
+    def take_turn(self) -> float:
+        """Return the particle-substeps per second of processor time of one turn."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        return float(self._process.stdout.readline())
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+
+def compare(other: Path, split: str, size: str, turns: int) -> NDArray[np.float64]:
+    """Return the rates of both trees, shape [turn, tree]."""
+    sides = [Side(tree, split, size) for tree in (other, HERE)]
+    rates = np.empty((turns, 2))
+    for turn in range(turns):
+        for index, side in enumerate(sides):
+            rates[turn, index] = side.take_turn()
+    for side in sides:
+        side.close()
+    return rates
+
+
+def main() -> int:
+    """Compare the two commits case by case and print a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--against", metavar="REV")
+    parser.add_argument("--cases", nargs="+", default=CASES, metavar="SPLIT")
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--turns", type=int, default=15)
+    parser.add_argument("--serve", metavar="SPLIT", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve:
+        serve(options.serve, options.size)
+        return 0
+    if options.against is None:
+        parser.error("--against is required")
+
+    print(
+        f"{hardware()['processor']}, size {options.size}; M particle-substeps/s of "
+        f"processor time"
+    )
+    print(f"| case | {options.against} | this tree | ratio | quartiles |")
+    print("|---|---:|---:|---:|---|")
+    with checked_out(options.against) as other:
+        for case in options.cases:
+            rates = compare(other, case, options.size, options.turns)
+            theirs, ours = np.median(rates, axis=0) / 1e6
+            low, ratio, high = np.quantile(rates[:, 1] / rates[:, 0], (0.25, 0.5, 0.75))
+            print(
+                f"| {case} | {theirs:.1f} | {ours:.1f} | {ratio:.2f} "
+                f"| {low:.2f} to {high:.2f} |",
+                flush=True,
+            )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
