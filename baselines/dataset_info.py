@@ -17,7 +17,7 @@ from .baseline import DatasetInfo
 
 
 def read_dataset_info(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     root: str | Path | None = None,

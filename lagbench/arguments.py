@@ -39,8 +39,8 @@ ALIASES = {
 
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
 
-UNCHECKED = frozenset({"Any", "ArrayLike", "object"})
-"""Annotations that take any value."""
+UNCHECKED = frozenset({"Any", "ArrayLike", "OwnMetrics", "object"})
+"""Annotations that take any value, or whose values the function itself checks."""
 
 
 @dataclass(frozen=True)

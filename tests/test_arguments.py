@@ -227,6 +227,15 @@ def test_values_of_a_wrong_kind_are_refused(value: object, annotation: str) -> N
         check_argument("name", value, annotation, where="function")
 
 
+def test_folders_of_local_splits_may_be_paths() -> None:
+    """A split is named by a text, or by the path of its folder."""
+    for name, function in FUNCTIONS.items():
+        parameters = inspect.signature(function).parameters
+        if "split" in parameters:
+            members = list_members(str(parameters["split"].annotation))
+            assert "Path" in members, name
+
+
 def test_calls_that_do_not_fit_raise_the_error_of_python() -> None:
     """An unknown or missing argument is told with the name of the function."""
 

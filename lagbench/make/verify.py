@@ -130,7 +130,7 @@ class VerificationResult:
 
 @check_arguments
 def verify(
-    split: str,
+    split: str | Path,
     size: str | None = None,
     *,
     root: str | Path | None = None,
@@ -146,7 +146,7 @@ def verify(
     result.
 
     Args:
-        split: name of the split.
+        split: name of the split, or path of a local split's folder.
         size: name of the size; the only one that is there when None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.

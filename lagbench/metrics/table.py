@@ -7,7 +7,7 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
@@ -27,10 +27,15 @@ from lagbench.errors import (
 )
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
+from .frame import FramePair
 from .metric import Metric, observable
 
 GROUP = "lagbench.metrics"
 """Entry-point group that adds metrics."""
+
+OwnMetric = Metric | Callable[[FramePair], float]
+OwnMetrics = OwnMetric | Collection[OwnMetric]
+"""Metrics that a user hands over in Python; see :func:`own_metrics`."""
 
 FAMILIES: Mapping[str, Sequence[Metric]] = MappingProxyType(
     {

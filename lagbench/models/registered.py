@@ -25,7 +25,7 @@ RECIPE = "own-training"
 def build_registered(
     baseline: str,
     *,
-    split: str,
+    split: str | Path,
     size: str | None = None,
     options: Mapping[str, Any] | None = None,
     root: str | Path | None = None,

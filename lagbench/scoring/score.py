@@ -20,9 +20,14 @@ from lagbench.data.local import (
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
-from lagbench.metrics.frame import FramePair
 from lagbench.metrics.metric import Metric
-from lagbench.metrics.table import available, own_metrics, ranking_metric, select
+from lagbench.metrics.table import (
+    OwnMetrics,
+    available,
+    own_metrics,
+    ranking_metric,
+    select,
+)
 from lagbench.references import extrapolation
 from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import CLASSICAL, NAIVE
@@ -70,7 +75,7 @@ def score(
     workers: int | None = None,
     scheduler: str | None = None,
     extras: Collection[str] = (),
-    metrics: Collection[Metric | Callable[[FramePair], float]] = (),
+    metrics: OwnMetrics = (),
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
     registry: Registry | None = None,
@@ -92,7 +97,7 @@ def score(
         metrics: metrics of your own that are measured too: functions of a
             :class:`~lagbench.metrics.FramePair`, or a
             :class:`~lagbench.metrics.Metric` where a direction and a unit are to be
-            stated. They are measured in this process.
+            stated; one of them, or a list. They are measured in this process.
         progress: called with the state of the work.
         examined: called with the result of the validation, before anything is raised
             for it.
