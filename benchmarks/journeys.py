@@ -3,8 +3,8 @@
     python benchmarks/journeys.py [--files]
 
 Runs each command in this process on a made-up root and prints in how many files of ours
-a function ran, and how many functions: class bodies, imports and child processes are
-left out. Then what the source says: files, lines, comments, the longest chain of
+a function ran, and how many functions: class bodies, child processes and what runs
+while a module is imported are left out. Then what the source says: files, lines, comments, the longest chain of
 imports. With --files it also lists the files of each command and the modules of the
 chain. Its table stands in CONTRIBUTING.md.
 """
@@ -41,12 +41,16 @@ def trace_command(words: list[str]) -> Counter[Path]:
     package_files = {path.resolve() for path in MODULES.values()}
     real_paths: dict[str, Path] = {}
     functions: set[tuple[Path, int]] = set()
+    modules_at_import = 0  # modules that are being imported, each by the one before
 
     def watch(frame: FrameType, event: str, _: object) -> None:
         """Note a named function of the package; `sys.setprofile` calls this."""
+        nonlocal modules_at_import
         code = frame.f_code
+        if code.co_name == "<module>":
+            modules_at_import += {"call": 1, "return": -1}.get(event, 0)
         is_named = not code.co_name.startswith("<")  # as <module> and <lambda>
-        if event != "call" or not is_named:
+        if event != "call" or not is_named or modules_at_import:
             return
         if code.co_filename not in real_paths:
             real_paths[code.co_filename] = Path(os.path.realpath(code.co_filename))

@@ -450,8 +450,6 @@ def colour_bar(
 
     Its ends are pointed where values may lie beyond them.
     """
-    from matplotlib.ticker import MaxNLocator
-
     if panel is Panel.VORTICITY and not is_solid:
         pointed = "both"
     else:
@@ -463,19 +461,16 @@ def colour_bar(
     bar.outline.set_visible(False)
     bar.set_label(label or UNITS[panel], labelpad=3)
     bar.ax.tick_params(length=0, pad=3)
-    bar.locator = MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10])
-    bar.update_ticks()
+    bar.ax.locator_params(axis="x", nbins=5)
 
 
 def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
     """Draw a key of the materials that occur."""
-    from matplotlib.lines import Line2D
-
     handles = []
     for material in np.unique(materials):
         colour = MATERIAL_COLOURS[material]
         name = MATERIALS[material]
-        dot = Line2D(
+        handles += axes.plot(
             [],
             [],
             linestyle="",
@@ -484,7 +479,6 @@ def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
             color=colour,
             label=name,
         )
-        handles.append(dot)
     axes.set_axis_off()
     axes.legend(
         handles=handles,

@@ -5,7 +5,6 @@ They are hashed before use, and read a few frames at a time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +20,6 @@ from lagbench.errors import DataError
 
 BLOCK = 16
 """Frames that are read at a time."""
-
-
-def fetch_truth(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
-    """Bring scenarios, or the manifest alone, from a store into the working copy.
-
-    Where the root is a plain folder, nothing is done.
-    """
-    # Without a store neither validating nor writing needs a network library.
-    from lagbench.store.copy import update_working_copy
-
-    update_working_copy(size, root, scenarios)
 
 
 class Truth:

@@ -25,6 +25,7 @@ from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.local import load_rooted_registry, resolve_root, suggest_split_of
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.store.copy import update_working_copy
 from lagbench.work.machine import ChildStopped, LimitedChild
 
 from .checks import (
@@ -61,7 +62,7 @@ from .task_checks import (
     check_scenarios,
     check_split,
 )
-from .truth import Truth, fetch_truth
+from .truth import Truth
 
 CPU_SECONDS = 5.0
 """Computing time for a small file, the start of the child aside [s].
@@ -204,7 +205,7 @@ def _examine(
     size, hint = _find_size(names, registry)
     size_json = None
     if size is not None:
-        fetch_truth(size, root, size.scored_scenarios)
+        update_working_copy(size, root, size.scored_scenarios)
         size_json = size.model_dump_json()
     request = {
         "path": str(path),

@@ -25,6 +25,7 @@ from lagbench.errors import (
     format_count,
     suggest_name,
 )
+from lagbench.store.copy import update_working_copy
 
 from .format import (
     ATTRIBUTES,
@@ -41,7 +42,7 @@ from .task_checks import (
     frames_to_predict,
     max_test_particles,
 )
-from .truth import Truth, fetch_truth
+from .truth import Truth
 
 CHUNK_CACHE_BYTES = 1 << 20
 """Memory for the chunks of a variable while it is written [bytes]."""
@@ -431,7 +432,7 @@ def _recorded_hash(size: Size, root: Path) -> str:
     Raises:
         DataError: none is recorded.
     """
-    fetch_truth(size, root)
+    update_working_copy(size, root)
     recorded = dataset_hash_of(size, root)
     if recorded is None:
         raise DataError(
@@ -621,7 +622,7 @@ def template(
     """
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     _check_output(Path(output), overwrite=overwrite)
-    fetch_truth(entry, folder, entry.subsets["test"])
+    update_working_copy(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
