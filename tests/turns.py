@@ -14,17 +14,19 @@ Case = TypeVar("Case")
 
 @functools.cache
 def turn() -> int:
-    """Return the number of commits so far, 0 where git does not tell.
+    """Return a number that picks the part which this run tests.
 
-    It picks what this run does of what is too much for one. ``LAGBENCH_TURN`` is taken
-    before it: a number, or ``all``, which is 0 here.
+    ``LAGBENCH_TURN`` is the number, or ``all``, which is 0 here. Without it the number
+    is drawn by the hash of the last commit: the same commit tests the same part again.
+    Commits are not counted, because CI may run once for several of them. It is 0 where
+    git does not tell.
     """
     chosen = os.environ.get("LAGBENCH_TURN", "")
     if chosen == "all":
         return 0
     if chosen:
         return int(chosen)
-    command = ["git", "rev-list", "--count", "HEAD"]
+    command = ["git", "rev-parse", "HEAD"]
     folder = Path(__file__).parent
     try:
         done = subprocess.run(
@@ -36,11 +38,11 @@ def turn() -> int:
         )
     except (OSError, subprocess.CalledProcessError):
         return 0
-    return int(done.stdout)
+    return int(done.stdout, base=16)
 
 
 def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[Case]:
-    """Return one case in ``turns``, the next ones after another commit.
+    """Return one case in ``turns``, others after another commit.
 
     With ``LAGBENCH_TURN=all`` these are all cases.
     """

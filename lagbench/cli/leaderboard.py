@@ -86,49 +86,55 @@ def build_command(
     print_result(result, [line], as_json=as_json, quiet=quiet)
 
 
+BaseOption = Annotated[
+    str | None,
+    option("--base REF", "Report changes to entries that this git commit has."),
+]
+OwnOption = Annotated[
+    list[str] | None,
+    option("--own METHOD", "With --base: an entry that is yours; repeatable."),
+]
+PageFlag = Annotated[
+    bool,
+    option(
+        "--page", "Also check that the files index.html and schema.json are up to date."
+    ),
+]
+RescoredOption = Annotated[
+    list[Path] | None,
+    option("--predictions FILE", "Score an entry's predictions again; repeatable."),
+]
+RecordFlag = Annotated[
+    bool,
+    option("--record", "With --predictions: add confirmed entries to verified.yaml."),
+]
+MeasuredRootOption = Annotated[
+    Path | None,
+    option(
+        "--root FOLDER",
+        "Folder of all data sets. Without --predictions, the shipped scores of "
+        "reference predictors are measured again on these data.",
+        parser=parse_root,
+    ),
+]
+MeasuredSplitOption = Annotated[
+    str | None, option("--split NAME", "With --root: measure on this split only.")
+]
+MeasuredSizeOption = Annotated[
+    str | None, option("--size NAME", "With --root: measure on this size only.")
+]
+
+
 def check_command(
     board: FoundBoardOption = None,
-    base: Annotated[
-        str | None,
-        option("--base REF", "Report changes to entries that this git commit has."),
-    ] = None,
-    own: Annotated[
-        list[str] | None,
-        option("--own METHOD", "With --base: an entry that is yours; repeatable."),
-    ] = None,
-    page: Annotated[
-        bool,
-        option(
-            "--page",
-            "Also check that the files index.html and schema.json are up to date.",
-        ),
-    ] = False,
-    predictions: Annotated[
-        list[Path] | None,
-        option("--predictions FILE", "Score an entry's predictions again; repeatable."),
-    ] = None,
-    recording: Annotated[
-        bool,
-        option(
-            "--record", "With --predictions: add confirmed entries to verified.yaml."
-        ),
-    ] = False,
-    root: Annotated[
-        Path | None,
-        option(
-            "--root FOLDER",
-            "Folder of all data sets. Without --predictions, the shipped scores of "
-            "reference predictors are measured again on these data.",
-            parser=parse_root,
-        ),
-    ] = None,
-    split: Annotated[
-        str | None,
-        option("--split NAME", "With --root: measure on this split only."),
-    ] = None,
-    size: Annotated[
-        str | None, option("--size NAME", "With --root: measure on this size only.")
-    ] = None,
+    base: BaseOption = None,
+    own: OwnOption = None,
+    page: PageFlag = False,
+    predictions: RescoredOption = None,
+    recording: RecordFlag = False,
+    root: MeasuredRootOption = None,
+    split: MeasuredSplitOption = None,
+    size: MeasuredSizeOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

@@ -1,7 +1,7 @@
 """Acceptance of the free-surface solver on scenarios of the registry and set pieces.
 
 Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least
-twice, in three commits.
+twice, in three turns.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not of_this_turn([0], turns=3), reason="the turn of other commits")
+@pytest.mark.skipif(not of_this_turn([0], turns=3), reason="not in this turn")
 def test_the_script_makes_and_recognises_all_of_them(tmp_path: Path) -> None:
     """Every fault in a child process, within time and memory: exit code 0."""
     script = Path(__file__).parents[1] / "bad_submissions.py"
