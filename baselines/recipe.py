@@ -403,28 +403,34 @@ def _missing_recipe(
     split, _, size_name = name.partition("/")
     if variant:
         size = size_name.removesuffix(f"-{variant}")
-        hint = _variant_hint(size, variant, split, file)
+        ways_out = _suggest_variants(size, variant, split, file)
     else:
-        hint = _recipe_hint(name, split, file)
+        ways_out = [_suggest_recipe(name, split, file)]
+    ways_out.append("write your own: --recipe FILE.yaml, see docs/baselines.md")
     return UsageError(
         f"{entry.name} has no recipe {name!r}",
         where="--split, --size, --recipe",
         expected="a recipe of the split and size",
         got=ascii(name),
-        fix=f"{hint}write your own: --recipe FILE.yaml, see docs/baselines.md",
+        fix="; or ".join(ways_out),
     )
 
 
-def _recipe_hint(name: str, split: str, file: _RecipeFile) -> str:
+def _suggest_recipe(name: str, split: str, file: _RecipeFile) -> str:
     """Return the nearest recipe, of the same split if it has any."""
     if not file.recipes:
-        return "leave --recipe out; or "
+        return "leave --recipe out"
     same_split = [other for other in file.recipes if other.split("/")[0] == split]
-    return f"{suggest_name(name, same_split or file.recipes)}; or "
+    return suggest_name(name, same_split or file.recipes)
 
 
-def _variant_hint(size: str, variant: str, split: str, file: _RecipeFile) -> str:
-    """Return the nearest variant of the size, or the sizes that have this variant."""
+def _suggest_variants(
+    size: str, variant: str, split: str, file: _RecipeFile
+) -> list[str]:
+    """Return the nearest variant of the size, or the sizes that have this variant.
+
+    Where the size has a recipe of its own, that is the second way out.
+    """
     size_names = []
     for recipe in file.recipes:
         recipe_split, _, size_name = recipe.partition("/")
@@ -439,17 +445,16 @@ def _variant_hint(size: str, variant: str, split: str, file: _RecipeFile) -> str
             sizes.append(size_name.removesuffix(f"-{variant}"))
 
     has_size = size in size_names
+    ways_out = []
     if has_size and sizes:
-        hint = f"--size {' or '.join(sizes)} has it; or "
+        ways_out.append(f"--size {' or '.join(sizes)} has it")
     elif variants:
-        hint = f"{suggest_name(variant, variants)}; or "
-    elif has_size:
-        hint = ""
-    else:
-        hint = _recipe_hint(f"{split}/{size}-{variant}", split, file)
+        ways_out.append(suggest_name(variant, variants))
+    elif not has_size:
+        ways_out.append(_suggest_recipe(f"{split}/{size}-{variant}", split, file))
     if has_size:
-        hint += f"leave --recipe out, for that of {size}; or "
-    return hint
+        ways_out.append(f"leave --recipe out, for that of {size}")
+    return ways_out
 
 
 def _check_baselines(part: _SharedRecipe, *, where: str) -> None:

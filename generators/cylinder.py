@@ -74,10 +74,10 @@ def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
     return x, middle + steps / size.value("lattice")
 
 
-def _square(way: Array) -> Array:
+def _square(vectors: Array) -> Array:
     """Return the squared length of vectors in the plane, shape [vector]."""
-    x = way[:, 0]
-    y = way[:, 1]
+    x = vectors[:, 0]
+    y = vectors[:, 1]
     return np.asarray(x * x + y * y)
 
 

@@ -297,6 +297,7 @@ class _TabWriter:
         return {name: self._curve(curve) for name, curve in curves.items()}
 
     def _curve(self, curve: Curve) -> Plain:
+        """Return a curve with the lower and the upper end of its band."""
         values = np.stack([curve.mean, curve.low, curve.high], axis=1)
         return self._points(curve, values)
 

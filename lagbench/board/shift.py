@@ -101,39 +101,38 @@ def find_mismatch(entry: Entry, size: Size, scores: ShiftScores) -> str | None:
         is_current = scores.dataset_sha256 == size.measured.dataset_sha256
         if not is_current or scores.subset_sha256 != subset_sha256:
             return "scores of other data"
-    models = {}
+    hashes = {}  # of the entry's models, by seed
     for prediction in entry.predictions:
         if prediction.weights is not None:
-            models[prediction.seed] = prediction.weights.sha256
+            hashes[prediction.seed] = prediction.weights.sha256
     seeds = set()
     scenarios = sorted(size.subsets.get(SUBSET, ()))
-    for one in scores.models:
-        if models.get(one.seed) != one.model:
-            return f"a model with SHA-256 {one.model[:16]}"
-        if one.seed in seeds:
-            return f"seed {one.seed} twice"
-        if sorted(one.values) != scenarios:
-            return f"seed {one.seed}: other scenarios"
-        seeds.add(one.seed)
+    for model in scores.models:
+        if hashes.get(model.seed) != model.model:
+            return f"a model with SHA-256 {model.model[:16]}"
+        if model.seed in seeds:
+            return f"seed {model.seed} twice"
+        if sorted(model.values) != scenarios:
+            return f"seed {model.seed}: other scenarios"
+        seeds.add(model.seed)
     return None
 
 
 def scores_of_seeds(scores: ShiftScores) -> list[Score]:
     """Return the score of each seed, without values per frame."""
     seeds = []
-    for one in scores.models:
-        scenarios = tuple(sorted(one.values))
-        values = [one.values[scenario] for scenario in scenarios]
-        seeds.append(
-            Score(
-                METRICS[scores.metric],
-                scenarios,
-                (),
-                np.empty((len(scenarios), 0)),
-                np.array(values),
-                (0,) * len(scenarios),
-            )
+    for model in scores.models:
+        scenarios = tuple(sorted(model.values))
+        values = [model.values[scenario] for scenario in scenarios]
+        score = Score(
+            metric=METRICS[scores.metric],
+            scenarios=scenarios,
+            frames=(),
+            per_frame=np.empty((len(scenarios), 0)),
+            values=np.array(values),
+            undefined=(0,) * len(scenarios),
         )
+        seeds.append(score)
     return seeds
 
 

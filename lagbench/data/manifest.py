@@ -398,7 +398,8 @@ They are not read again while their times stay.
 def record_hashes(
     folder: Path,
     contents: Mapping[Path, str],
-    digests: Mapping[Path, str] | None = None,
+    *,
+    file_hashes: Mapping[Path, str] | None = None,
 ) -> None:
     """Note content hashes of files that this machine has just hashed or written.
 
@@ -407,11 +408,12 @@ def record_hashes(
     Args:
         folder: folder of the data set.
         contents: content hashes by path.
-        digests: SHA-256 of the files' bytes, from before their values were read, where
-            it is known; else the bytes are read.
+        file_hashes: SHA-256 of the files' bytes by path, if they are known from before
+            the values were read. The bytes of all other files are read here.
     """
     if not contents:
         return
+    known_file_hashes = file_hashes or {}
     old_notes = _read_hash_notes(folder)
     new_notes = {}
     for path, content in contents.items():
@@ -420,13 +422,14 @@ def record_hashes(
         old_note = old_notes.get(name)
         if old_note is not None and old_note.says(stamp, content):
             continue
-        # The times are from before the bytes: a file that changes meanwhile does not
-        # fit its note.
-        digest = (digests or {}).get(path)
-        note = _HashNote(*stamp, digest or file_sha256(path), content)
-        new_notes[name] = note
-        if digest is None:
+        # The stamp is from before the bytes are read: if the file changes meanwhile,
+        # its new stamp is not that of its note.
+        if path in known_file_hashes:
+            note = _HashNote(*stamp, known_file_hashes[path], content)
+        else:
+            note = _HashNote(*stamp, file_sha256(path), content)
             _read_in_process[path] = note
+        new_notes[name] = note
     if new_notes:
         text = json.dumps(old_notes | new_notes, indent=1) + "\n"
         with suppress(WorkFailedError):
@@ -436,12 +439,12 @@ def record_hashes(
 def record_entry_hashes(folder: Path, entries: Iterable[FileEntry]) -> None:
     """Note files by their entries, which this machine has just made from them."""
     contents = {}
-    digests = {}
+    file_hashes = {}
     for entry in entries:
         path = folder / entry.path
         contents[path] = entry.content_sha256
-        digests[path] = entry.file_sha256
-    record_hashes(folder, contents, digests)
+        file_hashes[path] = entry.file_sha256
+    record_hashes(folder, contents, file_hashes=file_hashes)
 
 
 def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:

@@ -109,10 +109,9 @@ def linear(
 def _round_up(rough: float) -> float:
     """Return the next number that is 1, 2, 2.5 or 5 times a power of ten."""
     unit = 10.0 ** math.floor(math.log10(rough))
-    for factor in ROUND_FACTORS:
-        if factor * unit >= rough * (1 - 1e-9):
-            break
-    return factor * unit
+    least = rough * (1 - 1e-9)
+    round_numbers = [factor * unit for factor in ROUND_FACTORS]
+    return min(number for number in round_numbers if number >= least)
 
 
 def logarithmic(low: float, high: float) -> AxisScale:

@@ -275,7 +275,7 @@ def _inspect_files(
         if inspection.content_sha256:
             contents[path] = inspection.content_sha256
         meter.count(1, scenarios=1)
-    record_hashes(size.folder(root), contents, file_digests)
+    record_hashes(size.folder(root), contents, file_hashes=file_digests)
     return inspections
 
 
