@@ -155,7 +155,8 @@ def main() -> int:
     caption = (
         "Processor time of a predicted frame [ms] on one core. The models are "
         f"untrained and have the recipes of {SPLIT} {SIZE}. There are 2,000 q^2 "
-        "particles; the time grows as their number to the power in the last row."
+        "particles. The time grows as a power of their number; the last row has the "
+        "exponent."
     )
     text = f"{caption}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
     print(text)

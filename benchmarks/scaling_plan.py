@@ -257,7 +257,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     file = frames * n * p.bytes
     simulating = hours * (p.draw + (frames - 1) * row.substeps * p.substep)
     twins = TESTS * hours * (p.draw + HORIZON * row.substeps * p.substep)
-    perturbed_runs = f"perturbed runs of the {100 * TESTS:.0f} % test scenarios"
+    statistics = 0.8 * hours * frames * p.statistics
+    perturbed_runs = f"perturbed runs of the test scenarios ({100 * TESTS:.0f} %)"
     rows = {
         "bytes before compression": f"{SCENARIOS * frames * n * 16 / 1e12:.2f} TB",
         "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} "
@@ -265,8 +266,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{hours * frames * p.write:,.0f} core hours",
         perturbed_runs: f"{twins:,.0f} core hours",
-        "statistics of 80 % train "
-        "scenarios": f"{0.8 * hours * frames * p.statistics:,.0f} core hours",
+        "statistics of the train scenarios (80 %)": f"{statistics:,.0f} core hours",
         "one `lagbench verify`": f"{hours * frames * p.check:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
