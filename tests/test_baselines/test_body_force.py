@@ -205,7 +205,6 @@ def test_a_training_says_that_its_model_does_not_see_the_force(
     messages = [str(warning.message) for warning in caught]
     assert bool(messages) == has_warning, messages
     if has_warning:
-        assert "does not see the force that drives the flow" in messages[0]
         assert "--set model.body_force=true" in messages[0]
 
 

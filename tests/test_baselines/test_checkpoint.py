@@ -285,11 +285,11 @@ NO_CALLS = torch.tensor(0)
         ),
         (
             {"weights": {"a": torch.zeros(2), "calls": NO_CALLS}},
-            "do not fit the model",
+            "do not fit",
         ),
         (
             {"weights": {"a": torch.zeros(1)}},
-            "do not fit the model",
+            "do not fit",
         ),
         (
             {"options": {"sart": 1}},

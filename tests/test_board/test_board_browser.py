@@ -171,10 +171,8 @@ def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
     go(page, board.tabs[0])
     flags = "document.querySelectorAll('section:not([hidden]) tr[data-entry] .flag')"
     chips = dict(page.value(f"[...{flags}].map(e => [e.textContent, e.title])"))
-    assert chips["leaves the box: 5.9 %"].startswith(
-        "Predicted particles lie outside the box"
-    )
-    assert chips["unphysical"].endswith("14 times the truth's kinetic energy.")
+    assert "outside the box" in chips["leaves the box: 5.9 %"]
+    assert "kinetic energy" in chips["unphysical"]
     warning = (
         "document.querySelector('section:not([hidden]) tr[data-entry] .flag.warn')"
     )

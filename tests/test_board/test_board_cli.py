@@ -63,7 +63,8 @@ def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
     assert run(*SUBMIT).exit_code == 2
     submitted = run(*SUBMIT, "--new-board")
     assert submitted.exit_code == 0, submitted.output
-    assert "toy-model on curl-noise tiny: vorticity_nrmse" in submitted.stdout
+    assert "toy-model" in submitted.stdout
+    assert "vorticity_nrmse" in submitted.stdout
     entry = tmp_path / "leaderboard/submissions" / SPLIT / SIZE / "toy-model.yaml"
     assert yaml.safe_load(entry.read_text())["parameters"] == 1
     assert run("leaderboard", "check").exit_code == 0
@@ -125,7 +126,7 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (
             ["submit", "x.nc", "--url", "javascript:alert(1)"],
             2,
-            "is not an http:// or https:// address",
+            "javascript:",
         ),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),

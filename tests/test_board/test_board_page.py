@@ -224,7 +224,6 @@ def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
     assert means == pytest.approx([0.45, 0.3, 0.99])
     overview_text = text_of_overview(render(whole_board))
     assert "on 1 of 2" in overview_text
-    assert "Without a place: not on all 2 data sets" in overview_text
 
 
 def text_of_overview(page: str) -> str:
@@ -262,9 +261,8 @@ def test_a_size_without_places_says_why(board: Board) -> None:
     assert [overview.size for overview in overviews] == ["mini", "full"]
     assert [overview.has_places for overview in overviews] == [True, False]
     shown = text_of_overview(render(split_board))
-    assert "Both is the only method with a skill on all 2 data sets" in shown
-    assert "No method has a skill on all 2 data sets of size full" in shown
-    assert "Nobody has a place yet: a place needs a skill on all 2 data sets" in shown
+    assert re.search("Both is the only .* all 2 data sets", shown)
+    assert re.search("No method .* all 2 data sets of size full", shown)
 
 
 def test_the_first_film_is_of_a_row_in_sight(board: Board) -> None:
@@ -324,13 +322,13 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "ratio", "high", "beginning"),
+    ("low", "ratio", "high", "verdict"),
     [
-        (1.1, 1.5, 1.9, "Learning does not pay on cavity full"),
-        (0.8, 1.5, 1.9, "Whether learning pays on cavity full is open"),
-        (0.8, 0.9, 1.1, "Whether learning pays on cavity full is open"),
-        (0.4, 0.5, 0.6, "Learning pays on cavity full"),
-        (math.nan, 0.5, math.nan, "Whether learning pays on cavity full is open"),
+        (1.1, 1.5, 1.9, "does not pay"),
+        (0.8, 1.5, 1.9, "open"),
+        (0.8, 0.9, 1.1, "open"),
+        (0.4, 0.5, 0.6, "pays"),
+        (math.nan, 0.5, math.nan, "open"),
     ],
 )
 def test_a_sentence_says_whether_learning_pays(
@@ -338,15 +336,18 @@ def test_a_sentence_says_whether_learning_pays(
     low: float,
     ratio: float,
     high: float,
-    beginning: str,
+    verdict: str,
 ) -> None:
     """It follows from the ratio of the most accurate model, and states it."""
     tab = first_tab(
         board, compared(board, "Model", error=1.0, ratio=(low, ratio, high))
     )
     sentence = conclude(tab)
-    assert sentence.startswith(beginning)
-    assert "Model, the most accurate model, has" in sentence
+    judgement, _, _ = sentence.partition(":")
+    assert "cavity full" in judgement
+    assert verdict in judgement
+    assert ("open" in judgement) is (verdict == "open")
+    assert "Model" in sentence
     assert f"{ratio:.2f}×".replace("1.50", "1.5") in sentence
     assert ("(95\u00a0%: " in sentence) is not math.isnan(low)
     assert conclude(first_tab(board, board.tabs[0].rows[0])) == ""
@@ -385,8 +386,7 @@ def test_the_most_accurate_model_decides_whether_learning_pays(board: Board) -> 
     accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
     cheap = compared(board, "Cheap", error=2.0, ratio=GOOD)
     sentences = conclude(first_tab(board, cheap, accurate))
-    assert sentences.startswith("Learning does not pay on cavity full: Accurate, ")
-    assert "Yet Cheap, which is less accurate, has 0.50×" in sentences
+    assert re.search("does not pay on cavity full.*Accurate.*Cheap.*0.50×", sentences)
 
 
 def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
@@ -394,12 +394,13 @@ def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
     silent = compared(board, "Silent", error=0.5, ratio=None)
     accurate = compared(board, "Accurate", error=1.0, ratio=GOOD)
     sentences = conclude(first_tab(board, silent, accurate))
-    assert "Accurate, the most accurate model of known cost, has" in sentences
+    assert re.search("Accurate.* of known cost", sentences)
+    assert "Silent" not in sentences
     shown = text_of_overview(page_of(board, first_tab(board, silent, accurate)))
-    assert "the most accurate model of known cost has less error" in shown
+    assert "model of known cost" in shown
     shown = text_of_overview(page_of(board, first_tab(board, accurate)))
-    assert "the most accurate model has less error" in shown
-    assert "Learning pays on cavity (Accurate: 0.50×)" in shown
+    assert "model of known cost" not in shown
+    assert "cavity (Accurate: 0.50×)" in shown
 
 
 def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> None:
@@ -409,7 +410,7 @@ def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> 
         value = replace(row.values[board.tabs[0].ranking], mean=skill)
         tab = first_tab(board, replace(row, skill=value))
         shown = text_of_overview(page_of(board, tab))
-        assert ("No entry has a skill above 0 on cavity" in shown) is is_told
+        assert ("skill above 0 on cavity" in shown) is is_told
 
 
 def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
@@ -432,7 +433,7 @@ def test_the_notes_explain_marks_levels_and_columns(board: Board) -> None:
     labels = [element.text for element in read_html(page).named("strong")]
     for label in ("under-trained", "÷ classical", "scores"):
         assert label in labels
-    assert "as submitted: the maintainers did not follow the scores." in page
+    assert "as submitted: " in page
     assert "reproduced: " not in page
 
 
@@ -456,18 +457,14 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     """There is no ratio then."""
     row = compared(board, "Model", error=1.0, ratio=None, is_cheapest=True)
     tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
-    assert conclude(tab) == (
-        "On cavity full no classical solver is as cheap as Model, the most accurate "
-        "model. The mean error of Model is less than that of mid and coarse. It is "
-        "greater than that of fine."
-    )
+    sentences = conclude(tab)
+    assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
-    assert "as cheap as the most accurate model on cavity (Model)." in shown
+    assert "cavity (Model)" in shown
 
     tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
     sentences = conclude(tab)
-    assert "The mean error of Model equals that of twin." in sentences
-    assert "It is greater than that of finer and fine." in sentences
+    assert re.search("Model equals .*twin.*greater .*finer and fine", sentences)
 
 
 def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
@@ -480,11 +477,11 @@ def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
             seconds_per_frame=1.0, device="a", solver_seconds_per_frame=speed_up
         )
         sentences = conclude(first_tab(board, with_entry(row, cost=cost)))
-        assert ("A frame of the model costs 2 times as much" in sentences) is is_told
+        assert ("2 times" in sentences) is is_told
 
 
 def test_slow_solvers_are_marked(board: Board) -> None:
-    """A classical solver that costs more than the simulator has a mark, with words."""
+    """A classical solver that costs more than the simulator has a mark."""
     tab = with_solvers(board.tabs[0], {"fast": 1.0, "slow": 2.0})
     references = []
     for reference, seconds in zip(tab.references, (1.0, 3.0), strict=True):
@@ -496,7 +493,6 @@ def test_slow_solvers_are_marked(board: Board) -> None:
     lines = reference_lines(page)
     assert "slower than simulator" in lines["slow"]
     assert "slower than simulator" not in lines["fast"]
-    assert "costs this solver more than the simulator that made the data" in page
 
 
 def reference_lines(page: str) -> dict[str, str]:
@@ -515,10 +511,10 @@ def test_ranks_count_entries_only(board: Board) -> None:
     error = first_row.values[board.tabs[0].ranking].mean
     errors = {"better": 0.5 * error, "worse": 2.0 * error}
     page = page_of(board, with_solvers(board.tabs[0], errors))
-    assert "Ranks count entries only." in page
-    assert "better would stand before rank 1" in page
+    assert "entries only" in page
+    assert re.search("better .*before rank 1", page)
     assert reference_lines(page)["better"].startswith("ref.")
-    assert "would stand before rank 1" not in page_of(
+    assert "before rank 1" not in page_of(
         board, with_solvers(board.tabs[0], {"worse": 2.0 * error})
     )
 

@@ -100,7 +100,7 @@ def test_a_registry_without_the_model_split_gives_no_model(
 ) -> None:
     registry = Registry({"large": small_registry.split("large")}, {})
     reason = demo.explain_missing_model(registry)
-    assert reason == f"the registry has no {SPLIT} {SIZE}"
+    assert f"{SPLIT} {SIZE}" in str(reason)
 
 
 def test_a_solver_that_cannot_be_timed_gives_no_speed_up(
@@ -121,13 +121,13 @@ def test_without_torch_the_demo_makes_data_only(
     root = copied()
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
-    lines = result.stdout.splitlines()
-    assert "no model, no leaderboard: torch is not installed; pip install it" in lines
+    (hint,) = [line for line in result.stdout.splitlines() if "torch" in line]
+    assert "pip install" in hint
     assert not (root / "leaderboard").exists()
 
     data = run_demo(root, run)
     assert data["model"] is None
-    assert data["model_left_out"] == "torch is not installed; pip install it"
+    assert "torch" in data["model_left_out"]
     assert list(data["splits"]) == [SPLIT]
     split = data["splits"][SPLIT]
     assert split["generation"]["kept"] == [0, 1, 2, 3, 4]

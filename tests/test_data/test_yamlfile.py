@@ -46,15 +46,15 @@ def test_a_pipe_and_a_device_are_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (BOMB, "aliases are not allowed"),
+        (BOMB, "aliases"),
         ("a: 1\na: 2\n", "'a' is given twice"),
-        ("a: !!python/object/apply:os.system ['true']\n", "tags are not allowed"),
-        ("a: !!set {x, y}\n", "tags are not allowed"),
+        ("a: !!python/object/apply:os.system ['true']\n", "tags"),
+        ("a: !!set {x, y}\n", "tags"),
         ("date: 2026-13-45\n", "month must be in 1..12"),
-        (f"a: {'9' * 5000}\n", "not a plain YAML file"),
+        (f"a: {'9' * 5000}\n", "YAML"),
         ("? [a, b]\n: 1\n", "cannot be a key"),
-        ("a: [1, 2\n", "not a plain YAML file"),
-        (b"\xff\xfe\x00", "not a plain YAML file"),
+        ("a: [1, 2\n", "YAML"),
+        (b"\xff\xfe\x00", "YAML"),
         ("[" * 5000 + "]" * 5000, "nested deeper than 32"),
     ],
 )

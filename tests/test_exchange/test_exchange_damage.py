@@ -270,11 +270,11 @@ def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
     [
         (
             {"lagbench": {"frames_of_interest": [99]}},
-            "frame of interest is not predicted",
+            "frame of interest",
         ),
         (
             {"lagbench": {"frames_of_interest": [-1]}},
-            "frame of interest is not predicted",
+            "frame of interest",
         ),
         (
             {"lagbench": {"cells": 10**9}},
@@ -330,7 +330,7 @@ def test_metadata_that_are_a_pipe(tmp_path: Path) -> None:
         (
             "no json",
             UnreadableFileError,
-            "cannot read the metadata",
+            "metadata.json",
         ),
         (
             "no radius",
@@ -360,7 +360,7 @@ def test_metadata_that_are_a_pipe(tmp_path: Path) -> None:
         (
             "half a file",
             UnreadableFileError,
-            "cannot read the file",
+            "test.h5",
         ),
         (
             "no positions",

@@ -371,7 +371,4 @@ def test_states_outside_the_bounds_are_refused() -> None:
     for constants, moving in ((NO_SLIP, across), (FREE_SLIP, sliding)):
         with pytest.raises(UsageError) as caught:
             loaded(constants, [moving])
-        assert (
-            caught.value.where
-            == "scenario 0, wall_velocity in the order left, right, bottom, top"
-        )
+        assert str(caught.value.where).startswith("scenario 0, wall_velocity")

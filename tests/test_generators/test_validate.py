@@ -254,8 +254,8 @@ RE_100 = {"reynolds": 100.0}
         (Case.CAVITY, {"reynolds": -1.0}, "positive"),
         (Case.CAVITY, {"reynolds": math.nan}, "positive"),
         (Case.CAVITY, {"reynolds": 0.5}, "too viscous"),
-        (Case.CAVITY, RE_100 | {"grid": 8}, "grid is too small"),
-        (Case.CAVITY, RE_100 | {"particles": 1224}, "fewer particles than cells"),
+        (Case.CAVITY, RE_100 | {"grid": 8}, "grid"),
+        (Case.CAVITY, RE_100 | {"particles": 1224}, "particles"),
         (Case.CAVITY, RE_100 | {"dt": 0.1}, "sound"),
         (Case.CAVITY, RE_100 | {"lid_speed": 2.0}, "lid"),
         (Case.CAVITY, RE_100 | {"lid_off_after": 10}, "lid stops"),
@@ -397,8 +397,8 @@ def test_validate_curl_noise(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--grid", "4"], "grid is too small"),
-        (["--particles", "100"], "fewer particles than cells"),
+        (["--grid", "4"], "grid"),
+        (["--particles", "100"], "particles"),
         (["--profiles", "curve.txt"], "not a picture format"),
         (["--json", "/proc/none/result.json"], "cannot be written"),
         (["--frequency", "3"], "stirring"),

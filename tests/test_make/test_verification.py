@@ -92,7 +92,7 @@ def test_what_was_generated_passes(
     assert result.identity == "bitwise"
     result.check()
     result = verify_tiny(generated.root, unmeasured)
-    assert result.verdict == "no hash in datasets.yaml yet"
+    assert "no hash" in result.verdict
     result.check()
 
 
@@ -163,14 +163,14 @@ def described(**attributes: object) -> Callable[[Path], None]:
         (flipped("material"), "0003.nc, variable 'material'"),
         (
             lambda path: os.truncate(path, path.stat().st_size - 1024),
-            "damaged or not one of lagbench",
+            "damaged",
         ),
         (rewritten, "variable 'velocity'"),
         (described(scale_factor=2.0), "(?s)variable 'position'.*scale_factor"),
         (described(units="m"), "(?s)variable 'position'.*units"),
         (
             lambda path: shutil.copy(path.with_name("0004.nc"), path),
-            "a file holds another scenario",
+            "another scenario",
         ),
     ],
 )
@@ -296,7 +296,7 @@ def test_other_bits_of_other_machines_are_warnings(
     assert result.problems == ()
     assert result.identity == "tolerance"
     text = "\n".join(result.warnings)
-    assert "scenarios 4 have other bits than datasets.yaml" in text
+    assert "scenarios 4 " in text
     assert "tolerance" in result.verdict
     result.check()
     forge(file_of(root, "test/0004"))
@@ -340,9 +340,9 @@ def test_strangers_and_a_lying_manifest_are_warnings(
     change_manifest(root, lie)
     result = verify_tiny(root, measured)
     text = "\n".join(result.warnings)
-    assert "test has files of no scenario: 0099.nc" in text
-    assert "identity: tolerance" in text
-    assert "other hashes of 0" in text
+    assert "0099.nc" in text
+    assert "tolerance" in text
+    assert "hashes of 0" in text
     assert result.identity == "tolerance"
     result.check()
 

@@ -35,7 +35,7 @@ def test_a_similar_leaderboard_is_offered(
     with pytest.raises(UsageError) as caught:
         find_board(board, reads=reads)
     assert caught.value.where == board
-    assert str(caught.value.fix).startswith(f"there is a leaderboard in {offered}:")
+    assert f" in {offered}:" in str(caught.value.fix)
 
 
 @pytest.mark.parametrize("board", ["nothere", "other/nothere"])
@@ -44,4 +44,4 @@ def test_no_other_leaderboard_is_offered_to_write_into(board: str, here: Path) -
     for find in (find_board, require_board):
         with pytest.raises(UsageError) as caught:
             find(board)
-        assert str(caught.value.fix).startswith("run it from the root of the clone")
+        assert "root of the clone" in str(caught.value.fix)

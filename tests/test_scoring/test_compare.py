@@ -431,7 +431,7 @@ def test_an_entry_of_another_data_set_is_named(
             root=bench.root,
             registry=bench.registry,
         )
-    assert "elsewhere is an entry of fluid mini" in str(caught.value.fix)
+    assert "fluid mini" in str(caught.value.fix)
 
 
 def test_a_named_board_must_be_one(scored: Folders, tmp_path: Path) -> None:
@@ -644,9 +644,7 @@ def test_a_metric_of_one_method_only_is_named_as_that(tmp_path: Path) -> None:
     for first, second in ((mine, other), (other, mine)):
         with pytest.raises(UsageError) as caught:
             compare(first, second, metrics=["mse_end"])
-        assert "only one of the two methods has the metric 'mse_end'" in str(
-            caught.value
-        )
+        assert "'mse_end'" in str(caught.value)
         assert f"of {mine}, none of {other}" in str(caught.value)
 
 
@@ -804,8 +802,9 @@ def test_a_cost_is_told_as_the_predictions_state_it(
     labels = {"seconds_per_frame": 0.25, "device": "a laptop, 2 threads"}
     path = bench.submit(tmp_path / "predictions.nc", still, **labels)
     text = "\n".join(flag_lines(bench.evaluate(path)))
-    assert "cost: 0.25 s per frame on 'a laptop, 2 threads'" in text
-    assert "the predictions state" in text
+    (cost,) = [line for line in text.splitlines() if line.startswith("cost:")]
+    assert "0.25 s" in cost
+    assert "'a laptop, 2 threads'" in cost
 
 
 def test_a_stated_machine_cannot_write_on_the_terminal(

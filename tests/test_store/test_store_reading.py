@@ -253,8 +253,7 @@ def test_files_of_the_copy_make_no_store_whole(store: Store, tiny: Registry) -> 
     manifest = store.read(MANIFEST)
     store.put(MANIFEST, drop_entries(manifest, "scenario", 3))
     result = verify(SPLIT, SIZE, root=store.url, registry=tiny)
-    problem = "scenario 3 is in the working copy alone, not in the store"
-    assert problem in result.problems
+    assert any("scenario 3" in problem for problem in result.problems)
     store.remove(MANIFEST)
     result = verify(SPLIT, SIZE, root=store.url, registry=tiny)
     assert len(result.problems) == 5

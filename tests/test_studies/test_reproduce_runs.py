@@ -206,7 +206,7 @@ def test_models_without_the_recipe_are_left_out(
     output = capsys.readouterr()
     plan = "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
     assert output.out == plan
-    assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in output.err
+    assert "'short'" in line_of("curl-noise tiny mlp", output.err)
     assert not home.exists()
 
     assert reproduce(*words) == 0
@@ -216,6 +216,12 @@ def test_models_without_the_recipe_are_left_out(
     assert names == ["supergat-0"]
     assert reproduce(*words, "--dry-run") == 0
     assert capsys.readouterr().out == "curl-noise tiny supergat-0: there\n"
+
+
+def line_of(run: str, output: str) -> str:
+    """Return the one line of a plan that begins with the name of a run."""
+    (line,) = [line for line in output.splitlines() if f"{run}:" in line]
+    return line
 
 
 def test_a_recipe_that_no_model_has_is_a_mistake(
@@ -243,18 +249,18 @@ def test_the_way_to_full_is_told_without_data(
     assert "table_5_4" in capsys.readouterr().out
     assert command.main([*places, "--recipe", "short", "--dry-run"]) == 0
     output = capsys.readouterr()
-    assert "cavity full gns-0: to train, cavity/full-short: 14,000 steps" in output.out
-    assert "fluid full mlp-0: to train, fluid/full-short: 1,500 steps" in output.out
+    assert "cavity/full-short: 14,000 " in line_of("cavity full gns-0", output.out)
+    assert "fluid/full-short: 1,500 " in line_of("fluid full mlp-0", output.out)
     assert "studies of table_4_2: left out" in output.err
     short_cavity = ["--recipe", "short", "--dry-run", "--split", "cavity"]
     assert command.main([*places, *short_cavity]) == 0
     output = capsys.readouterr()
-    assert "cavity full mlp-0: to train, cavity/full-short: 1,000 steps" in output.out
-    assert "cavity full var: left out" in output.err
+    assert "cavity/full-short: 1,000 " in line_of("cavity full mlp-0", output.out)
+    assert line_of("cavity full var", output.err)
     assert command.main([*places, "--dry-run", "--split", "fluid"]) == 0
     output = capsys.readouterr()
-    assert "fluid full mlp-0: to train, fluid/full: 600 epochs" in output.out
-    assert "fluid full var-0: to train, fluid/full: closed form" in output.out
+    assert "fluid/full: 600 epochs" in line_of("fluid full mlp-0", output.out)
+    assert line_of("fluid full var-0", output.out).endswith("closed form")
     assert "studies of table_4_2\n" in output.out
     assert "lagbench generate --split fluid --size full" in output.err
     assert not list(tmp_path.iterdir())
