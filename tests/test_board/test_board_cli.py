@@ -126,7 +126,7 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (
             ["submit", "x.nc", "--url", "javascript:alert(1)"],
             2,
-            "javascript:",
+            "https://",
         ),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),

@@ -271,4 +271,4 @@ def test_a_training_begins_with_the_warning(
     before_training, message, _ = result.stderr.partition("lagbench: begun")
     assert message
     assert before_training.count("warning:") == is_warned
-    assert ("own/split.yaml" in before_training) == is_warned
+    assert ("score_grid" in before_training) == is_warned
