@@ -894,6 +894,22 @@ def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
     return np.asarray(View(box).place(film), np.float32)
 
 
+def _place_obstacle(
+    obstacle: NDArray[np.float32] | None, box: Box
+) -> tuple[float, float, float] | None:
+    """Return x, y and radius of an obstacle in the picture; None without one."""
+    if obstacle is None:
+        return None
+    centre = obstacle[:-1]
+    radius = float(obstacle[-1])
+    if box.dimension == 3:
+        view = View(box)
+        centre = view.place(centre)
+        radius *= view.scale
+    x, y = centre.tolist()
+    return x, y, radius
+
+
 def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
     maps = spaced(len(preview.map_frames), MAP_FRAMES)
     histograms = []
@@ -912,6 +928,7 @@ def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
         film_frames=preview.film_frames,
         material=preview.material,
         film=_flatten_film(preview.film[side], box),
+        obstacle=_place_obstacle(preview.obstacle, box),
     )
 
 

@@ -71,6 +71,8 @@ class Pictures:
     material: NDArray[np.int8]
     # positions in [-0.5, 1.5] [length], shape [film frame, particle, 2]
     film: NDArray[np.float32]
+    # x, y and radius of a fixed obstacle in the film [length]; None without one
+    obstacle: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

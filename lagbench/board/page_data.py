@@ -43,6 +43,7 @@ CURVE_LEVELS = 2000  # steps of a curve: six to a pixel
 MAP_LEVELS = 500  # steps of a vorticity map: more than a colour has
 FILM_LEVELS = 1000  # steps across a film: two to a pixel
 HISTOGRAM_LEVELS = 500  # steps of a histogram: two to a pixel
+OBSTACLE_DIGITS = 4  # of the place and radius of an obstacle in a film
 SHOWN_DIGITS = 3  # of the values at frames of interest
 
 # Values of maps are cut off at so many times the truth's greatest: an explosion would
@@ -108,6 +109,7 @@ def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
         "frames": list(row.pictures.film_frames),
         "material": materials,
         "films": films,
+        "obstacle": _plain_obstacle(row.pictures),
         "key": [[i, MATERIAL_NAMES[i]] for i in sorted(set(materials))],
     }
 
@@ -116,6 +118,13 @@ def _add_film(film: Floats32, arrays: ArrayStore) -> Reference:
     """Add positions of shape [film frame, particle, 2]."""
     frames = film.reshape(len(film), -1)
     return arrays.add(frames, kind="film", levels=FILM_LEVELS)
+
+
+def _plain_obstacle(pictures: Pictures) -> list[float] | None:
+    """Return x, y and radius of the obstacle in a film; None without one."""
+    if pictures.obstacle is None:
+        return None
+    return [round_digits(value, OBSTACLE_DIGITS) for value in pictures.obstacle]
 
 
 class _TabWriter:
@@ -351,6 +360,7 @@ class _TabWriter:
             "filmFrames": film_frames,
             "material": pictures.material[particles].tolist(),
             "film": _add_film(film, self._arrays),
+            "obstacle": _plain_obstacle(pictures),
         }
 
 

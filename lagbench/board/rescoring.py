@@ -248,7 +248,15 @@ def _compare_pictures(first: ScoreFile, second: ScoreFile) -> list[str]:
         differing.append("vorticity pictures")
     if not _is_close(first.preview.film, second.preview.film, step=FILM_STEP):
         differing.append("film pictures")
+    if not _is_same_obstacle(first.preview.obstacle, second.preview.obstacle):
+        differing.append("the obstacle of the film")
     return differing
+
+
+def _is_same_obstacle(first: ArrayLike | None, second: ArrayLike | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return np.array_equal(np.asarray(first), np.asarray(second))
 
 
 def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:

@@ -47,7 +47,13 @@ VORTICITY_LIMIT = 1e30
 class PreviewRecorder:
     """Takes the pictures of one scenario, its ``preview``, frame pair by frame pair."""
 
-    def __init__(self, number: int, scenario: Scenario) -> None:
+    def __init__(
+        self,
+        number: int,
+        scenario: Scenario,
+        *,
+        obstacle: NDArray[np.float32] | None = None,
+    ) -> None:
         config = scenario.config
         frames = config.predicted_frames
         map_frames = tuple(sorted(config.slow_frames.intersection(frames)))
@@ -68,6 +74,7 @@ class PreviewRecorder:
             particles=particles,
             material=scenario.material[list(particles)].astype(np.int8),
             film=np.zeros(film, np.float32),
+            obstacle=obstacle,
         )
 
     def add(self, pair: FramePair) -> None:
@@ -173,7 +180,8 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 rows[name] = snapshots(scenario, frames)
 
             if job.has_preview:
-                recorder = PreviewRecorder(number, scenario)
+                obstacle = truth.obstacle
+                recorder = PreviewRecorder(number, scenario, obstacle=obstacle)
             tallies, trace = measure_rows(
                 scenario,
                 truth.snapshots(),

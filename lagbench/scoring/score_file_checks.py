@@ -153,6 +153,9 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
     vorticity, precision = _unpack(group["vorticity"])
     histogram, _ = _unpack(group["histogram"])
     film, _ = _unpack(group["film"])
+    obstacle = None
+    if "obstacle" in group.attrs:
+        obstacle = np.asarray(group.attrs["obstacle"], np.float32)
     preview = Preview(
         scenario=int(np.ravel(group.attrs["scenario"])[0]),
         map_frames=_read_integers(group["map_frame"]),
@@ -163,6 +166,7 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
         particles=_read_integers(group["film_particle"]),
         material=np.asarray(group["material"][...], np.int8),
         film=film,
+        obstacle=obstacle,
     )
     return preview, precision
 
@@ -213,9 +217,12 @@ def _check_shapes(preview: Preview) -> None:
         "material": (preview.material.shape, (particle_count,)),
         "film": (preview.film.shape, (2, film_count, particle_count, space)),
     }
+    if preview.obstacle is not None:
+        shapes["obstacle"] = (preview.obstacle.shape, (space + 1,))
     for name, (got, expected) in shapes.items():
         if got != expected:
             raise ValueError(f"{name} has shape {got}, not {expected}")
+    _check_obstacle(preview.obstacle)
 
     film = preview.film
     is_long = film_count > FRAMES or particle_count > PARTICLES
@@ -226,6 +233,13 @@ def _check_shapes(preview: Preview) -> None:
     low, high = FILM_RANGE
     if film.min() < low - FILM_TOLERANCE or film.max() > high + FILM_TOLERANCE:
         raise ValueError("the film leaves its range")
+
+
+def _check_obstacle(obstacle: NDArray[np.float32] | None) -> None:
+    if obstacle is None:
+        return
+    if not np.isfinite(obstacle).all() or obstacle[-1] <= 0.0:
+        raise ValueError("the obstacle has no place or no size")
 
 
 def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:

@@ -89,6 +89,8 @@ def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
 
 def _write_preview(group: Any, preview: Preview) -> None:  # noqa: ANN401
     group.scenario = preview.scenario
+    if preview.obstacle is not None:
+        group.obstacle = preview.obstacle
     for name, numbers in (
         ("map_frame", preview.map_frames),
         ("film_frame", preview.film_frames),

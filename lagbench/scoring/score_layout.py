@@ -51,6 +51,8 @@ class Preview:
     material: NDArray[np.int8]  # their materials, shape [film particle]
     # their positions [length], shape [side, film frame, film particle, axis]
     film: NDArray[np.float32]
+    # centre and radius of a fixed obstacle [length], shape [axis + 1]; None without one
+    obstacle: NDArray[np.float32] | None = None
 
 
 def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:

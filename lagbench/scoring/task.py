@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lagbench.data import MATERIALS
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError
@@ -37,6 +38,13 @@ class OpenScenario:
 
     scenario: Scenario  # properties that all its frames share
     file: ScenarioFile
+
+    @property
+    def obstacle(self) -> NDArray[np.float32] | None:
+        """Centre and radius of a fixed obstacle [length]; None without one."""
+        parameters = self.file.header.parameters
+        dimension = self.scenario.config.box.dimension
+        return parse_obstacle(parameters, dimension, where=str(self.file.path))
 
     def snapshots(self) -> Iterator[Snapshot]:
         """Yield the true snapshots of the predicted frames; a block is in memory."""

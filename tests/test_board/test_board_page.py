@@ -111,6 +111,26 @@ def test_curves_and_films_arrive_at_the_script(board: Board, page: str) -> None:
             assert_allclose(film[-1, -1], last_particle, atol=6e-4)
 
 
+def test_the_obstacle_of_a_film_arrives_at_the_script() -> None:
+    """Place and radius of the first film and of each film; else there is none."""
+    board = make_board((("cavity", "mini"),), entries=3)
+    row_without = read_page_data(render(board)).tabs[0]["rows"][0]
+    assert row_without["pictures"]["obstacle"] is None
+
+    disc = (0.25, 0.5, 0.046875)
+    tab = board.tabs[0]
+    rows = []
+    for row in tab.rows:
+        assert row.pictures is not None
+        pictures = replace(row.pictures, obstacle=disc)
+        rows.append(replace(row, pictures=pictures))
+    data = read_page_data(with_rows(board, *rows))
+    for row_data in data.tabs[0]["rows"]:
+        assert row_data["pictures"]["obstacle"] == [0.25, 0.5, 0.04688]
+    assert data.hero is not None
+    assert data.hero["obstacle"] == [0.25, 0.5, 0.04688]
+
+
 def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:
     """Every metric of every row, to nine digits; entries tell who scored them."""
     tab = board.tabs[0]

@@ -198,6 +198,36 @@ def test_map_shows_the_field(page: Page, board: Board) -> None:
     assert np.all((pixels[strong][:, 0] > pixels[strong][:, 2]) == (field[strong] > 0))
 
 
+def test_film_shows_the_obstacle(running: Browser, board: Board, tmp_path: Path) -> None:
+    """The truth and the prediction have a disc where the obstacle stands, and nothing
+    beside it.
+    """
+    tab = board.tabs[0]
+    rows = []
+    for row in tab.rows:
+        assert row.pictures is not None
+        # all particles stand in a corner, away from the disc
+        film = 0.1 * np.asarray(row.pictures.film)
+        pictures = replace(row.pictures, film=film, obstacle=(0.25, 0.75, 0.125))
+        rows.append(replace(row, pictures=pictures))
+    path = tmp_path / "index.html"
+    path.write_text(
+        render(replace(board, tabs=(replace(tab, rows=tuple(rows)),))),
+        encoding="utf-8",
+    )
+    opened = running.open(path, width=1280)
+    still(opened)
+    restored(opened, "#tab=cavity-full&entry=gns")
+    opacities = opened.value(
+        "[...document.querySelectorAll('#panel canvas.film')].flatMap(c => "
+        "[[0.25, 0.25], [0.25, 0.145], [0.35, 0.25], [0.25, 0.1], [0.4, 0.25]]"
+        ".map(([x, y]) => c.getContext('2d')"
+        ".getImageData(c.width * x, c.height * y, 1, 1).data[3]))"
+    )
+    assert opacities == 2 * [255, 255, 255, 0, 0]
+    close(opened)
+
+
 def test_film_plays_unless_motion_is_unwanted(page: Page) -> None:
     """With reduced motion it waits for Play; otherwise it starts; Pause stops it."""
     at = "Number(document.querySelector('#panel input[type=range]').value)"

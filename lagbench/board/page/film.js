@@ -39,8 +39,8 @@ function particleColours(materials, first) {
 
 /** Plays one film on two canvases, `pixels` wide; `ended` is called `rest` seconds after its last frame, `stop` ends it. */
 class Film {
-  constructor({ frames, materials, sides }, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
-    Object.assign(this, { frames, materials, sides, rest, ended, rested: 0 });
+  constructor({ frames, materials, sides, obstacle = null }, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
+    Object.assign(this, { frames, materials, sides, obstacle, rest, ended, rested: 0 });
     this.time = 0;
     this.playing = false;
     this.canvases = this.sides.map(([name]) => el("canvas", { width: pixels, height: pixels, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
@@ -52,6 +52,7 @@ class Film {
     this.start = positionsAt(this.sides[0][1], this.materials.length, this.frames.length, 0);
     this.repaint = () => {
       this.colours = particleColours(this.materials, this.start);
+      this.obstacleColour = getComputedStyle(document.documentElement).getPropertyValue("--muted").trim();
       this.show(this.time);
     };
     document.addEventListener("schemechange", this.repaint);
@@ -95,6 +96,7 @@ class Film {
     const count = this.materials.length;
     const radius = 1.5 + width / 160;
     context.clearRect(0, 0, width, width);
+    if (this.obstacle) this.paintObstacle(context, width);
     const path = [];
     for (let k = TRAIL; k >= 0; k -= 1) {
       if (this.time - this.gap * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - this.gap * k));
@@ -114,6 +116,16 @@ class Film {
     }
   }
 
+  /** Paint the fixed obstacle under the particles. */
+  paintObstacle(context, width) {
+    const [x, y, radius] = this.obstacle;
+    context.globalAlpha = 1;
+    context.fillStyle = this.obstacleColour;
+    context.beginPath();
+    context.arc(width * x, width * (1 - y), width * radius, 0, 2 * Math.PI);
+    context.fill();
+  }
+
   stop() {
     this.toggle(false);
     document.removeEventListener("schemechange", this.repaint);
@@ -125,6 +137,7 @@ function filmOf(tab, row) {
   return {
     frames: row.pictures.filmFrames,
     materials: row.pictures.material,
+    obstacle: row.pictures.obstacle,
     sides: [["truth", numbersOf(tab.truth.film)], [short(row.name), numbersOf(row.pictures.film)]],
   };
 }

@@ -20,8 +20,8 @@ function setHero(tab) {
 /** Return what the film of a tab shows: the first film has all particles that are known. */
 function heroFilm(tab, leader, isFirst) {
   if (!isFirst) return filmOf(tab, leader);
-  const { frames, material, films } = BOARD.hero;
-  return { frames, materials: material, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
+  const { frames, material, films, obstacle } = BOARD.hero;
+  return { frames, materials: material, obstacle, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
 }
 
 function drawHero(tab, isFirst) {
