@@ -237,26 +237,18 @@ def collect(
     described = registry or load()
     board.require()
 
-    methods: dict[tuple[str, str], list[ScoredMethod]] = {}
-    truths: dict[tuple[str, str], PicturedTruth] = {}
+    paths: dict[tuple[str, ...], list[Path]] = {}
     for path in board.entries():
-        if only is not None and path.parts[1:3] not in only:
-            continue
-        read = _read_method(board, path, described, scope)
-        if read is None:
-            continue
-        method, truth = read
-        data_set = (method.entry.split, method.entry.size)
-        methods.setdefault(data_set, []).append(method)
-        # Maps of truth and prediction share one packing: an explosion leaves nothing
-        # of the truth.
-        finest = truths.setdefault(data_set, truth)
-        truths[data_set] = min(finest, truth, key=lambda pictured: pictured.order)
+        data_set = path.parts[1:3]
+        if only is None or data_set in only:
+            paths.setdefault(data_set, []).append(path)
+    for data_set, paths_of_data_set in paths.items():
+        _require_described(board, data_set, paths_of_data_set, described)
 
     verified = read_verified(board)
     failed_gates = read_failed_gates(board)
     shift = read_shift(board)
-    tabs = []
+    tabs: list[Tab] = []
     empty = []
     for split, description in described.splits.items():
         for name in description.sizes:
@@ -264,22 +256,26 @@ def collect(
             if only is not None and data_set not in only:
                 continue
             size = described.size(split, name)
-            if data_set in methods:
+            methods, truth = _read_methods(
+                board, paths.get(data_set, ()), described, scope
+            )
+            if truth is not None:
                 tab = _make_tab(
                     size,
                     description.title,
-                    methods=methods[data_set],
-                    truth=truths[data_set],
+                    methods=methods,
+                    truth=truth,
                     scope=scope,
                     references=read_references(board, size),
                     verified=verified,
                     failed_gates=failed_gates,
                     shift=shift,
                 )
-                tabs.append(tab)
+                # Pictures are let go tab by tab: those of all entries take more memory
+                # than everything else.
+                tabs = picture_first([*tabs, tab], PICTURED_METHODS)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
                 empty.append(data_set)
-    tabs = picture_first(tabs, PICTURED_METHODS)
 
     shown: set[str] = set()
     for tab in tabs:
@@ -292,13 +288,44 @@ def collect(
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
 
 
-def _read_method(
-    board: Folder, path: Path, registry: Registry, scope: Scope
-) -> tuple[ScoredMethod, PicturedTruth] | None:
-    """Return an entry with its scores, and the truth beside them.
+def _require_described(
+    board: Folder,
+    data_set: tuple[str, ...],
+    paths: Sequence[Path],
+    registry: Registry,
+) -> None:
+    """Refuse entries in the folder of a data set that is not known."""
+    split, name = data_set
+    if split in registry.splits and name in registry.splits[split].sizes:
+        return
+    for path in paths:
+        _size_of(_read_in_place(board, path), registry, where=board.path / path)
 
-    None for old scores of another task.
+
+def _read_methods(
+    board: Folder, paths: Sequence[Path], registry: Registry, scope: Scope
+) -> tuple[list[ScoredMethod], PicturedTruth | None]:
+    """Return the methods of a data set, and the truth as it is pictured best.
+
+    The truth is None where no entry has scores of this task.
     """
+    methods = []
+    finest: PicturedTruth | None = None
+    for path in paths:
+        read = _read_method(board, path, registry, scope)
+        if read is None:
+            continue
+        method, truth = read
+        methods.append(method)
+        # Maps of truth and prediction share one packing: an explosion leaves nothing
+        # of the truth.
+        if finest is None or truth.order < finest.order:
+            finest = truth
+    return methods, finest
+
+
+def _read_in_place(board: Folder, path: Path) -> Entry:
+    """Return an entry that lies where it says."""
     entry = read_entry(board.path / path)
     if entry.yaml_path != path:
         raise ChecksFailedError(
@@ -308,6 +335,17 @@ def _read_method(
             got=str(path),
             fix=CHECKS["place"].fix,
         )
+    return entry
+
+
+def _read_method(
+    board: Folder, path: Path, registry: Registry, scope: Scope
+) -> tuple[ScoredMethod, PicturedTruth] | None:
+    """Return an entry with its scores, and the truth beside them.
+
+    None for old scores of another task.
+    """
+    entry = _read_in_place(board, path)
     size = _size_of(entry, registry, where=board.path / path)
     current = is_current(entry.dataset, size)
     try:
@@ -343,7 +381,7 @@ def _read_method(
     for seed in scores[ranking].seeds:
         seeds.append(replace(seed, per_frame=np.empty((len(seed.values), 0))))
     method = ScoredMethod(
-        entry=entry,
+        entry=_without_stated_metrics(entry),
         is_current=current,
         ranking=ranking,
         seeds=seeds,
@@ -360,6 +398,16 @@ def _read_method(
         pictures=true_pictures,
     )
     return method, truth
+
+
+def _without_stated_metrics(entry: Entry) -> Entry:
+    """Return an entry without the metrics that it states.
+
+    Rows show those that follow from its score files. The stated ones would take more
+    memory than everything else of an entry without pictures.
+    """
+    score = entry.score.model_copy(update={"metrics": {}})
+    return entry.model_copy(update={"score": score})
 
 
 def _require_possible(board: Folder, path: Path, score_file: ScoreFile) -> None:

@@ -50,6 +50,9 @@ class CheckResult:
     # entries of which some seeds were confirmed and others not scored: they are not
     # added
     partly: tuple[str, ...] = ()
+    # entries whose models were run again and gave the same scores
+    reproduced_wholly: int = 0  # on all test scenarios
+    reproduced_partly: int = 0  # on a part of them
     # reference predictors that were measured again, by data set, as in "cavity mini"
     floors: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -136,6 +139,10 @@ def check_board(
             build(folder.path, check=True, registry=described)
         except LagbenchError as error:
             issues.append(issue_from_error("page", error, error.where))
+    reproduced = []
+    for line in checks.verifications:
+        if line.is_reproduced:
+            reproduced.append(line.is_reproduced_wholly)
     recorded_paths = []
     for entry in recorded:
         recorded_paths.append(entry.yaml_path.as_posix())
@@ -147,6 +154,8 @@ def check_board(
         confirmed=tuple(rescoring.confirmations),
         recorded=tuple(recorded_paths),
         partly=partly,
+        reproduced_wholly=reproduced.count(True),
+        reproduced_partly=reproduced.count(False),
         floors=measured,
     )
 

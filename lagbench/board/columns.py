@@ -222,12 +222,9 @@ def describe_check(row: BoardRow) -> str:
     if row.verified.level.rank < Level.REPRODUCED.rank and reproductions:
         seeds = len(row.entry.predictions)
         return f"{len(reproductions)} of {seeds} seeds reproduced"
-    for reproduction in reproductions:
-        if not reproduction.is_complete:
-            return (
-                f"{row.verified.level}, {reproduction.scenarios} of {reproduction.of} "
-                "scenarios"
-            )
+    if reproductions and not row.verified.is_reproduced_wholly:
+        least = min(reproductions, key=lambda reproduction: reproduction.scenarios)
+        return f"{row.verified.level}, {least.scenarios} of {least.of} scenarios"
     return str(row.verified.level)
 
 

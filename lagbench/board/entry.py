@@ -336,6 +336,17 @@ class Verification(Strict):
     cost: MeasuredCost | None = None
     blind: BlindScore | None = None
 
+    @property
+    def is_reproduced(self) -> bool:
+        """Whether the models were run again and gave the same scores."""
+        return self.level.rank >= Level.REPRODUCED.rank
+
+    @property
+    def is_reproduced_wholly(self) -> bool:
+        """Whether every model was run again on all test scenarios."""
+        is_complete = all(model.is_complete for model in self.reproduced)
+        return self.is_reproduced and is_complete
+
     @model_validator(mode="after")
     def _check_level(self) -> Self:
         has_models = bool(self.reproduced)

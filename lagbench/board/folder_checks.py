@@ -20,7 +20,7 @@ from lagbench.scoring.score_file_checks import (
 )
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import Entry, EntryBudget, Prediction, Status, Summary
+from .entry import Entry, EntryBudget, Prediction, Status, Summary, Verification
 from .entry_file import examine, load_plain
 from .fields import latest_date
 from .folder import SEASONS, VERIFIED, Folder, Place, entry_path
@@ -55,6 +55,8 @@ class FolderChecks:
     issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     readable_score_files: set[Path] = field(default_factory=set)
+    # lines of verified.yaml that hold
+    verifications: list[Verification] = field(default_factory=list)
     # entries by content hash and by fingerprint of their predictions
     _scored: dict[str, list[ScoredEntry]] = field(default_factory=dict)
 
@@ -418,10 +420,43 @@ class FolderChecks:
             return
         names = set()
         for entry in self.entries:
-            if verification_of(entry, verified) is not None:
+            line = verification_of(entry, verified)
+            if line is not None:
                 names.add(entry.yaml_path.as_posix())
+                self.verifications.append(line)
+                self._check_level(entry, line)
         for name in sorted(verified.keys() - names):
             self._add("verified", VERIFIED, ascii(name)[:120])
+
+    def _check_level(self, entry: Entry, line: Verification) -> None:
+        """Check that the level of a line follows from what was predicted anew."""
+        if not line.is_reproduced:
+            return
+        where = f"{VERIFIED}, {entry.yaml_path}"
+        seeds = {reproduction.seed for reproduction in line.reproduced}
+        agreeing = [reproduction.agrees for reproduction in line.reproduced]
+        if seeds != {*entry.seeds} or not all(agreeing):
+            self._add(
+                "verified",
+                where,
+                f"{sum(agreeing)} seeds with the same scores",
+                what=f"the level is {line.level}, and the records do not show it",
+                expected=f"a record of each of {len(entry.seeds)} seeds that agrees",
+            )
+        size = self.registry.size(entry.split, entry.size)
+        test_count = len(size.scored_scenarios)
+        counts = {reproduction.of for reproduction in line.reproduced}
+        beyond = max(reproduction.scenarios for reproduction in line.reproduced)
+        if is_current(entry.dataset, size) and (
+            counts != {test_count} or beyond > test_count
+        ):
+            self._add(
+                "verified",
+                where,
+                f"up to {beyond} of {sorted(counts)} scenarios",
+                what="other numbers of scenarios than the test subset has",
+                expected=f"at most {test_count} of {test_count}",
+            )
 
     def _check_seasons(self) -> None:
         """Check that seeds and scores of seasons follow from their frozen models."""

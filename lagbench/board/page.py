@@ -143,7 +143,11 @@ OVERVIEW_NOTES = (
 LEVEL_MEANINGS = {
     Level.AS_SUBMITTED: "the maintainers did not follow the scores",
     Level.SCORED_AGAIN: "the maintainers scored the predictions of the submitter again",
-    Level.REPRODUCED: "the maintainers ran the model and got the same scores",
+    Level.REPRODUCED: (
+        "the maintainers ran the model and got the same scores; where a number of "
+        "scenarios follows, on these only. That is weaker evidence: the scores on the "
+        "other scenarios are as submitted"
+    ),
     Level.BLIND: "the model was also scored on scenarios drawn after it was frozen",
 }
 """What the maintainers did with an entry, in words behind the name of its level."""
@@ -291,19 +295,23 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
     """Return how many entries the maintainers followed how far, and where."""
     counts = dict.fromkeys(Level, 0)
     machines = set()
+    whole_count = 0
     for row in rows:
         counts[level_of(row)] += 1
+        if row.verified is not None and row.verified.is_reproduced_wholly:
+            whole_count += 1
         if row.verified is not None and row.verified.cost is not None:
             machines.add(row.verified.cost.machine)
-    clauses = []
+    clauses: list[str] = []
     run_again = counts[Level.REPRODUCED] + counts[Level.BLIND]
     if run_again:
         models = _count(run_again, "entry", "entries")
         clause = f"ran the models of {models} again and got the same scores"
+        clause += _describe_extent(whole_count, run_again - whole_count)
         if counts[Level.BLIND]:
             clause += (
-                f", {counts[Level.BLIND]} of them also on scenarios that were drawn "
-                "after the models were frozen (blind)"
+                f"; {counts[Level.BLIND]} of these entries were also scored on "
+                "scenarios that were drawn after the models were frozen (blind)"
             )
         clauses.append(clause)
     if counts[Level.SCORED_AGAIN]:
@@ -317,6 +325,15 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
     if counts[Level.AS_SUBMITTED]:
         sentence += ". The others stand as submitted"
     return f"{sentence}."
+
+
+def _describe_extent(whole: int, partly: int) -> str:
+    """Return on how much of the test subset models were run again."""
+    if not partly:
+        return " on all test scenarios"
+    if not whole:
+        return " on a part of the test scenarios"
+    return f", {whole} on all test scenarios and {partly} on a part of them"
 
 
 def _describe_costs(rows: Sequence[BoardRow]) -> str:

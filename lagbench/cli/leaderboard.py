@@ -221,6 +221,11 @@ def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
                 "give the predictions of all its seeds in one call"
             )
 
+    if result.reproduced_wholly or result.reproduced_partly:
+        yield (
+            f"reproduced: {format_count(result.reproduced_wholly, 'entry')} on all "
+            f"test scenarios, {result.reproduced_partly} on a part of them"
+        )
     state = "nothing wrong"
     if result.findings:
         state = format_count(len(result.findings), "finding")

@@ -380,7 +380,7 @@ def draw_panel_grid(
 
 
 def draw_image_panel(
-    png: bytes, kind: str, alt: str, *, smooth: bool = False
+    png: bytes, kind: str, alt: str, *, smooth: bool = False, aspect: float = 1.0
 ) -> Markup:
     """Return a panel that shows a picture of the inside of the box.
 
@@ -389,21 +389,34 @@ def draw_image_panel(
         kind: classes of the panel, which tell the walls that move.
         alt: the picture in words.
         smooth: whether browsers may blur it when they enlarge it.
+        aspect: width over height of the box.
     """
     source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
     image_kind = None
     if smooth:
         image_kind = "smooth"
     drawn = tag("img", src=source, alt=alt, class_=image_kind)
-    return tag("span", drawn, class_=kind)
+    return tag("span", drawn, class_=kind, style=_aspect_style(aspect))
 
 
-def draw_line_panel(drawn: Markup, kind: str, alt: str) -> Markup:
-    """Return a panel of lines in coordinates from 0 to :data:`SIDE`."""
-    box = f"0 0 {SIDE} {SIDE}"
+def draw_line_panel(
+    drawn: Markup, kind: str, alt: str, *, aspect: float = 1.0
+) -> Markup:
+    """Return a panel of lines in coordinates from 0 to :data:`SIDE`, left to right.
+
+    The aspect is width over height of the box.
+    """
+    box = f"0 0 {SIDE} {SIDE / aspect:g}"
     title = tag("title", alt)
     svg = tag("svg", title, drawn, viewBox=box, class_="flow", role="img")
-    return tag("span", svg, class_=kind)
+    return tag("span", svg, class_=kind, style=_aspect_style(aspect))
+
+
+def _aspect_style(aspect: float) -> str | None:
+    """Return the style of a panel of a box that is no square; None for a square."""
+    if aspect == 1.0:
+        return None
+    return f"aspect-ratio:{aspect:.4g}"
 
 
 def draw_ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:

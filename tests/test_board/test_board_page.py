@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import datetime
 import hashlib
 import math
 import re
@@ -21,7 +22,14 @@ from sample_boards import make_board, with_entry
 from lagbench.board.build import picture_first
 from lagbench.board.columns import columns_of
 from lagbench.board.encoding import HARMLESS, decode
-from lagbench.board.entry import EntryCost, EntryFlag, Weights
+from lagbench.board.entry import (
+    EntryCost,
+    EntryFlag,
+    Level,
+    Reproduction,
+    Verification,
+    Weights,
+)
 from lagbench.board.model import Board, BoardRow, Tab
 from lagbench.board.overview import conclude, find_hero, make_overviews
 from lagbench.board.page import render, same_page
@@ -457,6 +465,51 @@ def test_the_notes_explain_marks_levels_and_columns(board: Board) -> None:
     assert "reproduced: " not in page
 
 
+def run_again_on(*counts: int) -> Verification:
+    """Return a line of an entry whose models ran on so many of 16 scenarios."""
+    reproductions = []
+    for seed, count in enumerate(counts):
+        reproduction = Reproduction(
+            seed=seed,
+            model="0" * 64,
+            metric="vorticity_nrmse",
+            scenarios=count,
+            of=16,
+            submitted=0.5,
+            reproduced=0.5,
+            difference=0.0,
+            tolerance=1e-3,
+        )
+        reproductions.append(reproduction)
+    return Verification(
+        scores=("0" * 64,),
+        lagbench="0.1.0",
+        date=datetime.date(2026, 1, 31),
+        level=Level.REPRODUCED,
+        reproduced=tuple(reproductions),
+    )
+
+
+def test_the_page_tells_whole_reproductions_from_partial_ones(board: Board) -> None:
+    """The header counts both; the column says on how many scenarios; the notes say what
+    a part shows.
+    """
+    whole = row_of(board, "Whole", "whole", verified=run_again_on(16, 16))
+    partly = row_of(board, "Partly", "partly", verified=run_again_on(16, 4))
+    other = row_of(board, "Other", "other", verified=run_again_on(2))
+    nobody = row_of(board, "Nobody", "nobody", verified=None)
+    page = with_rows(board, whole, partly, other, nobody)
+    assert (
+        "ran the models of 3 entries again and got the same scores, 1 on all test "
+        "scenarios and 2 on a part of them. The others stand as submitted."
+    ) in page
+    assert "reproduced, 4 of 16 scenarios" in page
+    assert "reproduced, 2 of 16 scenarios" in page
+    assert "weaker evidence" in page
+    assert "got the same scores on all test scenarios." in with_rows(board, whole)
+    assert "scores on a part of the test scenarios." in with_rows(board, partly, other)
+
+
 def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
     """Return a tab with classical solvers of some errors as references."""
     references = []
@@ -571,6 +624,20 @@ def test_many_methods_have_no_film(board: Board) -> None:
     first = read_page_data(page).tabs[0]
     assert first["pictured"] == 3
     assert [row["pictures"] is not None for row in first["rows"][:4]].count(True) == 3
+
+
+def test_pictures_are_let_go_tab_by_tab(board: Board) -> None:
+    """As by one call for all tabs: the memory of a large board stays small."""
+    at_once = picture_first(board.tabs, most=7)
+    tabs: list[Tab] = []
+    for tab in board.tabs:
+        tabs = picture_first([*tabs, tab], most=7)
+    for one, other in zip(tabs, at_once, strict=True):
+        assert one.pictured == other.pictured
+        has_pictures = [row.pictures is not None for row in one.rows]
+        assert has_pictures == [row.pictures is not None for row in other.rows]
+        assert True in has_pictures
+        assert False in has_pictures
 
 
 def test_every_tab_has_a_film(board: Board) -> None:

@@ -198,7 +198,9 @@ def test_map_shows_the_field(page: Page, board: Board) -> None:
     assert np.all((pixels[strong][:, 0] > pixels[strong][:, 2]) == (field[strong] > 0))
 
 
-def test_film_shows_the_obstacle(running: Browser, board: Board, tmp_path: Path) -> None:
+def test_film_shows_the_obstacle(
+    running: Browser, board: Board, tmp_path: Path
+) -> None:
     """The truth and the prediction have a disc where the obstacle stands, and nothing
     beside it.
     """

@@ -155,6 +155,39 @@ def test_a_line_holds_for_its_models_only(own: ModelBoard) -> None:
     assert checks_of(own.find()) == ["verified"]
 
 
+def test_check_counts_whole_and_partial_reproductions(own: ModelBoard) -> None:
+    """A level that its records do not show is an issue, and so are other numbers of
+    scenarios than the test subset has.
+    """
+
+    def counts() -> tuple[int, int]:
+        result = own.find()
+        assert result.findings == ()
+        return result.reproduced_wholly, result.reproduced_partly
+
+    assert counts() == (0, 0)
+    run_again(own, NAME, scenarios=1)
+    assert counts() == (0, 1)
+    run_again(own, NAME)
+    assert counts() == (1, 0)
+
+    verified = own.folder / "verified.yaml"
+    content = verified.read_bytes()
+
+    def change_record(**changes: object) -> list[str]:
+        def change(lines: Content) -> None:
+            lines[PATH]["reproduced"][0].update(changes)
+
+        verified.write_bytes(content)
+        own.edit(verified, change)
+        return checks_of(own.find())
+
+    assert change_record(scenarios=1, of=2) == []
+    assert change_record(scenarios=1, of=1) == ["verified"]
+    assert change_record(scenarios=3, of=2) == ["verified"]
+    assert change_record(difference=0.5) == ["verified"]
+
+
 def test_what_cannot_be_run_is_refused(own: ModelBoard) -> None:
     """A model that was exchanged, an entry without a model, an unknown entry."""
     weights = own.weights.read_bytes()

@@ -11,10 +11,14 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from PIL import Image
 
-from lagbench.figures.report.arrows import arrow_data
+from lagbench.data.box import Box
+from lagbench.data.grid import Grid, Placement, fields
+from lagbench.figures.html import Markup, draw_image_panel, draw_line_panel
+from lagbench.figures.report.arrows import arrow_data, draw_obstacle
 from lagbench.figures.report.distributions import histogram_shares
 from lagbench.figures.report.maps import (
     LEVELS,
+    aspect_of,
     draw_diverging_map,
     draw_sequential_map,
 )
@@ -51,6 +55,31 @@ def test_signed_maps_are_blue_below_zero_and_vermilion_above() -> None:
     assert top_right.tolist() == GREY
     assert lower_left.tolist() == [*BLUE, OPAQUE]
     assert lower_right.tolist() == [*VERMILION, half_opaque]
+
+
+def test_panels_have_the_aspect_of_the_box() -> None:
+    """A square says nothing; the panel of a channel is as wide as the channel."""
+    assert aspect_of(np.zeros((64, 40))) == 1.6
+    square = draw_image_panel(b"", "panel", "a field")
+    assert "aspect-ratio" not in square
+    channel = draw_image_panel(b"", "panel", "a field", aspect=1.6)
+    assert 'style="aspect-ratio:1.6"' in channel
+    lines = draw_line_panel(Markup(""), "panel", "arrows", aspect=1.6)
+    assert 'style="aspect-ratio:1.6"' in lines
+    assert 'viewBox="0 0 200 125"' in lines
+
+
+def test_arrows_stand_around_the_obstacle() -> None:
+    """The disc lies at its place in a channel of 1 by 0.625; boxes may have none."""
+    box = Box(low=(0.0, 0.1875), high=(1.0, 0.8125), periodic=(True, False))
+    grid = Grid(16, Placement.CELL_CENTRES, box)
+    position = np.array([[0.5, 0.5], [0.6, 0.5]])
+    flow = fields(position, np.zeros((2, 2)), grid, full=1.0)
+    disc = draw_obstacle(flow, np.float32([0.25, 0.5, 0.0625]))
+    for attribute in ('cx="50.00"', 'cy="62.50"', 'r="12.50"'):
+        assert attribute in disc
+    assert draw_obstacle(flow, None) == ""
+    assert draw_obstacle(flow, np.float32([0.25, 0.5, 0.5, 0.0625])) == ""
 
 
 def test_values_beyond_the_limit_have_its_colour() -> None:

@@ -36,6 +36,8 @@ SHORTEST = 1.0  # shorter arrows are dots [panel coordinate]
 HEAD = 0.32  # length of an arrow's head, as a share of the arrow
 HEAD_SPREAD = 0.55  # half its width, as a share of its length
 
+DISC_NUMBERS = 3  # x, y and radius
+
 TINY = 1e-300  # keeps quotients finite
 
 
@@ -89,13 +91,36 @@ def _draw_panels(
         "prediction": predicted,
         "difference": predicted - true,
     }
-    classes = gallery.labels[moment.scenario].classes
+    label = gallery.labels[moment.scenario]
+    width, height = fields.grid.box.lengths.tolist()
+    obstacle = draw_obstacle(fields, label.obstacle)
     panels = []
     for name, velocity in velocities.items():
         arrows = _draw_arrows(fields, velocity, limit=limit)
+        drawn = join([obstacle, arrows])
         alt = f"{name}, frame {moment.frame}"
-        panels.append(draw_line_panel(arrows, classes, alt))
+        panel = draw_line_panel(drawn, label.classes, alt, aspect=width / height)
+        panels.append(panel)
     return panels
+
+
+def draw_obstacle(fields: Fields, obstacle: NDArray[np.float32] | None) -> Markup:
+    """Return a fixed disc in the coordinates of a panel; nothing without one.
+
+    A ball is left out: it need not lie in the slice that is drawn.
+    """
+    if obstacle is None or len(obstacle) != DISC_NUMBERS:
+        return Markup("")
+    (left, right), (_, top) = fields.grid.box.bounds
+    scale = SIDE / (right - left)
+    x, y, radius = obstacle.tolist()
+    return tag(
+        "circle",
+        cx=f"{scale * (x - left):.2f}",
+        cy=f"{scale * (top - y):.2f}",
+        r=f"{scale * radius:.2f}",
+        class_="obstacle",
+    )
 
 
 def _draw_arrows(fields: Fields, velocity: Floats, *, limit: float) -> Markup:

@@ -98,6 +98,12 @@ def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:
     return field[np.ix_(*insides)]
 
 
+def aspect_of(field: NDArray[np.floating]) -> float:
+    """Return width over height of a field, shape [x node, y node]."""
+    column_count, row_count = field.shape
+    return column_count / row_count
+
+
 def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     """Return velocity and vorticity of all entries at the key frame (Fig. 5.17)."""
     scenario = subject.scenarios[0]
@@ -124,7 +130,9 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
             shown = crop_to_walls(subject.task, field)
             png = draw_map(shown, limit)
             alt = f"{what} of {name}, frame {frame}"
-            panels.append(draw_image_panel(png, label.classes, alt))
+            aspect = aspect_of(shown)
+            panel = draw_image_panel(png, label.classes, alt, aspect=aspect)
+            panels.append(panel)
         return panels
 
     error_name = "vorticity error"
@@ -178,7 +186,8 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     def draw_panel(field: Floats, what: str, frame: int) -> Markup:
         shown = crop_to_walls(subject.task, field)
         png = draw_diverging_map(shown, limit)
-        return draw_image_panel(png, label.classes, f"{what}, frame {frame}")
+        alt = f"{what}, frame {frame}"
+        return draw_image_panel(png, label.classes, alt, aspect=aspect_of(shown))
 
     true_panels = []
     for moment in moments:
@@ -230,7 +239,8 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
             png = draw_diverging_map(shown, limit)
             classes = gallery.labels[moment.scenario].classes
             alt = f"{what}, scenario {moment.scenario}"
-            panels.append(draw_image_panel(png, classes, alt))
+            aspect = aspect_of(shown)
+            panels.append(draw_image_panel(png, classes, alt, aspect=aspect))
         return panels
 
     what = "Vorticity"

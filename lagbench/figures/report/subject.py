@@ -264,6 +264,8 @@ class ScenarioLabel:
     reynolds: float | None  # Reynolds number, None where there is none
     mark: str  # family, pair or frequency, as in "falling circle", or empty
     is_slice: bool = False  # whether maps are slices of three dimensions
+    # centre and radius of a fixed obstacle [length]; None without one
+    obstacle: NDArray[np.float32] | None = None
 
     @property
     def classes(self) -> str:
@@ -407,6 +409,7 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
         reynolds=reynolds,
         mark=", ".join(marks),
         is_slice=truth.scenario.config.box.dimension == 3,
+        obstacle=truth.obstacle,
     )
 
 
