@@ -948,7 +948,7 @@ def _place_obstacle(
     """Return x, y and radius of an obstacle in the picture; None without one."""
     if obstacle is None:
         return None
-    centre = obstacle[:-1]
+    centre = obstacle[:-1].astype(np.float64)
     radius = float(obstacle[-1])
     if box.dimension == 3:
         view = View(box)

@@ -101,7 +101,7 @@ def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:
 def aspect_of(field: NDArray[np.floating]) -> float:
     """Return width over height of a field, shape [x node, y node]."""
     column_count, row_count = field.shape
-    return column_count / row_count
+    return float(column_count / row_count)
 
 
 def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
