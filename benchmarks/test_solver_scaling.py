@@ -22,7 +22,7 @@ ROWS = table_3_1.THESIS[:LAST]
 
 
 @pytest.fixture(scope="module")
-def found() -> list[table_3_1.Measurement]:
+def found() -> list[table_3_1.TimedRow]:
     """Collect the measurements of all rows."""
     return []
 
@@ -31,10 +31,10 @@ def found() -> list[table_3_1.Measurement]:
 def test_row(
     benchmark: BenchmarkFixture,
     row: table_3_1.ThesisRow,
-    found: list[table_3_1.Measurement],
+    found: list[table_3_1.TimedRow],
 ) -> None:
     """Time frames of the row's own substeps, and substeps in runs of 20."""
-    rounds: list[table_3_1.Measurement] = []
+    rounds: list[table_3_1.TimedRow] = []
     best_seconds(
         benchmark,
         lambda: rounds.append(table_3_1.measure(row, device=DEVICE, repeats=3)),
@@ -51,7 +51,7 @@ def test_row(
     )
 
 
-def test_exponents(found: list[table_3_1.Measurement], tmp_path: Path) -> None:
+def test_exponents(found: list[table_3_1.TimedRow], tmp_path: Path) -> None:
     """A substep's time grows with the particles at most to the power 1.05."""
     if len(found) < 2:
         pytest.skip("needs the rows of this module in the same run")

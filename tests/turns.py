@@ -50,3 +50,7 @@ def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[C
         return list(cases)
     first = -(turn() + shift) % turns
     return list(cases[first::turns])
+
+
+PROGRAMS = of_this_turn(("README", "notebook", "demo"), turns=3, shift=2)
+"""Which of three programs runs whole: each trains a model until it is good."""

@@ -338,6 +338,7 @@ def test_the_second_process_says_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not of_this_turn([0], turns=2), reason="not in this turn")
 def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
     """A loss that overflows ends both processes, and one of them says so."""
     settings = [word for key in SHARED for word in ("--set", key)]

@@ -11,6 +11,7 @@ import pytest
 import torch
 import yaml
 from conftest import SIZE, SPLIT
+from turns import PROGRAMS
 from typer.testing import Result
 
 from lagbench.cli import demo
@@ -208,6 +209,7 @@ def test_another_leaderboard_is_refused_before_the_work(
 
 
 @pytest.mark.slow
+@pytest.mark.skipif("demo" not in PROGRAMS, reason="not in this turn")
 def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
     """It gives four verified data sets, and a model that beats the naive baselines."""
     data = run_demo(tmp_path / "demo", run)

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from score_bench import ScoreBench
 from simple_models import install
-from turns import of_this_turn
+from turns import PROGRAMS
 from typer.main import get_command
 
 import lagbench
@@ -35,8 +35,6 @@ from lagbench.scoring import flags
 CLONE = Path(__file__).parents[2]
 README = (CLONE / "README.md").read_text()
 NOTEBOOK = CLONE / "docs" / "notebooks" / "quickstart.ipynb"
-# The two train the same model with the same functions.
-PROGRAMS = of_this_turn(["README", "notebook", "notebook"], turns=3, shift=2)
 PAGES = [CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md"))]
 
 
