@@ -25,7 +25,7 @@ types: $(VENV)/.dev
 	$(BIN)/mypy lagbench studies validation
 
 bench: $(VENV)/.dev
-	$(BIN)/pytest benchmarks
+	OMP_NUM_THREADS=1 $(BIN)/pytest benchmarks -s
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
