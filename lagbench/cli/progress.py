@@ -88,16 +88,17 @@ def _print_lines(unit: str, seconds_per_line: float) -> Listener:
             return
         last_time = now
 
-        share = ""
+        parts = []
         if progress.total:
-            share = f"{progress.done / progress.total:.0%}, "
-        remaining = ""
+            parts.append(f"{progress.done / progress.total:.0%}")
+        rate = _format_rate(progress, unit)
+        if rate:
+            parts.append(rate)
         seconds_left = _seconds_left(progress)
         if math.isfinite(seconds_left):
-            remaining = f", {format_seconds(seconds_left)} left"
-        rate = _format_rate(progress, unit)
+            parts.append(f"{format_seconds(seconds_left)} left")
         with suppress(OSError):  # the work goes on without a reader
-            typer.echo(f"{progress.stage}: {share}{rate}{remaining}", err=True)
+            typer.echo(f"{progress.stage}: {', '.join(parts)}", err=True)
 
     return print_progress
 
@@ -110,7 +111,12 @@ def _seconds_left(progress: Progress) -> float:
 
 
 def _format_rate(progress: Progress, unit: str) -> str:
-    """Return the count, and the rate: below one a second the time of one."""
+    """Return the count, and the rate: below one a second the time of one.
+
+    Nothing where the work has none of the unit.
+    """
+    if not progress.scenarios and not progress.scenarios_done:
+        return ""
     count = f"{progress.scenarios_done}"
     if progress.scenarios:
         count = f"{count}/{progress.scenarios}"

@@ -46,6 +46,19 @@ def test_a_file_gets_lines_with_the_count_and_the_time_left(
     assert re.findall(pattern, output.err) == [("60", "3 min"), ("200", "40 s")]
 
 
+def test_work_without_scenarios_is_told_by_its_share(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """``costs of curl-noise tiny: 38%, 0 scenarios`` was printed."""
+    timing = Progress(
+        stage="costs", done=3, total=8, scenarios_done=0, scenarios=0, seconds=1.0
+    )
+    with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
+        assert listener is not None
+        listener(timing)
+    assert capsys.readouterr().err == "costs: 38%\n"
+
+
 def test_an_unknown_total_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
         assert listener is not None
