@@ -143,14 +143,16 @@ OVERVIEW_NOTES = (
 LEVEL_MEANINGS = {
     Level.AS_SUBMITTED: "the maintainers did not follow the scores",
     Level.SCORED_AGAIN: "the maintainers scored the predictions of the submitter again",
-    Level.REPRODUCED: (
-        "the maintainers ran the model and got the same scores; where a number of "
-        "scenarios follows, on these only. That is weaker evidence: the scores on the "
-        "other scenarios are as submitted"
-    ),
+    Level.REPRODUCED: "the maintainers ran the model and got the same scores",
     Level.BLIND: "the model was also scored on scenarios drawn after it was frozen",
 }
 """What the maintainers did with an entry, in words behind the name of its level."""
+
+PARTIAL_MEANING = (
+    "Where a number of scenarios stands behind the level, the maintainers ran the "
+    "model on these test scenarios only. That is weaker evidence: the scores on the "
+    "others are as submitted."
+)
 
 RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
 
@@ -761,7 +763,11 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         meanings = []
         for level in sorted(levels, key=lambda level: level.rank):
             meanings.append(f"{level}: {LEVEL_MEANINGS[level]}")
-        yield _explain("scores", f"{'; '.join(meanings)}.")
+        meaning = f"{'; '.join(meanings)}."
+        lines = [row.verified for row in tab.rows if row.verified is not None]
+        if any(line.is_reproduced and not line.is_reproduced_wholly for line in lines):
+            meaning += f" {PARTIAL_MEANING}"
+        yield _explain("scores", meaning)
     if any(reference.is_slow for reference in tab.references):
         yield _explain(*SLOW)
     yield escaped(

@@ -506,6 +506,7 @@ def test_the_page_tells_whole_reproductions_from_partial_ones(board: Board) -> N
     assert "reproduced, 4 of 16 scenarios" in page
     assert "reproduced, 2 of 16 scenarios" in page
     assert "weaker evidence" in page
+    assert "weaker evidence" not in with_rows(board, whole, nobody)
     assert "got the same scores on all test scenarios." in with_rows(board, whole)
     assert "scores on a part of the test scenarios." in with_rows(board, partly, other)
 
