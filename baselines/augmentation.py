@@ -36,6 +36,7 @@ from .graph import Bounds
 
 # accelerations in the way back to the true path at most, in their deviations
 _MOST_DEVIATIONS = 3.0
+_WAVES = 3  # that displace the particles of a window
 
 
 class Symmetry(enum.StrEnum):
@@ -425,6 +426,51 @@ def draw_noise_levels(most: float, batch: Batch, generator: torch.Generator) -> 
     level = torch.rand(batch.windows, generator=generator, device=generator.device)
     sample = batch.sample.to(level.device)
     return most * level[sample][:, None, None]
+
+
+def draw_waves(
+    position: Tensor,
+    sample: Tensor,
+    windows: int,
+    generator: torch.Generator,
+    *,
+    strain: float,
+    shortest: float,
+) -> Tensor:
+    """Return displacements by random waves [length], of the shape of the positions.
+
+    A wave displaces particles along its own direction, so it compresses matter at some
+    places and stretches it at others. Each window has three waves. Direction and phase
+    are uniform, the logarithm of the wavelength is uniform over a decade, and the
+    largest strain of a wave is uniform up to the given one.
+
+    Args:
+        position: positions [length], shape [particle, axis].
+        sample: window of each particle, shape [particle].
+        windows: number of windows.
+        generator: source of the waves.
+        strain: largest strain of a wave.
+        shortest: shortest wavelength [length]; the longest is ten times as long.
+    """
+    dimension = position.shape[1]
+    device = generator.device
+    shape = (windows, _WAVES)
+    normal = torch.randn((*shape, dimension), generator=generator, device=device)
+    direction = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    phase = 2 * math.pi * torch.rand(shape, generator=generator, device=device)
+    decade = torch.rand(shape, generator=generator, device=device)
+    wavelength = shortest * 10.0**decade
+    wavenumber = 2 * math.pi / wavelength
+    wave_strain = strain * torch.rand(shape, generator=generator, device=device)
+    amplitude = wave_strain / wavenumber
+
+    of_particle = sample.to(device)
+    direction = direction[of_particle]  # [particle, wave, axis]
+    projection = (direction * position[:, None].to(direction)).sum(dim=-1)
+    angle = wavenumber[of_particle] * projection + phase[of_particle]
+    elongation = amplitude[of_particle] * torch.sin(angle)
+    displacement = (elongation[..., None] * direction).sum(dim=1)
+    return displacement.to(position)
 
 
 def augment(

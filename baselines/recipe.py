@@ -222,7 +222,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "body_force": False,
         "obstacle": False,
         "noise_spread": False,
-        "displacement_std": 0.0,
+        "compression": 0.0,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

@@ -33,7 +33,7 @@ from lagbench.errors import UsageError
 from .augmentation import (
     Symmetry,
     augment,
-    draw_noise_levels,
+    draw_waves,
     velocity_towards_path,
 )
 from .baseline import (
@@ -258,7 +258,7 @@ class GraphNetworkOptions(Options):
             "forgetful",
             "noise_std",
             "noise_spread",
-            "displacement_std",
+            "compression",
             "loss",
             "loss_norm",
             "link_weight",
@@ -287,10 +287,9 @@ class GraphNetworkOptions(Options):
     # whether each window draws the deviation of its noise, from none to noise_std: the
     # model then learns from true states and from far ones
     noise_spread: bool = False
-    # largest deviation of the displacements that particles get in training windows, per
-    # component [length]; each window draws its own, from none to this one. They change
-    # the density and no velocity: with recovery the model learns to even it out
-    displacement_std: float = Field(default=0.0, ge=0.0, allow_inf_nan=False)
+    # largest strain of the waves that displace the particles of training windows, from
+    # none in each wave; with recovery the model learns to even out densities
+    compression: float = Field(default=0.0, ge=0.0, le=1.0)
     loss: LossWeights = LossWeights()  # weights of the six terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
     # weight of an operator's link prediction; the operator's own when None
@@ -348,13 +347,13 @@ class GraphNetwork(Baseline):
                 got=f"model.noise_std={options.noise_std}",
                 fix="--set model.noise_std=1e-3, or leave model.noise_spread out",
             )
-        if options.displacement_std > 0.0 and options.recovery is None:
+        if options.compression > 0.0 and options.recovery is None:
             raise UsageError(
                 "displaced particles have no way back to the true path",
-                where="model.displacement_std",
+                where="model.compression",
                 expected="model.recovery, a number of frames",
                 got="model.recovery=null",
-                fix="--set model.recovery=8, or leave model.displacement_std out",
+                fix="--set model.recovery=8, or leave model.compression out",
             )
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
@@ -484,7 +483,7 @@ class GraphNetwork(Baseline):
         state = self.start(given)
         if generator is not None:
             state = self._forget(state, batch.windows, generator)
-            state = self._displace(state, batch, generator)
+            state = self._compress(state, batch.windows, generator)
         first_frame = self.history  # the first frame whose error counts
         if generator is not None and self.options.pushforward:
             state, frame_count = self._push_forward(state, generator)
@@ -507,19 +506,22 @@ class GraphNetwork(Baseline):
             means[name] = of_steps.mean()
         return means
 
-    def _displace(
-        self, state: ParticleState, batch: Batch, generator: torch.Generator
+    def _compress(
+        self, state: ParticleState, windows: int, generator: torch.Generator
     ) -> ParticleState:
-        """Return the state with particles moved at random; velocities stay."""
-        most = self.options.displacement_std
-        if most == 0.0:
+        """Return the state with particles displaced by waves; velocities stay."""
+        strain = self.options.compression
+        if strain == 0.0:
             return state
-        std = draw_noise_levels(most, batch, generator)
-        shape = state.position.shape
-        normal = torch.randn(shape, generator=generator, device=generator.device)
-        displacement = normal * std[:, 0]
-        moved = state.position + displacement.to(state.position)
-        position = self._keep_inside(moved)
+        displacement = draw_waves(
+            state.position,
+            state.sample,
+            windows,
+            generator,
+            strain=strain,
+            shortest=self.radius,
+        )
+        position = self._keep_inside(state.position + displacement)
         return replace(state, position=position)
 
     @torch.no_grad()

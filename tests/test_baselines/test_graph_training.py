@@ -373,6 +373,36 @@ def test_no_noise_cannot_spread() -> None:
     assert caught.value.where == "model.noise_spread"
 
 
+def test_displaced_particles_are_to_come_back() -> None:
+    """An untrained network leaves fluid at rest, where a quarter of the way is asked.
+
+    Deviations are drawn from none to the largest: their mean square is a third of its.
+    """
+    displacement_std = 1e-5  # so small that the way back has no limit
+    at_rest = np.repeat(swirl(0, 1), 8, axis=0)
+    windows = batch(*[at_rest] * 8)
+    options = {"layers": 1, "latent": 4, "recovery": 4.0}
+    model = network(
+        noise_std=0.0, clamp=False, displacement_std=displacement_std, **options
+    )
+    errors = []
+    for seed in range(25):
+        terms = model(windows, seeded(seed))
+        errors.append(float(terms["velocity"].detach()))
+    way_back = displacement_std / 4.0 / model.velocity.std
+    expected = float(torch.sum(way_back**2)) / 3
+    assert np.mean(errors) == pytest.approx(expected, rel=0.3)
+    without_noise = model(windows)
+    assert float(without_noise["velocity"]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_displaced_particles_need_a_way_back() -> None:
+    """Without one the network would learn nothing from them."""
+    with pytest.raises(UsageError) as caught:
+        network(displacement_std=1e-3)
+    assert caught.value.where == "model.displacement_std"
+
+
 def test_steps_without_gradients_predict_no_links(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
