@@ -22,6 +22,7 @@ from simple_models import (
 from torch import Tensor
 from turns import of_this_turn
 
+from lagbench.baselines.augmentation import draw_waves
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.dataset_info import read_dataset_info
@@ -373,34 +374,71 @@ def test_no_noise_cannot_spread() -> None:
     assert caught.value.where == "model.noise_spread"
 
 
-def test_displaced_particles_are_to_come_back() -> None:
-    """An untrained network leaves fluid at rest, where a quarter of the way is asked.
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_waves_compress_and_do_not_turn(dimension: int) -> None:
+    """Their gradient is symmetric: no particle turns about another one.
 
-    Deviations are drawn from none to the largest: their mean square is a third of its.
+    A wave along x of amplitude strain / k strains by the given share at most, and
+    there are three.
     """
-    displacement_std = 1e-5  # so small that the way back has no limit
+    strain = 0.4
+    points = torch.rand(60, dimension, generator=seeded(0), dtype=torch.float64)
+    sample = torch.arange(60) // 20  # three windows
+    spacing = 1e-3
+
+    def displacement(position: Tensor) -> Tensor:
+        waves = draw_waves(position, sample, 3, seeded(1), strain=strain, shortest=0.1)
+        return waves.double()
+
+    columns = []
+    for axis in range(dimension):
+        step = torch.zeros(dimension, dtype=torch.float64)
+        step[axis] = spacing
+        after = displacement(points + step)
+        before = displacement(points - step)
+        columns.append((after - before) / (2 * spacing))
+    gradient = torch.stack(columns, dim=2)  # [particle, component, axis]
+    torch.testing.assert_close(gradient, gradient.mT, atol=2e-3, rtol=0.0)
+    strains = torch.linalg.eigvalsh((gradient + gradient.mT) / 2)
+    assert 0.05 < float(strains.abs().max()) <= 3 * strain
+    # Windows have waves of their own.
+    same_points = points[:1].expand(60, dimension)
+    at_one_point = displacement(same_points)
+    assert len(torch.unique(at_one_point, dim=0)) == 3
+
+
+def test_compressed_particles_are_to_come_back() -> None:
+    """An untrained network leaves fluid at rest: all of the way back is its error."""
     at_rest = np.repeat(swirl(0, 1), 8, axis=0)
-    windows = batch(*[at_rest] * 8)
-    options = {"layers": 1, "latent": 4, "recovery": 4.0}
-    model = network(
-        noise_std=0.0, clamp=False, displacement_std=displacement_std, **options
+    windows = batch(*[at_rest] * 4)
+    options = {"layers": 1, "latent": 4, "noise_std": 0.0, "clamp": False}
+    strain = 1e-3  # so small that the way back has no limit
+    recovery = 4.0
+    model = network(compression=strain, recovery=recovery, **options)
+    in_training = model(windows, seeded(3))
+    in_validation = model(windows)
+
+    last = windows.position[:, model.history - 1]
+    displacement = draw_waves(
+        last,
+        windows.sample,
+        windows.windows,
+        seeded(3),
+        strain=strain,
+        shortest=model.radius,
     )
-    errors = []
-    for seed in range(25):
-        terms = model(windows, seeded(seed))
-        errors.append(float(terms["velocity"].detach()))
-    way_back = displacement_std / 4.0 / model.velocity.std
-    expected = float(torch.sum(way_back**2)) / 3
-    assert np.mean(errors) == pytest.approx(expected, rel=0.3)
-    without_noise = model(windows)
-    assert float(without_noise["velocity"]) == pytest.approx(0.0, abs=1e-9)
+    way_back = displacement / recovery / model.velocity.std
+    expected = float((way_back**2).sum(dim=1).mean())
+    assert expected > 0.0
+    assert float(in_training["velocity"]) == pytest.approx(expected, rel=1e-3)
+    assert float(in_validation["velocity"]) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_displaced_particles_need_a_way_back() -> None:
+def test_compressed_particles_need_a_way_back() -> None:
     """Without one the network would learn nothing from them."""
     with pytest.raises(UsageError) as caught:
-        network(displacement_std=1e-3)
-    assert caught.value.where == "model.displacement_std"
+        network(compression=0.5)
+    assert caught.value.where == "model.compression"
 
 
 def test_steps_without_gradients_predict_no_links(

@@ -101,7 +101,7 @@ OTHER = {
         "recovery": 4.0,
         "noise_std": 0.5,
         "noise_spread": True,
-        "displacement_std": 0.5,
+        "compression": 0.5,
         "forgetful": 0.7,
         "loss_norm": "l1",
     },
