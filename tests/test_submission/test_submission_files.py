@@ -237,7 +237,7 @@ WRONG_LABELS: list[tuple[Labels, str]] = [
     ({"method": "a\x07"}, "'method'"),
     ({"method": "\udcff"}, "'method'"),
     ({"method": "x" * 201}, "'method'"),
-    ({"method": None}, "'method'"),
+    ({"method": None}, "method"),
     ({"dataset_sha256": "zz"}, "dataset_sha256"),
     ({"dataset_sha256": ""}, "dataset_sha256"),
     ({"dataset_sha256": 5}, "dataset_sha256"),
