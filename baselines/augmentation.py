@@ -469,7 +469,8 @@ def draw_waves(
     projection = (direction * position[:, None].to(direction)).sum(dim=-1)
     angle = wavenumber[of_particle] * projection + phase[of_particle]
     elongation = amplitude[of_particle] * torch.sin(angle)
-    displacement = (elongation[..., None] * direction).sum(dim=1)
+    by_wave = elongation[..., None] * direction
+    displacement: Tensor = by_wave.sum(dim=1)
     return displacement.to(position)
 
 
