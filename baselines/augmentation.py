@@ -37,6 +37,7 @@ from .graph import Bounds
 # accelerations in the way back to the true path at most, in their deviations
 _MOST_DEVIATIONS = 3.0
 _WAVES = 3  # that displace the particles of a window
+_LEAST_WAVENUMBER = 1e-6  # far below that of any box [1/length]
 
 
 class Symmetry(enum.StrEnum):
@@ -436,13 +437,15 @@ def draw_waves(
     *,
     strain: float,
     shortest: float,
+    period: Tensor,
 ) -> Tensor:
     """Return displacements by random waves [length], of the shape of the positions.
 
     A wave displaces particles along its own direction, so it compresses matter at some
     places and stretches it at others. Each window has three waves. Direction and phase
     are uniform, the logarithm of the wavelength is uniform over a decade, and the
-    largest strain of a wave is uniform up to the given one.
+    largest strain of a wave is uniform up to the given one. Along a periodic axis a
+    whole number of waves fits the period.
 
     Args:
         position: positions [length], shape [particle, axis].
@@ -451,25 +454,33 @@ def draw_waves(
         generator: source of the waves.
         strain: largest strain of a wave.
         shortest: shortest wavelength [length]; the longest is ten times as long.
+        period: period of each axis [length], infinite between walls, shape [axis].
     """
-    dimension = position.shape[1]
     device = generator.device
     shape = (windows, _WAVES)
+    dimension = position.shape[1]
     normal = torch.randn((*shape, dimension), generator=generator, device=device)
     direction = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
     phase = 2 * math.pi * torch.rand(shape, generator=generator, device=device)
     decade = torch.rand(shape, generator=generator, device=device)
     wavelength = shortest * 10.0**decade
-    wavenumber = 2 * math.pi / wavelength
     wave_strain = strain * torch.rand(shape, generator=generator, device=device)
-    amplitude = wave_strain / wavenumber
+
+    wave_vector = direction * (2 * math.pi / wavelength[..., None])
+    periods = period.to(device)
+    waves_in_period = torch.round(wave_vector * periods / (2 * math.pi))
+    fitting = 2 * math.pi * waves_in_period / periods
+    wave_vector = torch.where(periods.isfinite(), fitting, wave_vector)
+    wavenumber = torch.linalg.vector_norm(wave_vector, dim=-1, keepdim=True)
+    # A wave longer than the box fits no period: it displaces nothing.
+    wavenumber = wavenumber.clamp(min=_LEAST_WAVENUMBER)
+    amplitude = wave_strain[..., None] * wave_vector / wavenumber**2
 
     of_particle = sample.to(device)
-    direction = direction[of_particle]  # [particle, wave, axis]
-    projection = (direction * position[:, None].to(direction)).sum(dim=-1)
-    angle = wavenumber[of_particle] * projection + phase[of_particle]
-    elongation = amplitude[of_particle] * torch.sin(angle)
-    by_wave = elongation[..., None] * direction
+    positions = position[:, None].to(device)
+    products = wave_vector[of_particle] * positions
+    angle = products.sum(dim=-1) + phase[of_particle]
+    by_wave = amplitude[of_particle] * torch.sin(angle)[..., None]
     displacement: Tensor = by_wave.sum(dim=1)
     return displacement.to(position)
 

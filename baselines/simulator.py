@@ -287,8 +287,9 @@ class GraphNetworkOptions(Options):
     # whether each window draws the deviation of its noise, from none to noise_std: the
     # model then learns from true states and from far ones
     noise_spread: bool = False
-    # largest strain of the waves that displace the particles of training windows, from
-    # none in each wave; with recovery the model learns to even out densities
+    # Three waves displace the particles of each training window. This is the largest
+    # strain of one wave; each draws its own, from 0. With recovery the model learns to
+    # even out densities.
     compression: float = Field(default=0.0, ge=0.0, le=1.0)
     loss: LossWeights = LossWeights()  # weights of the six terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
@@ -520,6 +521,7 @@ class GraphNetwork(Baseline):
             generator,
             strain=strain,
             shortest=self.radius,
+            period=self.box.period,
         )
         position = self._keep_inside(state.position + displacement)
         return replace(state, position=position)

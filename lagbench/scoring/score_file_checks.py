@@ -155,7 +155,7 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
     film, _ = _unpack(group["film"])
     obstacle = None
     if "obstacle" in group.attrs:
-        obstacle = np.asarray(group.attrs["obstacle"], np.float32)
+        obstacle = _read_obstacle(group)
     preview = Preview(
         scenario=int(np.ravel(group.attrs["scenario"])[0]),
         map_frames=_read_integers(group["map_frame"]),
@@ -169,6 +169,18 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
         obstacle=obstacle,
     )
     return preview, precision
+
+
+def _read_obstacle(group: h5py.Group) -> NDArray[np.float32]:
+    """Return centre and radius of the obstacle [length].
+
+    Raises:
+        ValueError: they are no floats.
+    """
+    values = np.asarray(group.attrs["obstacle"])
+    if values.dtype != np.float32:
+        raise ValueError("the obstacle is no array of float32")
+    return values
 
 
 def _unpack(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
@@ -240,6 +252,10 @@ def _check_obstacle(obstacle: NDArray[np.float32] | None) -> None:
         return
     if not np.isfinite(obstacle).all() or obstacle[-1] <= 0.0:
         raise ValueError("the obstacle has no place or no size")
+    low, high = FILM_RANGE
+    place = obstacle[:-1]
+    if place.min() < low or place.max() > high or obstacle[-1] > high - low:
+        raise ValueError("the obstacle leaves the range of films")
 
 
 def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:

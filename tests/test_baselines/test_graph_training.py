@@ -387,7 +387,15 @@ def test_waves_compress_and_do_not_turn(dimension: int) -> None:
     spacing = 1e-3
 
     def displacement(position: Tensor) -> Tensor:
-        waves = draw_waves(position, sample, 3, seeded(1), strain=strain, shortest=0.1)
+        waves = draw_waves(
+            position,
+            sample,
+            3,
+            seeded(1),
+            strain=strain,
+            shortest=0.1,
+            period=torch.full((dimension,), torch.inf),
+        )
         return waves.double()
 
     columns = []
@@ -405,6 +413,22 @@ def test_waves_compress_and_do_not_turn(dimension: int) -> None:
     same_points = points[:1].expand(60, dimension)
     at_one_point = displacement(same_points)
     assert len(torch.unique(at_one_point, dim=0)) == 3
+
+
+def test_waves_fit_the_period_of_an_axis() -> None:
+    """A particle and its image one period on are displaced alike."""
+    period = torch.tensor([0.7, torch.inf])
+    points = torch.rand(40, 2, generator=seeded(0))
+    sample = torch.arange(40) // 20
+    displacements = []
+    for image in (points, points + torch.tensor([0.7, 0.0])):
+        waves = draw_waves(
+            image, sample, 2, seeded(1), strain=0.5, shortest=0.1, period=period
+        )
+        displacements.append(waves)
+    first, second = displacements
+    assert float(first.abs().max()) > 1e-3
+    torch.testing.assert_close(first, second, atol=1e-6, rtol=0.0)
 
 
 def test_compressed_particles_are_to_come_back() -> None:
@@ -426,6 +450,7 @@ def test_compressed_particles_are_to_come_back() -> None:
         seeded(3),
         strain=strain,
         shortest=model.radius,
+        period=model.box.period,
     )
     way_back = displacement / recovery / model.velocity.std
     expected = float((way_back**2).sum(dim=1).mean())

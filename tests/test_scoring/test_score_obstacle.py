@@ -41,7 +41,7 @@ def write_with(
 
 
 def test_the_obstacle_reads_back(card: ScoreCard, tmp_path: Path) -> None:
-    """It has the same bits; a file without one has the bytes that it had before."""
+    """It has the same bits; a file without one does not name it."""
     path = write_with(card, DISC, tmp_path / "scores.nc")
     read = read_score_file(path).preview.obstacle
     assert read is not None
@@ -62,6 +62,10 @@ def test_the_obstacle_reads_back(card: ScoreCard, tmp_path: Path) -> None:
         np.float32([0.25, 0.5, 0.0]),
         np.float32([0.25, np.nan, 0.1]),
         np.float32(0.1),
+        np.array([0.25, 0.5, 1e300]),
+        np.array([b"0.25", b"0.5", b"0.1"]),
+        np.float32([1e38, 0.5, 0.1]),
+        np.float32([0.25, 0.5, 1e38]),
     ],
 )
 def test_an_obstacle_without_place_or_size_is_refused(
