@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import itertools
 import os
 import re
 import stat
@@ -33,6 +34,7 @@ PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics"
 """Entry points by which other packages add models, splits and metrics."""
 
 _WORD = re.compile(r"\S+")
+_DIGITS = re.compile(r"[0-9]+")
 # The scheme before it is only looked back at: a search through a long text is linear.
 _HOST_OF_ADDRESS = re.compile(r"(?<=[A-Za-z0-9+.-]):/+([^/]*)")
 _IPV6_HOST = re.compile(r"\[[0-9A-Fa-f:.]+(?:%\w+)?\](?::[0-9]*)?")
@@ -331,17 +333,25 @@ def check_regular(
 def suggest_file(path: Path) -> str | None:
     """Return a hint that names the file of the same folder with the nearest name.
 
-    None where the folder holds no such file.
+    A name with other digits is another scenario or run, so it is not suggested. None
+    where the folder holds no such file.
     """
     names: list[str] = []
-    with suppress(OSError, ValueError):
-        names = os.listdir(path.parent)
-    if len(names) > MOST_FILES:
+    with suppress(OSError, ValueError), os.scandir(path.parent) as entries:
+        for entry in itertools.islice(entries, MOST_FILES + 1):
+            names.append(entry.name)
+    if not names or len(names) > MOST_FILES:
         return None
-    close_names = difflib.get_close_matches(path.name, sorted(names), n=1, cutoff=0.75)
-    if not close_names:
-        return None
-    return f"did you mean {path.with_name(close_names[0])}?"
+
+    name_without_digits = _DIGITS.sub("", path.name)
+    close_names = difflib.get_close_matches(
+        path.name, sorted(names), n=len(names), cutoff=0.75
+    )
+    for name in close_names:
+        differs_in_letters = _DIGITS.sub("", name) != name_without_digits
+        if differs_in_letters and os.path.isfile(path.with_name(name)):
+            return f"did you mean {path.with_name(name)}?"
+    return None
 
 
 def format_count(number: int, noun: str) -> str:
