@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import functools
 import importlib
@@ -26,7 +27,12 @@ from .cli.commands import (
     SEASON_COMMANDS,
     CommandEntry,
 )
-from .cli.typed_settings import NEGATIVE_NUMBER, advise_on_lists, advise_on_settings
+from .cli.typed_settings import (
+    NEGATIVE_NUMBER,
+    advise_on_lists,
+    advise_on_settings,
+    shorten_word,
+)
 from .errors import (
     LagbenchError,
     UnreadableFileError,
@@ -83,7 +89,8 @@ _DECIMAL_COMMA = re.compile(r"[0-9]+,[0-9]+")
 SIZE_NAMES = frozenset({"tiny", "mini", "full"})
 """Names of sizes that a user may write behind the split."""
 
-MOST_LETTERS = 60  # of a word of the command line in a message
+NEAR_NAME = 0.8
+"""Likeness of two options, of 1, from which one is a misspelt other."""
 
 
 class _LazyCommand(TyperCommand):
@@ -230,7 +237,7 @@ def _name_help(command: str) -> str:
 
 def _typed_words() -> str | None:
     """Return the words behind ``lagbench``; None where there are none."""
-    return " ".join(map(_quote_word, sys.argv[1:])) or None
+    return " ".join(map(shorten_word, sys.argv[1:])) or None
 
 
 def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN401
@@ -245,10 +252,13 @@ def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN4
             "the size and write it into predictions",
         )
     fix = _name_help(command)
-    possible = ", ".join(error.possibilities or ())
-    if possible:
-        fix = f"did you mean {possible}? {fix}"
-    if command == "lagbench train":
+    options = error.possibilities or ()
+    if options:
+        fix = f"did you mean {', '.join(options)}? {fix}"
+    is_misspelt = difflib.get_close_matches(
+        error.option_name, options, cutoff=NEAR_NAME
+    )
+    if command == "lagbench train" and not is_misspelt:
         setting = "--set training.steps=100"
         fix = f"the values of a recipe follow --set, as in {setting}; {fix}"
     # The value of a setting may be a negative number.
@@ -292,14 +302,15 @@ def _bad_parameter_error(error: Any, command: str) -> LagbenchError:  # noqa: AN
     name = _parameter_name(error)
     detail = _first_detail(error)
     fix = f"give another value; {_name_help(command)}"
-    if detail and _DECIMAL_COMMA.fullmatch(str(detail["input"])):
+    is_number = detail is not None and detail["type"].startswith("float")
+    if is_number and _DECIMAL_COMMA.fullmatch(str(detail["input"])):
         number = str(detail["input"]).replace(",", ".")
         fix = f"write a decimal point: {name} {number}"
     return UsageError(
         f"{name} has a value that does not fit",
         where=command,
         expected=describe_expectation(detail) if detail else str(error.message),
-        got=_quote_word(repr(detail["input"])) if detail else None,
+        got=shorten_word(repr(detail["input"])) if detail else None,
         fix=fix,
     )
 
@@ -331,16 +342,23 @@ def _extra_words_error(
 ) -> UsageError:
     """Return the error for words that are neither arguments nor options."""
     usage = " ".join([command, *context.command.collect_usage_pieces(context)])
-    fix = f"leave them out, or put quotes around a text with blanks; `{command} --help`"
+    has_size = any("--size" in parameter.opts for parameter in context.command.params)
     size_names = SIZE_NAMES.intersection(words.split())
-    if size_names:
+    if has_size and size_names:
         fix = f"name the size by an option: --size {min(size_names)}"
+    else:
+        fix = (
+            advise_on_lists(sys.argv)
+            or advise_on_settings(sys.argv)
+            or "leave them out, or put quotes around a text with blanks; "
+            f"`{command} --help`"
+        )
     return UsageError(
         "too many words",
         where=command,
         expected=usage,
-        got=_quote_word(words),
-        fix=advise_on_lists(sys.argv) or advise_on_settings(sys.argv) or fix,
+        got=shorten_word(words),
+        fix=fix,
     )
 
 
@@ -381,10 +399,6 @@ def _first_detail(error: Any) -> Any:  # noqa: ANN401 (two copies of click)
     if not hasattr(cause, "errors"):
         return None
     return cause.errors()[0]
-
-
-def _quote_word(word: str) -> str:
-    return word if len(word) <= MOST_LETTERS else f"{word[:MOST_LETTERS]}..."
 
 
 def _interruption_message(command: str | None) -> str:

@@ -11,8 +11,23 @@ from lagbench.errors import UsageError
 NEGATIVE_NUMBER = re.compile(r"-[0-9.].*")
 """A word that begins as an option does, and is the value of a setting."""
 
-LIST_OPTIONS = ("--subset", "--scenarios", "--bounds", "--periodic")
+LIST_FORMS = {
+    "--scenarios": re.compile("[0-9,-]+"),
+    "--bounds": re.compile("[0-9.e,+-]+"),
+    "--periodic": re.compile("[xyz,]+"),
+}
+"""Options that take several numbers or axes in one word, and what may be in it."""
+
+LIST_OPTIONS = ("--subset", *LIST_FORMS)
 """Options that take several values in one word."""
+
+MOST_LETTERS = 60
+"""Letters of a word of the command line in a message."""
+
+
+def shorten_word(word: str) -> str:
+    """Return a word as messages show it, cut where it is long."""
+    return word if len(word) <= MOST_LETTERS else f"{word[:MOST_LETTERS]}..."
 
 
 def advise_on_settings(words: Sequence[str]) -> str | None:
@@ -47,15 +62,19 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
             is_setting = False
     if not has_mistake:
         return None
-    options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
+    quoted_settings = [shlex.quote(shorten_word(setting)) for setting in settings]
+    options = " ".join(f"--set {setting}" for setting in quoted_settings)
     return f"write settings with = and without blanks: {options}"
 
 
 def advise_on_lists(words: Sequence[str]) -> str | None:
     """Return how to write a list that was typed with blanks; None where there is none.
 
+    Where a word behind the option is no value of it, the words are no list.
+
     >>> advise_on_lists(["generate", "cavity", "--subset", "train", "valid"])
     'write several values with commas: --subset train,valid'
+    >>> advise_on_lists(["generate", "--subset", "train", "cavity", "tiny"])
     """
     for number, word in enumerate(words):
         if word not in LIST_OPTIONS:
@@ -65,9 +84,20 @@ def advise_on_lists(words: Sequence[str]) -> str | None:
             if value.startswith("-") and not NEGATIVE_NUMBER.fullmatch(value):
                 break
             values.append(value.strip(","))
-        if len(values) > 1:
-            return f"write several values with commas: {word} {','.join(values)}"
+        if len(values) > 1 and all(_fits_option(value, word) for value in values):
+            listing = shorten_word(",".join(filter(None, values)))
+            return f"write several values with commas: {word} {listing}"
     return None
+
+
+def _fits_option(value: str, option: str) -> bool:
+    """Say whether a word may be a value of an option that takes lists."""
+    # The help of a group shall load no other module.
+    from lagbench.data.limits import SUBSETS
+
+    if option == "--subset":
+        return set(filter(None, value.split(","))) <= set(SUBSETS)
+    return LIST_FORMS[option].fullmatch(value) is not None
 
 
 def check_typed_settings(words: Sequence[str]) -> None:
@@ -84,7 +114,7 @@ def check_typed_settings(words: Sequence[str]) -> None:
                 "a setting has no =",
                 where="--set",
                 expected="--set KEY=VALUE",
-                got=f"--set {word} {following}".rstrip(),
+                got=f"--set {shorten_word(word)} {shorten_word(following)}".rstrip(),
                 fix=advise_on_settings(words)
-                or f"write its value behind a =: --set {word}=VALUE",
+                or f"write its value behind a =: --set {shorten_word(word)}=VALUE",
             )

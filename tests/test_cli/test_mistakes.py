@@ -226,11 +226,18 @@ HINTS = {
     f"{TRAIN} gns --set training.steps=1 more": "leave them out",
     f"{TRAIN} gns --set training.steps=many": "expected: a whole number",
     f"{TRAIN} gns --steps 100": "follow --set, as in --set training.steps=100",
+    f"{TRAIN} gns --ouput x": "fix: did you mean --output",
     "generate cavity tiny": "fix: name the size by an option: --size tiny",
     "generate cavity --subset train valid": "with commas: --subset train,valid",
     "verify cavity --scenarios 1, 2": "with commas: --scenarios 1,2",
+    "generate --subset train cavity tiny": "fix: name the size by an option: --size t",
+    "verify --scenarios 0-3 cavity mini": "fix: name the size by an option: --size m",
+    "download --subset test cavity extra": "fix: leave them out",
+    "list cavity mini": "fix: leave them out",
+    "leaderboard build mini": "fix: leave them out",
+    "validate good.nc tiny": "fix: leave them out",
     f"{ADOPT} runs.npy --bounds 0,1, 0,1": "with commas and without blanks",
-    "score goood.nc": "did you mean ",
+    "score goood.nc": "good.nc?",
     "score good.nc nan.nc": "lagbench compare",
     f"{TRAIN} gns --set model.latent": "--set model.latent=VALUE",
     f"{TRAIN} gns --set training.steps={'9' * 5000}": "the value is no YAML",
@@ -239,6 +246,7 @@ HINTS = {
     "plot good.nc -o x.png": "--report",
     "score good.nc --workers 0": "expected: a number not less than 1",
     "generate cavity --workers two": "expected: a whole number",
+    "generate cavity --workers 1,2": "fix: give another value",
     f"{ADOPT} runs.npy --radius big": "expected: a number",
     f"{ADOPT} runs.npy --radius 0,1": "fix: write a decimal point: --radius 0.1",
     "generate cavity --size": "where: lagbench generate",
@@ -283,6 +291,40 @@ def test_a_mistake_is_told_with_what_mends_it(
     assert has_all_parts(result.output), result.output
     assert HINTS[command] in result.output
     assert "Input should" not in result.output
+
+
+def test_a_long_setting_is_cut_in_the_message(
+    type_command: Callable[[str], Result],
+) -> None:
+    key = "k" * 5000
+    for settings in (f"--set {key}", f"--set {key} 1", f"--set {key}= 1"):
+        result = type_command(f"{TRAIN} gns {settings}")
+        assert result.exit_code == 2
+        assert has_all_parts(result.stderr), result.stderr
+        assert len(result.stderr) < 600
+
+
+def test_a_missing_file_is_not_taken_for_another_one(
+    type_command: Callable[[str], Result], tmp_path: Path
+) -> None:
+    """Numbers name contents, and folders and broken links are no files."""
+    (tmp_path / "0004.nc").touch()
+    (tmp_path / "predictions").mkdir()
+    (tmp_path / "broken.nc").symlink_to("nothing")
+    for name in ("0003.nc", "prediction", "broken.nc", "brokn.nc"):
+        result = type_command(f"validate {tmp_path / name}")
+        assert result.exit_code == 3
+        assert has_all_parts(result.output), result.output
+        assert "did you mean" not in result.output
+
+
+def test_a_file_is_suggested_where_a_folder_has_a_nearer_name(
+    type_command: Callable[[str], Result], tmp_path: Path
+) -> None:
+    (tmp_path / "scores.n").mkdir()
+    (tmp_path / "scores_.nc").touch()
+    result = type_command(f"validate {tmp_path / 'scores.nc'}")
+    assert "scores_.nc?" in result.output
 
 
 def has_all_parts(message: str) -> bool:
