@@ -9,21 +9,23 @@ lagbench.errors.UsageError: frame is of a wrong kind
   where: draw, frame
   expected: a whole number
   got: '3'
-  fix: give a number without quotes: frame=3
+  fix: give a whole number without quotes: frame=3
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
+import math
 import numbers
 import operator
 import os
 import re
 import reprlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 from .errors import UsageError
 
@@ -39,6 +41,9 @@ ALIASES = {
 
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
 
+MAX_TYPED = 80
+"""The most characters of a value that an advice repeats."""
+
 UNCHECKED = frozenset({"Any", "ArrayLike", "OwnMetrics", "object"})
 """Annotations that take any value, or whose values the function itself checks."""
 
@@ -50,6 +55,7 @@ class ArgumentKind:
     description: str  # as in "expected: a whole number"
     accepts: Callable[[object], bool]
     example: str  # as it is typed
+    items: tuple[ArgumentKind, ...] = ()  # of a list whose items are checked
 
 
 def _is_whole(value: object) -> bool:
@@ -73,9 +79,24 @@ def _is_truth(value: object) -> bool:
     return type(value).__name__ in ("bool", "bool_")
 
 
-def _is_list(value: object) -> bool:
+def _is_iterable(value: object) -> bool:
     """Tell whether a value has items; the letters of a text are none."""
-    return isinstance(value, Iterable) and not isinstance(value, str | bytes)
+    if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+        return False
+    if not isinstance(value, Sized):
+        # an iterator stays whole
+        return True
+    try:
+        iter(value)
+    except TypeError:
+        # an array without axes
+        return False
+    return True
+
+
+def _is_list(value: object) -> bool:
+    """Tell whether a value has items that can be read more than once."""
+    return isinstance(value, Sized) and _is_iterable(value)
 
 
 PLAIN_KINDS = {
@@ -92,11 +113,11 @@ PLAIN_KINDS = {
 """Kinds of single values, by their annotations."""
 
 LISTS = {
-    "Collection": Collection,
-    "Iterable": Iterable,
-    "Sequence": Sequence,
+    "Collection": _is_list,
+    "Iterable": _is_iterable,
+    "Sequence": _is_list,
 }
-"""Kinds of several values, by their annotations."""
+"""What accepts several values, by their annotations."""
 
 PLURALS = {
     "str": "texts",
@@ -113,14 +134,14 @@ def check_arguments(
     """Decorate a function so that it refuses arguments of a wrong kind.
 
     What an argument may be follows from its annotation. Whether a value of the right
-    kind fits, the function checks itself. Arguments that are missing or that it does
-    not have raise the TypeError of Python, and so does ``**options``' own check.
+    kind fits, the function checks itself, and so it does with ``*args`` and
+    ``**options``. Missing and unknown arguments raise the TypeError of Python.
 
     Raises:
         UsageError: by the decorated function, for an argument of a wrong kind.
     """
     signature = inspect.signature(function)
-    annotations: dict[str, str] = {}
+    kinds: dict[str, tuple[ArgumentKind, ...]] = {}
     for parameter in signature.parameters.values():
         is_variable = parameter.kind in (
             inspect.Parameter.VAR_KEYWORD,
@@ -128,14 +149,15 @@ def check_arguments(
         )
         is_annotated = parameter.annotation is not inspect.Parameter.empty
         if is_annotated and not is_variable:
-            annotations[parameter.name] = str(parameter.annotation)
+            kinds[parameter.name] = find_kinds(str(parameter.annotation))
     is_constructor = function.__name__ == "__init__"
 
     @functools.wraps(function)
     def checked(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        try:
+        bound = None
+        with contextlib.suppress(TypeError):
             bound = signature.bind(*args, **kwargs)
-        except TypeError:
+        if bound is None:
             # Python's own message names the function.
             return function(*args, **kwargs)
         place = function.__name__
@@ -143,53 +165,61 @@ def check_arguments(
             # of the class that the user called, which may have inherited it
             place = type(args[0]).__name__
         for name, value in bound.arguments.items():
-            if name in annotations:
-                check_argument(name, value, annotations[name], where=place)
+            if name in kinds:
+                check_argument(name, value, kinds[name], where=place)
         return function(*args, **kwargs)
 
     return checked
 
 
-def check_argument(name: str, value: object, annotation: str, *, where: str) -> None:
-    """Refuse a value that its annotation does not allow.
+def check_argument(
+    name: str, value: object, kinds: Sequence[ArgumentKind], *, where: str
+) -> None:
+    """Refuse a value of none of some kinds.
 
     Args:
         name: name of the argument.
         value: what the user gave.
-        annotation: as it is written in the function, as in "str | Path | None".
+        kinds: what the value may be; none of them: anything.
         where: name of the function.
 
     Raises:
         UsageError: a value of a wrong kind, or a list with one.
     """
-    members = list_members(annotation)
-    if any(member in UNCHECKED for member in members):
+    if not kinds:
         return
-    kinds = [find_kind(member) for member in members]
-    accepted_by = None
-    for member, kind in zip(members, kinds, strict=True):
-        if kind.accepts(value):
-            accepted_by = member
-            break
-    if accepted_by is None:
+    accepting = [kind for kind in kinds if kind.accepts(value)]
+    if not accepting:
         raise UsageError(
             f"{name} is of a wrong kind",
             where=f"{where}, {name}",
             expected=" or ".join(kind.description for kind in kinds),
-            got=reprlib.repr(value),
-            fix=_suggest_value(name, value, members),
+            got=_shorten(value),
+            fix=_suggest_value(name, value, kinds),
         )
-    item_kinds = _item_kinds(accepted_by)
-    if item_kinds and isinstance(value, Collection) and not isinstance(value, Mapping):
+    kind = accepting[0]
+    if kind.items and isinstance(value, Collection) and not isinstance(value, Mapping):
         for item in value:
-            if not any(kind.accepts(item) for kind in item_kinds):
+            if not any(item_kind.accepts(item) for item_kind in kind.items):
                 raise UsageError(
                     f"{name} holds a value of a wrong kind",
                     where=f"{where}, {name}",
-                    expected=find_kind(accepted_by).description,
-                    got=f"{reprlib.repr(item)} in it",
-                    fix="leave that value out, or mend it",
+                    expected=kind.description,
+                    got=f"{_shorten(item)} in it",
+                    fix="leave that value out, or correct it",
                 )
+
+
+def find_kinds(annotation: str) -> tuple[ArgumentKind, ...]:
+    """Return the kinds that an annotation allows; none where it takes any value.
+
+    >>> [kind.description for kind in find_kinds("str | Sequence[str] | None")]
+    ['a text', 'a list of texts', 'None']
+    """
+    members = list_members(annotation)
+    if any(member in UNCHECKED for member in members):
+        return ()
+    return tuple(find_kind(member) for member in members)
 
 
 def list_members(annotation: str) -> list[str]:
@@ -226,7 +256,9 @@ def find_kind(member: str) -> ArgumentKind:
         for item in list_members(items.removesuffix("]")):
             item_head = item.partition("[")[0]
             nouns.append(PLURALS.get(item_head, f"{item_head} objects"))
-        return ArgumentKind(f"a list of {' or '.join(nouns)}", _is_list, "[...]")
+        return ArgumentKind(
+            f"a list of {' or '.join(nouns)}", LISTS[head], "[...]", _item_kinds(member)
+        )
     if head == "Mapping":
         return ArgumentKind(
             "a dictionary", lambda value: isinstance(value, Mapping), "{...}"
@@ -241,37 +273,85 @@ def find_kind(member: str) -> ArgumentKind:
     return ArgumentKind(f"an object of the class {name}", is_instance, f"{name}(...)")
 
 
-def _item_kinds(member: str) -> list[ArgumentKind]:
+def _item_kinds(member: str) -> tuple[ArgumentKind, ...]:
     """Return the kinds of the items of a list of plain values; else none.
 
     What lists of other things may hold, their functions check.
     """
-    head, _, items = member.partition("[")
-    if head not in LISTS:
-        return []
+    items = member.partition("[")[2].removesuffix("]")
     kinds = []
-    for item in list_members(items.removesuffix("]")):
+    for item in list_members(items):
         if item not in PLAIN_KINDS:
-            return []
+            return ()
         kinds.append(PLAIN_KINDS[item])
-    return kinds
+    return tuple(kinds)
 
 
-def _suggest_value(name: str, value: object, members: Sequence[str]) -> str:
+def _suggest_value(name: str, value: object, kinds: Sequence[ArgumentKind]) -> str:
     """Return what a user can type in the place of a value of a wrong kind."""
-    example = find_kind(members[0]).example
-    is_numeric = "int" in members or "float" in members
-    if is_numeric and isinstance(value, str):
-        if _NUMBER.fullmatch(value):
-            return f"give a number without quotes: {name}={value}"
-        return f"give a number without quotes, as in {name}={example}"
-    if "int" in members and _is_number(value):
-        number: Any = value
-        if float(number).is_integer():
-            return f"write {name}={int(number)}, not {name}={number}"
-    for member in members:
-        if any(kind.accepts(value) for kind in _item_kinds(member)):
-            return f"put it into brackets: {name}=[{reprlib.repr(value)}]"
-    if "None" in members:
+    example = kinds[0].example
+    takes_whole = PLAIN_KINDS["int"] in kinds
+    takes_any_number = PLAIN_KINDS["float"] in kinds
+    if isinstance(value, str) and (takes_whole or takes_any_number):
+        noun = "a number" if takes_any_number else "a whole number"
+        number = _read_number(value, whole=not takes_any_number)
+        if number:
+            return f"give {noun} without quotes: {name}={number}"
+        return f"give {noun} without quotes, as in {name}={example}"
+    if takes_whole and _is_number(value):
+        number = _spell(_round_number(value))
+        if number:
+            return f"write {name}={number}, not {name}={_shorten(value)}"
+    for kind in kinds:
+        if any(item_kind.accepts(value) for item_kind in kind.items):
+            return f"put it into brackets: {name}=[{_spell(value) or '...'}]"
+    if _is_iterable(value) and any(kind.accepts is _is_list for kind in kinds):
+        return f"make a list of it: {name}=list(...)"
+    if PLAIN_KINDS["None"] in kinds:
         return f"leave {name} out, or give such a value: {name}={example}"
     return f"give such a value: {name}={example}"
+
+
+def _read_number(text: str, *, whole: bool) -> str:
+    """Return the number of a text as it is typed; empty where there is none."""
+    if len(text) > MAX_TYPED or not _NUMBER.fullmatch(text):
+        return ""
+    if re.fullmatch("-?[0-9]+", text):
+        return _spell(int(text))
+    number = float(text)
+    return _spell(_round_number(number) if whole else number)
+
+
+def _round_number(value: object) -> int | None:
+    """Return a number without fraction as a whole number."""
+    try:
+        number = int(value)  # type: ignore[call-overload]
+    except (OverflowError, ValueError):
+        # infinity, or not a number
+        return None
+    return number if number == value else None
+
+
+def _spell(value: object) -> str:
+    """Return a number, a text or a path as it is typed; empty where it is too long."""
+    text = ""
+    if _is_whole(value):
+        whole_number = operator.index(value)  # type: ignore[arg-type]
+        if abs(whole_number) < 10**MAX_TYPED:
+            text = str(whole_number)
+    elif isinstance(value, float) and math.isfinite(value):
+        text = repr(float(value))
+    elif isinstance(value, str):
+        text = repr(str(value))
+    elif isinstance(value, os.PathLike):
+        text = repr(os.fspath(value))
+    return text if len(text) <= MAX_TYPED else ""
+
+
+def _shorten(value: object) -> str:
+    """Return what messages show of a value."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:
+        # a whole number of more digits than Python prints
+        return f"<{type(value).__name__} too long to print>"

@@ -182,7 +182,7 @@ class Batch:
             frame=self.frame + first,
         )
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str | int) -> Self:
         """Return the batch on a device."""
         moved_tensors = {}
         for name, value in vars(self).items():

@@ -348,7 +348,7 @@ def predict(
     root: str | Path | None = None,
     history: int | None = None,
     registry: Registry | None = None,
-    device: torch.device | str = "cpu",
+    device: torch.device | str | int = "cpu",
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Roll a model out over every scenario of a subset, from the task's given frames.
 
@@ -364,7 +364,7 @@ def predict(
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: how many of the last given frames the model sees; all by default.
         registry: description of the data sets; ours by default.
-        device: device of the model.
+        device: device of the model; a number is that of an accelerator.
 
     Yields:
         Scenario id, and positions of the frames to predict [length], float32, shape

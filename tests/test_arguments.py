@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
+import re
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +21,10 @@ from lagbench.arguments import (
     UNCHECKED,
     check_argument,
     check_arguments,
+    find_kinds,
     list_members,
 )
-from lagbench.errors import UsageError
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.models.export import export_onnx
 from lagbench.models.registered import build_registered, export_safetensors
 
@@ -150,9 +154,29 @@ def test_each_parameter_of_public_functions_has_a_checked_kind(
             "complete=True",
         ),
         (
-            lambda: lagbench.score("p.nc", extras="transport"),
-            "score, extras",
-            "brackets: extras=['transport']",
+            lambda: lagbench.generate("cavity", "tiny", gather="folder"),
+            "generate, gather",
+            "brackets: gather=['folder']",
+        ),
+        (
+            lambda: lagbench.generate("cavity", "tiny", scenarios=np.array(3)),
+            "generate, scenarios",
+            "brackets: scenarios=[3]",
+        ),
+        (
+            lambda: lagbench.generate("cavity", "tiny", subset=np.array("train")),
+            "generate, subset",
+            "leave subset out",
+        ),
+        (
+            lambda: lagbench.compare("p.nc", "q.nc", metrics=iter(["mse_end"])),
+            "compare, metrics",
+            "metrics=list(...)",
+        ),
+        (
+            lambda: lagbench.verify("cavity", "tiny", regenerate="1.5"),
+            "verify, regenerate",
+            "a whole number without quotes, as in regenerate=2",
         ),
         (
             lambda: lagbench.open_split("cavity", subset=None),
@@ -180,7 +204,7 @@ def test_each_parameter_of_public_functions_has_a_checked_kind(
 def test_arguments_of_a_wrong_kind_are_usage_errors(
     call: Callable[[], Any], where: str, fix: str
 ) -> None:
-    """They were a bare TypeError or AttributeError of Python."""
+    """The message names the function, the argument and what to write."""
     with pytest.raises(UsageError) as caught:
         call()
     assert caught.value.where == where
@@ -205,7 +229,7 @@ def test_arguments_of_a_wrong_kind_are_usage_errors(
 )
 def test_values_of_the_right_kind_are_accepted(value: object, annotation: str) -> None:
     """Numbers of NumPy count as numbers; items of an iterator are not consumed."""
-    check_argument("name", value, annotation, where="function")
+    check_argument("name", value, find_kinds(annotation), where="function")
 
 
 @pytest.mark.parametrize(
@@ -219,12 +243,79 @@ def test_values_of_the_right_kind_are_accepted(value: object, annotation: str) -
         (1, "bool"),
         ([3], "Selection"),
         ([True], "Scenarios"),
+        (np.array(3), "Scenarios"),
+        (np.array("train"), "Selection"),
+        (iter(["train"]), "Selection"),
+        (iter(["mse_end"]), "Collection[str]"),
+        pytest.param(10**5000, "str | Path", id="too-long"),
+        ([10**5000], "Selection"),
+        (Fraction(10**400), "int"),
+        (float("inf"), "int"),
+        (float("nan"), "int"),
     ],
 )
 def test_values_of_a_wrong_kind_are_refused(value: object, annotation: str) -> None:
     """True is no number, and a list is no better than what it holds."""
     with pytest.raises(UsageError):
-        check_argument("name", value, annotation, where="function")
+        check_argument("name", value, find_kinds(annotation), where="function")
+
+
+@pytest.mark.parametrize(
+    ("value", "annotation"),
+    [
+        ("1", "int"),
+        ("007", "int"),
+        ("2.0", "int | None"),
+        ("1e3", "int"),
+        ("1.5", "int"),
+        ("1e400", "float"),
+        ("0.5", "float"),
+        ("9" * 5000, "int"),
+        (1e300, "int"),
+        (Fraction(10**400), "int"),
+        (3, "Scenarios"),
+        (np.int64(3), "Scenarios"),
+        ("mse_end", "Sequence[str]"),
+        (Path("a"), "Sequence[str | Path]"),
+    ],
+)
+def test_advised_values_are_accepted(value: object, annotation: str) -> None:
+    """Who types the advice is not refused again."""
+    kinds = find_kinds(annotation)
+    with pytest.raises(UsageError) as caught:
+        check_argument("name", value, kinds, where="function")
+    advice = re.search(r"name=([^,]+)", str(caught.value.fix))
+    assert advice is not None
+    check_argument("name", ast.literal_eval(advice[1]), kinds, where="function")
+
+
+def test_advice_repeats_no_part_of_a_long_text() -> None:
+    """Half a name cannot be typed."""
+    with pytest.raises(UsageError) as caught:
+        check_argument("name", "a" * 200, find_kinds("Sequence[str]"), where="function")
+    assert str(caught.value.fix).endswith("name=[...]")
+
+
+@pytest.mark.parametrize(
+    ("value", "annotation"), [(72.5, "dpi"), (0, "device"), ("mse_end", "metrics")]
+)
+def test_values_with_two_kinds_are_accepted(value: object, annotation: str) -> None:
+    """Pixels per inch have fractions, a device a number, and one metric is a text."""
+    functions: dict[str, Any] = {
+        "dpi": lagbench.plot,
+        "device": lagbench_torch.predict,
+        "metrics": lagbench.compare,
+    }
+    parameters = inspect.signature(functions[annotation]).parameters
+    kinds = find_kinds(str(parameters[annotation].annotation))
+    check_argument(annotation, value, kinds, where="function")
+
+
+def test_one_extra_is_a_text() -> None:
+    """The name of one extra needs no brackets; the missing file is told."""
+    with pytest.raises(LagbenchError) as caught:
+        lagbench.score("p.nc", extras="transport")
+    assert "extras" not in str(caught.value.where)
 
 
 def test_folders_of_local_splits_may_be_paths() -> None:
@@ -246,8 +337,9 @@ def test_calls_that_do_not_fit_raise_the_error_of_python() -> None:
     call: Any = draw
     with pytest.raises(TypeError, match=r"draw\(\) got an unexpected keyword"):
         call("cavity", colour="red")
-    with pytest.raises(TypeError, match=r"draw\(\) missing 1 required"):
+    with pytest.raises(TypeError, match=r"draw\(\) missing 1 required") as caught:
         call()
+    assert caught.value.__context__ is None
     assert call("cavity") == "cavity"
 
 

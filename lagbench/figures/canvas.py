@@ -189,7 +189,7 @@ def reduce_colours(image: Image, palette: NDArray[np.uint8]) -> Image:
 
 
 @contextmanager
-def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
+def figure(width: float, height: float, *, dpi: float = DPI) -> Iterator[Figure]:
     """Yield an empty figure in lagbench's style; save it inside the context.
 
     The user's matplotlibrc has no influence. Width and height are in inches.

@@ -35,7 +35,7 @@ def plot(
     frame: int = -1,
     kind: str = ALL,
     output: str | Path | None = None,
-    dpi: int = DPI,
+    dpi: float = DPI,
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Path:

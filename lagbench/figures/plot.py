@@ -115,7 +115,7 @@ def plot_frame(
     output: str | Path,
     *,
     kind: str = ALL,
-    dpi: int = DPI,
+    dpi: float = DPI,
     registry: Registry | None = None,
 ) -> Path:
     """Draw one frame of a scenario; return the path of the file.
@@ -269,7 +269,7 @@ def contact_sheet(
     root: str | Path | None = None,
     kind: Panel | str | None = None,
     frame: int | None = None,
-    dpi: int = DPI,
+    dpi: float = DPI,
     registry: Registry | None = None,
 ) -> Path:
     """Draw many scenarios of a split on one page; return the path of the file.
@@ -310,7 +310,7 @@ def draw_contact_sheet(
     registry: Registry,
     panel: Panel | None = None,
     frame: int | None = None,
-    dpi: int = DPI,
+    dpi: float = DPI,
 ) -> Path:
     """Draw the scenarios of a data set that lies in a root folder on one page.
 
@@ -500,7 +500,7 @@ def _choose_frames(recording: Recording) -> list[int]:
 
 
 def _draw_sheet(
-    sheet: ContactSheet, title: str, output: str | Path, *, dpi: int
+    sheet: ContactSheet, title: str, output: str | Path, *, dpi: float
 ) -> Path:
     """Draw a contact sheet; return the path of its file."""
     columns = max(map(len, sheet.rows))

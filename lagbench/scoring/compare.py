@@ -226,7 +226,7 @@ def compare(
     first: str | Path,
     second: str | Path,
     *,
-    metrics: Collection[str] = (),
+    metrics: str | Collection[str] = (),
     split: str | Path | None = None,
     board: str | Path | None = None,
     root: str | Path | None = None,
@@ -248,7 +248,8 @@ def compare(
         second: one of the same. Or a bare name: of a reference in the scores of the
             first (a scores.nc holds only the best one), or of an entry for the same
             data set. If both have that name, the reference is meant.
-        metrics: metrics that are compared beside the ranking metric, which always is;
+        metrics: names of metrics, or one name, that are compared beside the ranking
+            metric, which always is;
             all that judge by default.
         split: the split to which both must belong, or the path of a local split's
             folder; the one that they name when None.
@@ -310,7 +311,7 @@ def compare(
 
 
 def _compare_metrics(
-    one: Contestant, two: Contestant, metrics: Collection[str]
+    one: Contestant, two: Contestant, metrics: str | Collection[str]
 ) -> dict[str, MetricComparison]:
     """Compare the ranking metric, then others that judge and are asked for, by name."""
     judging = _judging_metrics(one, two)

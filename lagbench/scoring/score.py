@@ -74,7 +74,7 @@ def score(
     output_dir: str | Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    extras: Collection[str] = (),
+    extras: str | Collection[str] = (),
     metrics: OwnMetrics = (),
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
@@ -93,7 +93,7 @@ def score(
             name beside them, see :func:`scores_folder`.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
-        extras: extras whose metrics are measured too, as in ("transport",).
+        extras: extras whose metrics are measured too, as in ("transport",); or one.
         metrics: metrics of your own that are measured too: functions of a
             :class:`~lagbench.metrics.FramePair`, or a
             :class:`~lagbench.metrics.Metric` where a direction and a unit are to be
@@ -416,7 +416,7 @@ def _write(card: ScoreCard, folder: Path) -> ScoreCard:
     return card.at(json_path, netcdf_path)
 
 
-def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
+def _select_metrics(extras: str | Collection[str]) -> tuple[Metric, ...]:
     """Return the metrics to measure; refuse an extra that brings none."""
     if isinstance(extras, str):
         extras = (extras,)

@@ -7,7 +7,7 @@ import operator
 import os
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from itertools import accumulate
@@ -380,7 +380,7 @@ class WindowReader:
     ) -> None:
         _check_bytes(cache_bytes, "cache_bytes")
         tier, root_folder, _ = locate(split, size, root=root, registry=registry)
-        if isinstance(subset, str) or not isinstance(subset, Iterable):
+        if isinstance(subset, str):
             subset = (subset,)
         subsets = tuple(subset)
         paths = scenario_files(tier, root_folder, subsets)

@@ -49,7 +49,7 @@ def test_a_file_gets_lines_with_the_count_and_the_time_left(
 def test_work_without_scenarios_is_told_by_its_share(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """``costs of curl-noise tiny: 38%, 0 scenarios`` was printed."""
+    """The line names the stage and the share, and no scenarios."""
     timing = Progress(
         stage="costs", done=3, total=8, scenarios_done=0, scenarios=0, seconds=1.0
     )

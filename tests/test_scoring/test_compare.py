@@ -1017,7 +1017,7 @@ def test_lines_say_how_much_better_a_submission_is(
     is_better = difference < 0.0
     assert is_better == (word == "better")
 
-    # a name that is no reference beside it was a KeyError
+    # a name that is no reference is refused
     with pytest.raises(UsageError) as caught:
         card.against("persistance")
     assert caught.value.where == "against, row"
