@@ -68,7 +68,7 @@ def manifest_of(root: Path) -> Manifest:
         ({"device": "gpu"}, "no device 'gpu'"),
         ({"device": "cuba"}, "did you mean 'cuda'?"),
         *(({"workers": count}, "at least one worker") for count in (0, -1)),
-        ({"workers": "2"}, "a number without quotes: workers=2"),
+        ({"workers": "2"}, "a whole number without quotes: workers=2"),
     ],
 )
 def test_bad_input(
