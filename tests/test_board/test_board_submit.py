@@ -58,8 +58,8 @@ def predictions(own: BoardBench) -> Path:
 
 
 @pytest.fixture
-def unscored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fail where anything is scored."""
+def unscored(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where anything is scored after the leaderboard was made."""
     monkeypatch.setattr(submitting, "score", pytest.fail)
 
 
