@@ -441,11 +441,13 @@ def draw_waves(
 ) -> Tensor:
     """Return displacements by random waves [length], of the shape of the positions.
 
-    A wave displaces particles along its own direction, so it compresses matter at some
-    places and stretches it at others. Each window has three waves. Direction and phase
-    are uniform, the logarithm of the wavelength is uniform over a decade, and the
-    largest strain of a wave is uniform up to the given one. Along a periodic axis a
-    whole number of waves fits the period.
+    The waves are longitudinal, as sound is: u(x) = sum of (e_i k_i / |k_i|^2)
+    sin(k_i x + phase_i), with a wave vector k_i and a largest strain e_i. Such a wave
+    compresses matter at some places and stretches it at others.
+
+    Each window has three waves. Direction and phase are uniform, the logarithm of the
+    wavelength is uniform over a decade, and the largest strain of a wave is uniform up
+    to the given one. Along a periodic axis a whole number of waves fits the period.
 
     Args:
         position: positions [length], shape [particle, axis].

@@ -30,12 +30,7 @@ from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
 
-from .augmentation import (
-    Symmetry,
-    augment,
-    draw_waves,
-    velocity_towards_path,
-)
+from .augmentation import Symmetry, augment, draw_waves, velocity_towards_path
 from .baseline import (
     Baseline,
     Batch,
@@ -510,7 +505,11 @@ class GraphNetwork(Baseline):
     def _compress(
         self, state: ParticleState, windows: int, generator: torch.Generator
     ) -> ParticleState:
-        """Return the state with particles displaced by waves; velocities stay."""
+        """Return the state with particles displaced by random waves.
+
+        Their velocities stay: only the density changes, as in a rollout that has
+        drifted off.
+        """
         strain = self.options.compression
         if strain == 0.0:
             return state

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,8 +21,8 @@ from typing import Any, TypeVar
 from lagbench.arguments import check_arguments
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids, url_of
-from lagbench.data.local import locate_new, root_url
+from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids
+from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
@@ -50,7 +49,12 @@ from lagbench.generators.simulate import (
 from lagbench.generators.split import Device
 from lagbench.store.copy import gather as gather_files
 from lagbench.store.copy import list_gatherable
-from lagbench.store.publication import Publication, check_store, publish
+from lagbench.store.publication import (
+    Publication,
+    check_address,
+    inspect_store,
+    publish,
+)
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import describe_machine, promises_bits, worker_count
 from lagbench.work.pool import Event, Pool, Report, WorkItem
@@ -154,9 +158,7 @@ def generate(
             bucket.
     """
     started = time.monotonic()
-    named_url = root_url(root)
-    if named_url is not None:
-        check_store(named_url)
+    check_address(root)
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted_ids = select(tier, subset=subset, scenarios=scenarios)
     target = _find_device(device)
@@ -180,15 +182,10 @@ def generate(
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")
-        with ExitStack() as stack:
-            lock = dataset_lock(
-                folder, tier.split, tier.name, tier.major, on_wait=on_wait
-            )
-            stack.enter_context(lock)
-            store = None
-            store_url = url_of(folder)
-            if store_url is not None:
-                store = stack.enter_context(publish(tier, folder, store_url))
+        with (
+            dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
+            publish(tier, folder) as store,
+        ):
             keeper = _ManifestKeeper(setup, store)
             scan = _simulate_missing(setup, keeper, wanted_ids, sources, force=force)
             _complete_statistics(setup, keeper)
@@ -330,10 +327,7 @@ def _plan_only(
     gathered: set[int] = set()
     for source in sources:
         gathered.update(list_gatherable(setup.size, setup.root, source))
-    store_url = url_of(setup.root)
-    store = None
-    if store_url is not None:
-        store = Publication(setup.size, setup.root, store_url)
+    store = inspect_store(setup.size, setup.root)
     return _scan_folder(setup, store, wanted_ids, force=force, gathered=gathered)
 
 

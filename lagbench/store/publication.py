@@ -15,7 +15,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME
+from lagbench.data.layout import MANIFEST_NAME, url_of
+from lagbench.data.local import root_url
 from lagbench.data.manifest import FileEntry, Manifest, merge_entries, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
@@ -179,34 +180,42 @@ class Publication:
         return manifest or merge_entries(self._size, None)
 
 
-def check_store(url: str) -> None:
+def check_address(root: str | Path | None) -> None:
     """Refuse an address where nothing can be written, before its copy is made."""
-    Objects(url, "")
+    url = root_url(root)
+    if url is not None:
+        Objects(url, "")
+
+
+def inspect_store(size: Size, root: Path) -> Publication | None:
+    """Return the state of a data set in its store; None for a plain folder."""
+    url = url_of(root)
+    if url is None:
+        return None
+    return Publication(size, root, url)
 
 
 @contextmanager
-def publish(size: Size, root: Path, url: str) -> Iterator[Publication]:
-    """Write a data set to a store.
+def publish(size: Size, root: Path) -> Iterator[Publication | None]:
+    """Write a data set to a store; yield None for a root that is a plain folder.
 
     Hold the lock of the working copy. Until the end nothing is fetched into it
     unasked.
-
-    Args:
-        size: the data set.
-        root: its working copy.
-        url: address of the store.
 
     Raises:
         DataError: the bucket does not exist.
         WorkFailedError: the store refuses or does not answer.
         UsageError: the package for this kind of address is not installed.
     """
-    publication = Publication(size, root, url)
+    state = inspect_store(size, root)
+    if state is None:
+        yield None
+        return
     with suspend_fetching(root):
         try:
-            publication.prepare()
-            yield publication
+            state.prepare()
+            yield state
         except BaseException:
             with suppress(LagbenchError):  # the first error is on its way to the user
-                publication.save()
+                state.save()
             raise
