@@ -156,6 +156,32 @@ def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
     assert ratio == pytest.approx(expected, rel=1e-4)
 
 
+def test_the_shortest_wave_decays_where_both_dampings_are_strong() -> None:
+    """Viscosity and hyperviscosity, each stable alone in one time step, act together.
+
+    The chequered wave u = -v = a (-1)^(i + j) has no divergence, and q^2 = 8 / h^2.
+    """
+    cells = 16
+    fastest_laplacian = 8.0 * cells**2
+    nu = 1.5 / fastest_laplacian
+    mu = 1.4 / fastest_laplacian**2
+    unit = (0.0, 1.0)
+    grid = ClosedGrid(
+        Box.from_bounds((unit, unit), (True, True)),
+        cells=(cells, cells),
+        no_slip=False,
+        hyperviscosity=mu,
+    )
+    column, row = np.indices((cells, cells))
+    u = 1e-6 * (-1.0) ** (column + row)
+    velocity = [u, -u]
+    for _ in range(10):
+        velocity = grid.advance(
+            velocity, duration=1.0, viscosity=nu, wall_velocity=np.zeros((4, 2))
+        )
+    assert np.abs(velocity[0]).max() < 1e-8
+
+
 def test_a_fit_finds_a_damping_that_the_data_show() -> None:
     """A vortex that fades faster than its viscosity says gets a greater one."""
     options = {
