@@ -231,7 +231,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
     """Return whether oneDNN can and should multiply x by the weight.
 
-    It does for a matrix of float32 on a CPU, outside autocast and torch.compile.
+    It can for a non-empty matrix of float32 on a CPU, outside autocast and
+    torch.compile, and should wherever it can: see :class:`_OneDNNLinear`.
     """
     is_cpu_matrix = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
     is_float32 = x.dtype == weight.dtype == torch.float32
@@ -368,12 +369,12 @@ LARGEST_KEPT = 24e6
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
-    """Return linear layers with ReLU between them, LayerNorm after the last."""
+    """Return linear layers with ReLU between them, with ``norm`` a LayerNorm last."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers.append(Linear(inputs, outputs))
         layers.append(nn.ReLU(inplace=True))
-    layers.pop()
+    layers.pop()  # no ReLU after the last
     if norm:
         layers.append(LayerNorm(widths[-1]))
     return nn.Sequential(*layers)

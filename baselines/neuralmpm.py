@@ -81,6 +81,7 @@ class NeuralMPM(Baseline):
         cells_per_radius = self.grid.spacing / info.radius
         unit = cells_per_radius**info.box.dimension
         self.speed = _isotropic_std(info, "velocity_std")
+        # Deviation of the accelerations [length/frame^2]: the unit of the output.
         self.change = _isotropic_std(info, "acceleration_std")
         self.encoder = FieldEncoder(
             self.grid,
@@ -341,12 +342,13 @@ class NeuralMPM(Baseline):
             output = self.network(inputs)
 
         output = output * self.change
-        velocity, accelerations = self.decoder.decode(
+        gathered_velocity, accelerations = self.decoder.decode(
             state, stencil, output, grid_velocity
         )
+        # A learned number beside the output, since stresses alone conserve momentum.
         if self.fall is not None:
             accelerations = self._add_fall(accelerations, self.fall)
-        frames = self._integrate(state, velocity, accelerations)
+        frames = self._integrate(state, gathered_velocity, accelerations)
         next_state = self._after(state, frames)
         return next_state, frames
 

@@ -43,8 +43,8 @@ class ParticleGrid(nn.Module):
     its first node lies half a cell from the seam; there cells may be a little longer or
     shorter than along other axes.
 
-    Particles that do not mix, those of several windows or materials, each have a layer
-    of nodes.
+    Each window, or material, has its own layer of nodes, so its particles do not mix
+    with others.
 
     Args:
         bounds: box (low, high) along each axis [length]; particles lie in it.

@@ -260,7 +260,10 @@ def _show_forcing(model: Baseline, unseen: Sequence[str]) -> str:
 def _open_folder(
     output: str | Path | None, recipe: Recipe, initial: TrainingStart | None
 ) -> RunFolder:
-    """Return the folder of a run, if it can be written and holds no start of it."""
+    """Return the folder of a run, if it can be written.
+
+    Refuse one whose checkpoint or weights are the start: they would be overwritten.
+    """
     if output is None:
         name = recipe.baseline
         if initial is not None:
@@ -270,7 +273,7 @@ def _open_folder(
     check_writable(folder.path, option="--output")
     if initial is not None and folder.holds(initial.path):
         raise UsageError(
-            "the weights to start from lie in the folder of the training",
+            "this training would overwrite the weights that it starts from",
             where="--start",
             expected="weights in another folder",
             got=str(initial.path),

@@ -154,9 +154,9 @@ def main() -> int:
         lines.append(["", "exponent", *exponents])
     caption = (
         "Processor time of a predicted frame [ms] on one core. The models are "
-        f"untrained and have the recipes of {SPLIT} {SIZE}. There are 2,000 q^2 "
-        "particles. The time grows as a power of their number; the last row has the "
-        "exponent."
+        f"untrained and have the recipes of {SPLIT} {SIZE}. In the row of q the box "
+        "holds 2,000 q^2 particles; q is the factor of resolution along each axis. The "
+        "time grows as a power of their number; the last row has the exponent."
     )
     text = f"{caption}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
     print(text)

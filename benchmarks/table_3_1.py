@@ -204,8 +204,10 @@ def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
 def markdown(measurements: Sequence[TimedRow], device: str) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        f"Times in milliseconds. Ours were measured on {device}, those of the thesis "
-        "on its GPU. The number of particles grows as q^2.",
+        f"Times of our solver with `--device {device}`, and of the solver of the "
+        "thesis on the GPU of its author, in milliseconds. q is the quality factor of "
+        "the thesis. The numbers of particles are those of its Table 3.1; they grow "
+        "roughly as q^2.",
         "",
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",
@@ -222,8 +224,8 @@ def markdown(measurements: Sequence[TimedRow], device: str) -> str:
         )
     lines += [
         "",
-        "A time grows as the named number to the power of the exponent. The exponents "
-        "are slopes of least-squares lines through the logarithms.",
+        "The exponent p in the row `A against B` means that A grows as B^p. It is the "
+        "slope of a least-squares line through the logarithms.",
         "",
         "| exponent of | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",

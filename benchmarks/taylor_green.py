@@ -22,13 +22,13 @@ from lagbench.data.grid import Grid, fields
 Floats = NDArray[np.float64]
 
 SIDES = (20, 32, 45, 64, 91, 128, 181, 256)
-"""Particles along a side; each has twice the particles of the one before."""
+"""Particles along a side; from the second on each has twice those before."""
 
 WAVE = 2.0 * math.pi
 
 
-KINDS = {"random": math.nan, "jitter 0.25": 0.25, "lattice": 0.0}
-"""Jitter of each kind of positions, in spacings; NaN for random ones."""
+JITTERS = {"random": math.nan, "jitter 0.25": 0.25, "lattice": 0.0}
+"""Width of the jitter of each kind of positions, in spacings; NaN for random ones."""
 
 FINE_SIDE = 2000  # particles along a side where only the error of the grid is left
 
@@ -43,7 +43,7 @@ def velocity(position: Floats) -> Floats:
 
 
 def sample_positions(side: int, jitter: float) -> Floats:
-    """Return a lattice moved by at most ``jitter`` spacings; random points for NaN."""
+    """Return a lattice moved by up to half of ``jitter``; random points for NaN."""
     rng = np.random.Generator(np.random.PCG64(0))
     if math.isnan(jitter):
         return rng.random((side * side, 2))
@@ -85,7 +85,7 @@ def main() -> int:
         "cell centres"
     )
     heads = ""
-    for kind in KINDS:
+    for kind in JITTERS:
         heads += f"{kind:>14s}"
     print(f"{'particles':>10s}{'per cell':>10s}{heads}")
     cell_count = grid.cells**2
@@ -93,14 +93,14 @@ def main() -> int:
         particle_count = side * side
         particles_per_cell = particle_count / cell_count
         line = f"{particle_count:10d}{particles_per_cell:10.2f}"
-        for jitter in KINDS.values():
+        for jitter in JITTERS.values():
             position = sample_positions(side, jitter)
             error = relative_error(position, grid)
             line += f"{error:14.4f}"
         print(line)
     fine_lattice = sample_positions(FINE_SIDE, 0.0)
     error = relative_error(fine_lattice, grid)
-    print(f"grid alone (4 million particles on a lattice): {error:.4f}")
+    print(f"grid alone ({len(fine_lattice):,} particles on a lattice): {error:.4f}")
     return 0
 
 

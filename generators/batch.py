@@ -124,6 +124,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
                 f"{place_of(size)}",
             ) from error
 
+    # From here on the author of the split is at fault, not the parameters.
     where = f"{size.generator}.initial_state"
     if not isinstance(state, InitialState):
         raise UsageError(
@@ -307,6 +308,7 @@ class ScenarioBatch:
         self._displacements.append((self._substep, offset.copy()))
 
     def _advance_to(self, substep: int) -> None:
+        """Advance to a substep; a stride that fails is replayed to name its substep."""
         while self._substep < substep:
             count = min(self._stride, substep - self._substep)
             with self._scenario_names():

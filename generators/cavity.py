@@ -66,10 +66,10 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
 
 
 def is_classic(scenario: int) -> bool:
-    """Tell whether the lid starts once and keeps its speed: once in eight ids.
+    """Tell whether the lid starts once and keeps its speed, unless it is a belt.
 
-    The remainder moves on by one every 24 ids, else these ids would always be odd, and
-    only half of :data:`DRIVEN` would occur among them.
+    One id in eight. All ids with the remainder 7 of 8 are odd and would meet only half
+    of :data:`DRIVEN`, so the remainder that is asked for falls by one every 24 ids.
     """
     return (scenario + scenario // 24) % 8 == 7
 

@@ -780,12 +780,12 @@ class NodalStressND:
     def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
-            now = self.carried[s, p]
+            now = self.carried[s, p]  # v_p, J_p
             reached = ti.Vector(
                 [ti.abs(now[0]), ti.abs(now[1]), ti.abs(now[2]), now[3]]
             )
             self.extremes[s, p] = reached
-            self.x[s, p][3] = -now[3]
+            self.x[s, p][3] = -now[3]  # this lane keeps the largest -J
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
             self.peak[s, n] = 0.0

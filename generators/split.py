@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Device(enum.StrEnum):
-    """Where and how the substeps run; the bits do not depend on it."""
+    """Where and how the substeps run. CUDA gives other bits than the other two."""
 
     # one scenario, a whole frame of substeps in one serial kernel without atomics
     CPU = "cpu"

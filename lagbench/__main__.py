@@ -405,7 +405,7 @@ def _interruption_message(command: str | None) -> str:
     if command not in RESUMABLE_COMMANDS:
         return "lagbench: interrupted"
     same_command = "the same command"
-    for option in ("--force", "--again"):
+    for option in ("--force", "--again", "--fresh"):
         if option in sys.argv:
             same_command += f", without {option},"
     return f"lagbench: interrupted; {same_command} goes on where it stopped"

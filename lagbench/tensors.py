@@ -152,7 +152,8 @@ class Batch:
     def part(self, frames: slice) -> Self:
         """Return consecutive frames of every window.
 
-        `frame` follows, and the forcing of later frames stays.
+        `frame` becomes the first frame of the part. The wall velocities and forces of
+        later frames are kept.
 
         Raises:
             UsageError: no frame is left, or not every frame is taken: forcing is given

@@ -88,8 +88,10 @@ class WindowDataset(WindowReader, Dataset[TensorWindow]):
 
     Args:
         split: name of the split, or path of a local split's folder.
-        subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one with data, of several mini, when None.
+        subset: train, valid or test, also shift or extra where the split has it; or
+            several of them.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.
@@ -126,8 +128,8 @@ class WindowSampler(Sampler[int]):
     are shuffled. So a frame is decompressed about once, not once for each window that
     holds it. Where all frames fit one pool, every order is equally likely.
 
-    With several ranks, each takes every ranks-th window of the one order, and the last
-    windows that do not fill a turn of all ranks are left out.
+    With n ranks, each rank takes every n-th window of the same order. The last windows
+    are left out if there are fewer than n of them.
 
     Args:
         data: the windows.
@@ -359,8 +361,9 @@ def predict(
     Args:
         step: the model.
         split: name of the split, or path of a local split's folder.
-        subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one with data, of several mini, when None.
+        subset: train, valid or test; also shift or extra where the split has it.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: how many of the last given frames the model sees; all by default.
         registry: description of the data sets; ours by default.

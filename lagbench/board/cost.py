@@ -230,7 +230,7 @@ def cost_figure(tab: Tab) -> Markup:
 def picture(board: Board, size: Size) -> str:
     """Return the figure of a data set as an SVG file of its own.
 
-    Without entries it shows the reference predictors.
+    A board without scored entries has no tab: then it shows reference predictors alone.
 
     Raises:
         DataError: neither entries nor reference predictors have a cost.
@@ -247,6 +247,7 @@ def picture(board: Board, size: Size) -> str:
         ranking = tab.ranking
         points = []
         for point in points_of(tab):
+            # In a file of its own the links of the page lead nowhere.
             points.append(replace(point, href=None))
     if not points:
         raise DataError(

@@ -166,7 +166,7 @@ class ArrayStore:
         return places
 
     def to_bytes(self) -> bytes:
-        """Return the lower bytes of all numbers, then the upper ones."""
+        """Return the lower bytes of all 16-bit numbers, then their upper bytes."""
         parts = []
         for group in self._groups.values():
             parts += group.parts

@@ -19,8 +19,10 @@ MOST_BYTES = 1_000_000
 def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
     """Return the gates that weights failed, by SHA-256 of the weights.
 
+    Weights that passed all have none; weights that were not measured are absent.
+
     Raises:
-        UnreadableFileError: the file is not the one that the script writes.
+        UnreadableFileError: the file is not what ``python -m studies.gates`` writes.
     """
     path = folder.path / GATES
     if path.is_symlink() or not path.is_file():
@@ -35,7 +37,7 @@ def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
         raise UnreadableFileError(
             "the gates cannot be read",
             where=str(path),
-            expected="the JSON that studies.gates writes",
+            expected="the JSON that `python -m studies.gates` writes",
             got=error,
             fix="write them anew: python -m studies.gates",
         ) from error

@@ -194,6 +194,7 @@ class _TabWriter:
         return places
 
     def _reference(self, line: Line, row: ReferenceRow) -> Plain:
+        """Return a reference predictor's line: curves without bands, no pictures."""
         energy = None
         if row.energy is not None:
             energy = self._mean_curve(row.energy)

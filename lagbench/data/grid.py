@@ -516,7 +516,7 @@ def slope_along(
 ) -> Floats:
     """Return central differences of a field along an axis [unit of the field / length].
 
-    Between walls they are 0 on the rim of the grid, where there is none.
+    Between walls the two ends of the axis have no central difference: they are 0.
 
     Args:
         field: values at the nodes, shape [..., *node].
@@ -582,8 +582,8 @@ def curl(
 def vorticity(velocity: Floats, spacing: float) -> Floats:
     """Return ``omega = dv/dx - du/dy`` (Eq. 5.19) in two dimensions between walls.
 
-    Solid-body rotation Omega gives 2 Omega. Central differences, 0 on the rim of the
-    grid where there is none.
+    Solid-body rotation Omega gives 2 Omega. These are central differences. Along an
+    axis the two ends have none: the derivative is 0 there.
 
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].

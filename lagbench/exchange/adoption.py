@@ -95,8 +95,8 @@ def adopt(
 
     Raises:
         UsageError: no radius or frame interval, too few trajectories or one named
-            twice, a folder that is there (all that is missing is told at once), a task
-            that does not fit the data.
+            twice, an output folder that exists already, a task that does not fit the
+            data. One message names everything that is missing.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
         DataError: positions are not finite, or outside the unit box, or
             particles jump by more than half the box along an axis with walls.

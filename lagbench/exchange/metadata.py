@@ -320,7 +320,7 @@ class ExportInfo:
 def describe_export(
     size: Size, form: Format, shapes: Shapes, info: ExportInfo
 ) -> dict[str, object]:
-    """Return the metadata of an export."""
+    """Return the metadata of an export; the format's keys replace common ones."""
     metadata = _common_metadata(size, info)
     if form is Format.GNS_NPZ:
         metadata |= _gns_metadata(size, shapes)

@@ -47,7 +47,8 @@ def plot(
         scenario: scenario id; the first one of test when None.
         frame: absolute frame number; negative ones count from the end.
         kind: all (three panels), speed, material, vorticity or streamlines; in three
-            dimensions also front or above, which all has of free surfaces.
+            dimensions also front or above. Of a free surface kind ``all`` shows these
+            two.
         output: file to write, ending in .png, .pdf or .svg; named after the data in the
             working folder when None.
         dpi: pixels per inch.

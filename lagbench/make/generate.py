@@ -137,11 +137,12 @@ def generate(
             folder. With a URL (``s3://bucket/prefix``) files are written to its working
             copy and put into the store, see docs/scaling.md.
         workers: worker processes; one per core, or one for the parallel devices.
-        device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
+        device: "cpu", "parallel" or "cuda". "cpu" and "parallel" give the same bits,
+            "cuda" gives others.
         scheduler: address of a Dask scheduler whose workers simulate instead; they must
             see the root folder under the same path.
         gather: other root folders, from which finished scenarios are taken first.
-        force: simulate anew what is there and right.
+        force: simulate scenarios again even if their files are there and correct.
         dry_run: only say what it would take.
         progress: called as the work advances.
         on_wait: called with the holder in words when another process holds the lock.
@@ -376,6 +377,7 @@ def _scan_folder(
     stored: Mapping[int, FileEntry] = {}
     if store:
         stored = store.stored_entries
+    # All wanted ids that no store holds, and every file that the manifest belies.
     suspects = _suspects(setup, old, stored, wanted_ids)
     setup.meter.begin("checking", total=len(suspects), scenarios=len(suspects))
     inspections = {}

@@ -160,8 +160,8 @@ def verify(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario, fewer than one worker, or
-            than no scenario anew.
+        UsageError: unknown split, size, subset or scenario, fewer than one worker, or a
+            negative number for ``regenerate``.
         WorkFailedError: simulating anew failed.
     """
     tier, folder, _ = locate(split, size, root=root, registry=registry)

@@ -138,9 +138,9 @@ class Metric:
     statistic is NaN, the frame is undefined: left out of the mean and counted.
 
     Raises:
-        UsageError: neither a statistic nor others' series, a text as ``of``, a target
-            without its value, a name that is not of small letters, digits and
-            underscores, or no direction.
+        UsageError: both ``statistic`` and ``of`` are missing; ``of`` is a string; a
+            target has no ``perfect`` value; the name does not consist of small letters,
+            digits and underscores; or there is no direction.
     """
 
     name: str  # unique

@@ -109,7 +109,8 @@ def export_onnx(
 def _one_frame_more(forcing: Tensor, frames: int) -> Tensor:
     """Return what drives the flow towards the given frames and the next one.
 
-    The shape is [frame, ...]. Where the next one is not known, the last one repeats.
+    The shape is [frame, ...]. Where the next frame is not known, the forcing of the
+    last known frame repeats.
     """
     return torch.cat([forcing, forcing[-1:]])[: frames + 1]
 

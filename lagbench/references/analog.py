@@ -156,11 +156,11 @@ def _carry(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
 
 
 def _follow(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
-    """Yield the paths of the analog's particles that are nearest to those given."""
+    """Yield the paths of the analog's particles that are assigned to those given."""
     frames = given.predicted_frames
-    before = mirror.positions(_frame(file, frames[0] - 1))
+    analog_last = mirror.positions(_frame(file, frames[0] - 1))
     partner = assign_particles(
-        given.last, before, given.material, file.read("material"), given.box
+        given.last, analog_last, given.material, file.read("material"), given.box
     )
     for frame in frames:
         yield mirror.positions(_frame(file, frame))[partner].astype("float32")

@@ -248,9 +248,9 @@ def compare(
         second: one of the same. Or a bare name: of a reference in the scores of the
             first (a scores.nc holds only the best one), or of an entry for the same
             data set. If both have that name, the reference is meant.
-        metrics: names of metrics, or one name, that are compared beside the ranking
-            metric, which always is;
-            all that judge by default.
+        metrics: one or more names of further metrics to compare. The ranking metric is
+            always compared. By default all metrics whose direction tells better from
+            worse.
         split: the split to which both must belong, or the path of a local split's
             folder; the one that they name when None.
         board: folder of the leaderboard; ``leaderboard`` in the working folder when

@@ -175,7 +175,7 @@ def _read_obstacle(group: h5py.Group) -> NDArray[np.float32]:
     """Return centre and radius of the obstacle [length].
 
     Raises:
-        ValueError: they are no floats.
+        ValueError: they are no float32.
     """
     values = np.asarray(group.attrs["obstacle"])
     if values.dtype != np.float32:

@@ -47,7 +47,8 @@ def load_manifest(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one with data, of several mini, when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Raises:
@@ -80,8 +81,9 @@ def open_split(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one with data, of several mini, when None.
+        subset: train, valid or test; also shift or extra where the split has it.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:

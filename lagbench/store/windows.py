@@ -542,7 +542,8 @@ def windows(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        subset: train, valid, test or, for multimaterial, extra; or several of them.
+        subset: train, valid or test, also shift or extra where the split has it; or
+            several of them.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.

@@ -176,8 +176,8 @@ def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predi
 
     Args:
         path: the file.
-        info: what the headers of this very file say, where it was opened before. The
-            layout of a file of the same length is not checked again.
+        info: the `FileInfo` of this file from an earlier opening, if there is one. The
+            layout of a file of the same length is then not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.

@@ -63,7 +63,8 @@ class PredictionsWriter:
     Args:
         path: file to write.
         split: name of the split.
-        size: name of the size; the only one with data, of several mini, when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         method: what makes the predictions.
         subset: the subset that is predicted: test, or shift, which lies outside train.
         velocity: whether velocities are stored too (they are not scored).
@@ -494,7 +495,8 @@ def write(
             one array [scenario, frame, particle, space] with the test scenarios by
             ascending id.
         split: name of the split.
-        size: name of the size; the only one with data, of several mini, when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         method: what made the predictions.
         subset: the subset that is predicted: test, or shift, which lies outside train.
         velocities: velocities [length/s], in the same form; stored, not scored.
@@ -608,7 +610,8 @@ def template(
 
     Args:
         split: name of the split.
-        size: name of the size; the only one with data, of several mini, when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         output: file to write.
         overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
