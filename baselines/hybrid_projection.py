@@ -12,14 +12,16 @@ With all three 0 the model is that solver, digit by digit.
 The coefficients are fitted to rollouts of the solver over many frames of ``train``: a
 solver with a learned part that is trained through its own steps (Um et al. 2020,
 arXiv 2007.00016; Kochkov et al. 2021, PNAS 118). Three numbers need no gradient: the
-simplex method of Nelder and Mead (1965) finds them.
+simplex method of Nelder and Mead (1965) finds them. The error that they minimise is
+that of the vorticity on the score grid, seen through the particles of the truth: a
+finer grid has about one particle a cell, and there sampling noise hides the error.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import ClassVar
 
 import numpy as np
@@ -121,21 +123,64 @@ class ClosedGrid(StaggeredGrid):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What drives the flow of one scenario towards each frame that is known."""
+
+    walls: Floats  # wall velocities [length/s], shape [frame, 2 axis, axis]
+    # acceleration of the fluid in layers [length/s^2], shape [frame, layer, axis]; None
+    # without a force
+    forces: Floats | None
+
+    @classmethod
+    def of(cls, batch: Batch, window: int) -> Drive:
+        """Return what drives a window of a batch; walls at rest where none moves."""
+        dimension = batch.position.shape[2]
+        walls = np.zeros((1, 2 * dimension, dimension))
+        if batch.wall_velocity is not None:
+            walls = batch.wall_velocity[window].double().cpu().numpy()
+        forces = None
+        if batch.body_force is not None:
+            forces = batch.body_force[window].double().cpu().numpy()
+        return cls(walls=walls, forces=forces)
+
+    @property
+    def moves_walls(self) -> bool:
+        """Whether a wall ever moves."""
+        return bool(self.walls.any())
+
+    def wall_velocity(self, frame: int) -> Floats:
+        """Return the wall velocities towards a frame; the last known ones stay."""
+        known_frame = min(frame, len(self.walls) - 1)
+        return np.asarray(self.walls[known_frame])
+
+    def force(self, frame: int) -> Floats | None:
+        """Return the acceleration towards a frame; the last known one stays."""
+        if self.forces is None:
+            return None
+        known_frame = min(frame, len(self.forces) - 1)
+        return np.asarray(self.forces[known_frame])
+
+
+@dataclass(frozen=True, kw_only=True)
 class FlowState:
     """One scenario on the way: its solver and where its fluid is."""
 
     grid: ClosedGrid
+    drive: Drive
+    viscosity: float  # nu' [length^2/s]
     field: Velocity  # face velocities [length/s]
     position: Floats  # particle positions [length], shape [particle, axis]
-    walls: Floats  # wall velocities of all known frames [length/s]
-    frame: int  # row of `walls` of the frame that was reached
-    viscosity: float  # nu' [length^2/s]
+    frame: int  # number of the frame that was reached, counted from the window's first
 
-    def wall_velocity(self, frame: int) -> Floats:
-        """Return the wall velocities towards a frame; the last known ones stay."""
-        last_known = len(self.walls) - 1
-        known_frame = min(frame, last_known)
-        return np.asarray(self.walls[known_frame])
+    def later_field(self, *, frame: int, duration: float) -> Velocity:
+        """Return the face velocities after some time on the way to a frame."""
+        return self.grid.advance(
+            self.field,
+            duration=duration,
+            viscosity=self.viscosity,
+            wall_velocity=self.drive.wall_velocity(frame),
+            force=self.drive.force(frame),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,6 +189,56 @@ class Flows:
 
     flows: tuple[FlowState, ...]
     device: torch.device
+
+
+class Observation:
+    """What particles show of the true flow half-way between two frames.
+
+    Args:
+        grid: the score grid, on which the particles' velocities are averaged.
+        position: particle positions [length], shape [particle, axis].
+        velocity: velocities of the particles [length/s], shape [particle, axis].
+        wall_velocity: as in :meth:`StaggeredGrid.acceleration`.
+    """
+
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        position: Floats,
+        velocity: Floats,
+        wall_velocity: Floats,
+    ) -> None:
+        self.grid = grid
+        self.position = position
+        self.wall_velocity = wall_velocity
+        self.true_vorticity = self._vorticity_of(velocity)
+
+    def vorticity_of(self, field: Velocity, grid: StaggeredGrid) -> Floats:
+        """Return the vorticity [1/s] that the particles would show in another flow.
+
+        Args:
+            field: face velocities of that flow [length/s].
+            grid: its grid.
+        """
+        velocity = grid.at_particles(
+            field, self.position, wall_velocity=self.wall_velocity
+        )
+        return self._vorticity_of(velocity)
+
+    def _vorticity_of(self, velocity: Floats) -> Floats:
+        # The mean around each face is enough: corrections would sharpen the noise too.
+        field = self.grid.from_particles(
+            self.position, velocity, wall_velocity=self.wall_velocity, corrections=0
+        )
+        return compute_vorticity(field, self.grid)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """A scenario of the fit: the given frames, and what its particles show later."""
+
+    given: Batch
+    observations: tuple[Observation, ...]
 
 
 class HybridOptions(Options):
@@ -167,6 +262,7 @@ class HybridProjection(Baseline):
     method = "hybrid projection"
     closed_form: ClassVar[bool] = True
     fits_batches: ClassVar[bool] = True
+    any_box: ClassVar[bool] = True
 
     Options = HybridOptions
     options: HybridOptions
@@ -178,8 +274,8 @@ class HybridProjection(Baseline):
 
     @property
     def forcing_seen(self) -> frozenset[str]:
-        """Neither a force nor an obstacle."""
-        return frozenset()
+        """The force that drives the flow; no obstacle."""
+        return frozenset({"body_force"})
 
     @property
     def history(self) -> int:
@@ -221,46 +317,38 @@ class HybridProjection(Baseline):
     ) -> FlowState:
         """Return the flow of one window, brought to its last given frame."""
         interval = self.info.frame_interval
-        frames = given.position[is_inside].double().cpu().numpy()
-        _, frame_count, dimension = frames.shape
-        walls = np.zeros((1, 2 * dimension, dimension))
-        if given.wall_velocity is not None:
-            known_walls = given.wall_velocity[window]
-            walls = known_walls.double().cpu().numpy()
-        viscosity, hyperviscosity = self._closure(given, window, coefficients)
         box = self.info.box
+        drive = Drive.of(given, window)
+        viscosity, hyperviscosity = self._closure(given, window, coefficients)
         grid = ClosedGrid(
             box,
-            cells=self._cell_counts(box),
-            no_slip=bool(walls.any()),
+            cells=self._cell_counts(self.options.resolution),
+            no_slip=drive.moves_walls,
             hyperviscosity=hyperviscosity,
         )
-        last_frame = frame_count - 1
+        frames = given.position[is_inside].double().cpu().numpy()
         before = frames[:, -2]
         position = frames[:, -1]
-        flow = FlowState(
-            grid=grid,
-            field=[],
-            position=position,
-            walls=walls,
-            frame=last_frame,
-            viscosity=viscosity,
-        )
-        wall_velocity = flow.wall_velocity(last_frame)
+        last_frame = given.frames - 1
+
         step = box.displacement(before, position)
-        velocity = step / interval
         if box.is_periodic:
             middle = box.inside(position - step / 2.0)
         else:
             middle = (position + before) / 2
-        # The velocities of the last step hold half a frame before its end.
-        field = grid.from_particles(middle, velocity, wall_velocity=wall_velocity)
-        field = grid.advance(
-            field,
-            duration=0.5 * interval,
-            viscosity=viscosity,
-            wall_velocity=wall_velocity,
+        field = grid.from_particles(
+            middle, step / interval, wall_velocity=drive.wall_velocity(last_frame)
         )
+        flow = FlowState(
+            grid=grid,
+            drive=drive,
+            viscosity=viscosity,
+            field=field,
+            position=position,
+            frame=last_frame,
+        )
+        # The velocities of the last step hold half a frame before its end.
+        field = flow.later_field(frame=last_frame, duration=0.5 * interval)
         return replace(flow, field=field)
 
     def _closure(
@@ -278,19 +366,19 @@ class HybridProjection(Baseline):
         # A file states it in float64; the solver's steps may hang on the last digit.
         stated = float(given.viscosity[window])
         relative, added, hyper = coefficients.tolist()  # a, b, c
-        box = self.info.box
-        cell_counts = np.asarray(self._cell_counts(box))
-        cell_lengths = box.lengths / cell_counts
+        cell_counts = np.asarray(self._cell_counts(self.options.resolution))
+        cell_lengths = self.info.box.lengths / cell_counts
         spacing = float(cell_lengths.min())
         interval = self.info.frame_interval
         viscosity = (1.0 + relative) * stated + added * spacing**2 / interval
         hyperviscosity = max(hyper, 0.0) * spacing**4 / interval
         return max(viscosity, 0.0), hyperviscosity
 
-    def _cell_counts(self, box: Box) -> tuple[int, ...]:
-        cells_per_length = self.options.resolution * self.info.score_cells
+    def _cell_counts(self, resolution: float) -> tuple[int, ...]:
+        """Return the cells along each axis, for cells over those of the score grid."""
+        cells_per_length = resolution * self.info.score_cells
         counts = []
-        for length in box.lengths:
+        for length in self.info.box.lengths:
             nearest = round(cells_per_length * length)
             counts.append(max(4, nearest))
         return tuple(counts)
@@ -312,19 +400,13 @@ class HybridProjection(Baseline):
         """Return a flow one frame later."""
         interval = self.info.frame_interval
         next_frame = flow.frame + 1
-        wall_velocity = flow.wall_velocity(next_frame)
-        field = flow.grid.advance(
-            flow.field,
-            duration=interval,
-            viscosity=flow.viscosity,
-            wall_velocity=wall_velocity,
-        )
+        field = flow.later_field(frame=next_frame, duration=interval)
         position = flow.grid.carry(
             flow.position,
             before=flow.field,
             after=field,
             duration=interval,
-            wall_velocity=wall_velocity,
+            wall_velocity=flow.drive.wall_velocity(next_frame),
         )
         return replace(flow, field=field, position=position, frame=next_frame)
 
@@ -333,14 +415,14 @@ class HybridProjection(Baseline):
     def fit(self, scenarios: Iterable[Batch]) -> Mapping[str, float]:
         """Fit the coefficients to scenarios of train; return errors to log.
 
-        The error is that of the vorticity on the solver's grid over the true one's, the
+        The error is that of the vorticity on the score grid over the true one's, the
         root of a mean over frames, and the mean over scenarios.
 
         Args:
             scenarios: whole scenarios, one a batch.
         """
-        samples = []
-        for scenario in islice(scenarios, self.options.scenarios):
+        samples: list[Sample] = []
+        for scenario in itertools.islice(scenarios, self.options.scenarios):
             sample = self._prepare(scenario)
             samples.append(sample)
         size = 1
@@ -383,83 +465,51 @@ class HybridProjection(Baseline):
             "hyper": hyper,
         }
 
-    def _prepare(self, scenario: Batch) -> tuple[Batch, list[Floats]]:
-        """Return the first frames of a scenario, and its true vorticity later on."""
+    def _prepare(self, scenario: Batch) -> Sample:
+        """Return the first frames of a scenario, and what its particles show later."""
+        box = self.info.box
         given_frames = self.info.input_frames
-        last = min(scenario.frames, given_frames + self.options.frames)
+        frame_count = min(scenario.frames, given_frames + self.options.frames)
+        drive = Drive.of(scenario, 0)
+        score_grid = StaggeredGrid(
+            box, cells=self._cell_counts(1.0), no_slip=drive.moves_walls
+        )
+        positions = scenario.position.double().numpy()
+        observations = []
+        for frame in range(given_frames, frame_count):
+            before = positions[:, frame - 1]
+            step = box.displacement(before, positions[:, frame])
+            observation = Observation(
+                score_grid,
+                position=box.inside(before + step / 2.0),
+                velocity=step / self.info.frame_interval,
+                wall_velocity=drive.wall_velocity(frame),
+            )
+            observations.append(observation)
         given = scenario.part(slice(given_frames))
-        vorticity = []
-        for frame in range(given_frames, last):
-            window = scenario.part(slice(0, frame + 1))
-            flow = self._observe(window)
-            true_vorticity = compute_vorticity(flow.field, flow.grid)
-            vorticity.append(true_vorticity)
-        return given, vorticity
+        return Sample(given=given, observations=tuple(observations))
 
-    def _observe(self, window: Batch) -> FlowState:
-        """Return the flow of a window's last step, half a frame before its end."""
-        interval = self.info.frame_interval
-        box = self.info.box
-        flow = self._begin_at_rest(window)
-        frames = window.position[:, -2:].double().numpy()
-        before = frames[:, 0]
-        position = frames[:, 1]
-        step = box.displacement(before, position)
-        middle = box.inside(position - step / 2.0)
-        velocity = step / interval
-        wall_velocity = flow.wall_velocity(window.frames - 1)
-        field = flow.grid.from_particles(middle, velocity, wall_velocity=wall_velocity)
-        return replace(flow, field=field)
-
-    def _begin_at_rest(self, window: Batch) -> FlowState:
-        """Return the flow of a window without its field."""
-        box = self.info.box
-        dimension = window.position.shape[2]
-        walls = np.zeros((1, 2 * dimension, dimension))
-        if window.wall_velocity is not None:
-            walls = window.wall_velocity[0].double().numpy()
-        grid = ClosedGrid(
-            box,
-            cells=self._cell_counts(box),
-            no_slip=bool(walls.any()),
-            hyperviscosity=0.0,
-        )
-        return FlowState(
-            grid=grid,
-            field=[],
-            position=np.zeros((0, dimension)),
-            walls=walls,
-            frame=0,
-            viscosity=0.0,
-        )
-
-    def _error(self, sample: tuple[Batch, list[Floats]], coefficients: Floats) -> float:
+    def _error(self, sample: Sample, coefficients: Floats) -> float:
         """Return the error of a rollout with some coefficients [1]."""
-        given, true_vorticity = sample
-        particles = len(given.position)
-        everybody = torch.ones(particles, dtype=torch.bool)
+        given = sample.given
+        particle_count = len(given.position)
+        everybody = torch.ones(particle_count, dtype=torch.bool)
         flow = self._begin(given, 0, everybody, coefficients)
         interval = self.info.frame_interval
         squared_error = 0.0
         squared_truth = 0.0
-        field = flow.field
-        for step, truth in enumerate(true_vorticity, start=1):
-            wall_velocity = flow.wall_velocity(flow.frame + step)
-            later = flow.grid.advance(
-                field,
-                duration=interval,
-                viscosity=flow.viscosity,
-                wall_velocity=wall_velocity,
-            )
+        for observation in sample.observations:
+            next_frame = flow.frame + 1
+            later = flow.later_field(frame=next_frame, duration=interval)
             # The mean of both ends stands for the step between two frames.
             middle = []
-            for start, end in zip(field, later, strict=True):
+            for start, end in zip(flow.field, later, strict=True):
                 middle.append((start + end) / 2)
-            vorticity = compute_vorticity(middle, flow.grid)
-            difference = vorticity - truth
+            vorticity = observation.vorticity_of(middle, flow.grid)
+            difference = vorticity - observation.true_vorticity
             squared_error += float(np.square(difference).sum())
-            squared_truth += float(np.square(truth).sum())
-            field = later
+            squared_truth += float(np.square(observation.true_vorticity).sum())
+            flow = replace(flow, field=later, frame=next_frame)
         if not np.isfinite(squared_error) or squared_truth == 0.0:
             return WORST_ERROR
         relative_error = float(np.sqrt(squared_error / squared_truth))
@@ -467,11 +517,36 @@ class HybridProjection(Baseline):
 
 
 def compute_vorticity(velocity: Velocity, grid: StaggeredGrid) -> Floats:
-    """Return dv/dx - du/dy at the inner corners of a grid in two dimensions [1/s]."""
-    u, v = velocity
-    width, height = grid.spacing
-    v_differences = np.diff(v, axis=0)
-    u_differences = np.diff(u, axis=1)
-    dv_dx = v_differences[:, 1:-1] / width
-    du_dy = u_differences[1:-1] / height
-    return np.asarray(dv_dx - du_dy)
+    """Return ``d u_b / d a - d u_a / d b`` for each pair of axes a < b [1/s].
+
+    The edges on which both slopes stand: those inside the box, and along a periodic
+    axis those of its seam too.
+
+    Args:
+        velocity: face velocities [length/s].
+        grid: their grid.
+
+    Returns:
+        One number per pair of axes and edge, in one row.
+    """
+    rotations = []
+    for a, b in itertools.combinations(range(grid.dimension), 2):
+        slope_of_b = _slope_at_edges(velocity[b], grid, component=b, axis=a)
+        slope_of_a = _slope_at_edges(velocity[a], grid, component=a, axis=b)
+        rotation = slope_of_b - slope_of_a
+        rotations.append(rotation.ravel())
+    return np.concatenate(rotations)
+
+
+def _slope_at_edges(
+    values: Floats, grid: StaggeredGrid, *, component: int, axis: int
+) -> Floats:
+    """Return the slope of a component along another axis [1/s], on inner edges."""
+    if grid.box.periodic[axis]:
+        change = values - np.roll(values, 1, axis)
+    else:
+        change = np.diff(values, axis=axis)
+    if not grid.box.periodic[component]:
+        last = change.shape[component] - 1
+        change = change.take(range(1, last), axis=component)
+    return np.asarray(change / grid.spacing[axis])

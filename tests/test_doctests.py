@@ -13,8 +13,11 @@ PACKAGE = Path(lagbench.__file__).parent
 
 def modules_with_examples() -> list[str]:
     """Names of the modules whose text holds an example."""
+    paths = list(PACKAGE.rglob("*.py"))
+    for linked in ("generators", "baselines"):
+        paths += (PACKAGE / linked).rglob("*.py")
     names = []
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(set(paths)):
         if ">>> " not in path.read_text(encoding="utf-8"):
             continue
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,18 @@ from numpy.typing import NDArray
 from simple_models import info
 
 from lagbench.baselines.baseline import Batch, DatasetInfo
-from lagbench.baselines.hybrid_projection import ClosedGrid, HybridProjection
+from lagbench.baselines.hybrid_projection import (
+    ClosedGrid,
+    HybridProjection,
+    compute_vorticity,
+)
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.box import Box
 from lagbench.data.registry import Size, load
 from lagbench.errors import DataError
 from lagbench.references import projection
 from lagbench.references.predictor import Given
+from lagbench.references.staggered import StaggeredGrid
 from lagbench.tensors import TensorWindow, collate
 
 Array = NDArray[np.float64]
@@ -81,16 +87,19 @@ def moving_lid(frames: int) -> Array:
 
 def batch_of(
     path: Array,
-    walls: Array,
+    walls: Array | None,
     viscosity: float | None,
 ) -> Batch:
     """Return one window of liquid."""
     particle_count = path.shape[1]
     position = path.transpose(1, 0, 2)
+    wall_velocity = None
+    if walls is not None:
+        wall_velocity = torch.from_numpy(walls).float()
     window = TensorWindow(
         position=torch.from_numpy(position).float(),
         material=torch.zeros(particle_count, dtype=torch.int64),
-        wall_velocity=torch.from_numpy(walls).float(),
+        wall_velocity=wall_velocity,
         scenario=0,
         frame=0,
         viscosity=viscosity,
@@ -121,6 +130,87 @@ def test_without_a_closure_it_is_the_reference_solver() -> None:
     (rollout,) = roll_out(model, window, size.task.horizon)
     predicted = rollout.position.numpy()
     np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
+
+
+def test_a_force_drives_it_as_it_drives_the_reference_solver() -> None:
+    """Two layers of a periodic square are pushed opposite ways, harder each frame."""
+    size = load().size("poiseuille", "tiny")
+    given_frames = size.task.input_frames
+    frames = given_frames + size.task.horizon
+    axis = (np.arange(24) + 0.5) / 24
+    columns, rows = np.meshgrid(axis, axis, indexing="ij")
+    place = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    path = rounded(np.repeat(place[None], given_frames, axis=0))
+    forces = np.zeros((frames, 2, 2))
+    strength = 0.01 * np.arange(frames)
+    forces[:, 0, 0] = strength
+    forces[:, 1, 0] = -strength
+    forces = rounded(forces)
+    given = Given(
+        size=size,
+        root=Path(),
+        position=path,
+        material=np.zeros(len(place), np.int8),
+        walls=np.zeros((frames, 4, 2)),
+        area=1.0,
+        body_force=forces * size.frame_interval**2,
+        parameters={"viscosity": VISCOSITY},
+    )
+    positions = projection.predict(given, 2)
+    expected = np.array(list(positions))
+    model = HybridProjection.build(
+        {},
+        info(
+            bounds=size.bounds,
+            periodic=("x", "y"),
+            frame_interval=size.frame_interval,
+            score_cells=size.task.score_grid.cells,
+            input_frames=given_frames,
+        ),
+    )
+    window = batch_of(path, None, VISCOSITY)
+    body_force = torch.from_numpy(forces).float()
+    window = replace(window, body_force=body_force[None])
+    (rollout,) = roll_out(model, window, size.task.horizon)
+    predicted = rollout.position.numpy()
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
+    assert np.abs(expected[-1] - path[-1]).max() > 0.01
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("is_periodic", [False, True])
+def test_the_vorticity_of_a_rigid_rotation_is_twice_its_rate(
+    dimension: int, is_periodic: bool
+) -> None:
+    """U = Omega x r. At the seam of a periodic box the rotation jumps: left out."""
+    unit = (0.0, 1.0)
+    cells = 6
+    box = Box.from_bounds((unit,) * dimension, (is_periodic,) * dimension)
+    grid = StaggeredGrid(box, cells=(cells,) * dimension, no_slip=False)
+    rate = np.array([0.3, -0.2, 0.7])
+    if dimension == 2:
+        rate[:2] = 0.0
+    velocity = []
+    for component in range(dimension):
+        faces = np.indices(grid.face_shape(component))
+        place = np.zeros((3, *faces.shape[1:]))
+        for axis in range(dimension):
+            place[axis] = grid.face_origin(component)[axis] + faces[axis] / cells
+        field = np.cross(rate, place, axisb=0, axisc=0)
+        velocity.append(field[component])
+
+    vorticity = compute_vorticity(velocity, grid)
+
+    # Pairs of axes (0, 1), (0, 2), (1, 2): components z, -y, x of the rotation.
+    expected = 2.0 * np.array([rate[2], -rate[1], rate[0]])
+    pair_count = dimension * (dimension - 1) // 2
+    per_pair = vorticity.reshape(pair_count, -1)
+    for value, numbers in zip(expected, per_pair, strict=False):
+        if is_periodic:
+            numbers = numbers.reshape((cells,) * dimension)[
+                (slice(1, None),) * dimension
+            ]
+        np.testing.assert_allclose(numbers, value, atol=1e-12)
 
 
 def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
