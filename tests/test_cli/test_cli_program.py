@@ -139,6 +139,25 @@ def test_an_interruption_is_no_error_to_trace(
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("train", "--fresh"), ("generate", "--force")],
+)
+def test_an_interruption_says_to_leave_out_what_deletes_the_work(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: str, option: str
+) -> None:
+    """The same command with the option would delete what was done so far."""
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("typer.core.TyperCommand.invoke", interrupt)
+    monkeypatch.setattr("sys.argv", ["lagbench", command, option])
+    result = run(command, option)
+    assert result.exit_code == 130
+    assert f"without {option}" in result.stderr
+
+
 @pytest.mark.parametrize("words", [("--help",), ("list",), ("list", "--json")])
 def test_a_closed_pipe_ends_in_silence(words: tuple[str, ...]) -> None:
     """Text, tables and help end as the shell's commands do when nobody reads them."""
