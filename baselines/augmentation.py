@@ -163,8 +163,10 @@ def draw_mirror_matrices(
     device = generator.device
     if dimension == 3:
         return _draw_solid_matrices(symmetry, windows, generator)
-    bits = torch.randint(2, (3, windows), generator=generator, device=device)
-    flip_x, flip_y, swap = bits * (symmetry is Symmetry.SQUARE)
+    shape = (3, windows)
+    bits = torch.randint(2, shape, generator=generator, device=device)
+    is_square = symmetry is Symmetry.SQUARE
+    flip_x, flip_y, swap = bits * is_square
     if symmetry is Symmetry.MIRROR:
         flip_x = bits[0]
     flips = torch.stack([flip_x, flip_y], dim=1)
@@ -183,12 +185,13 @@ def _draw_solid_matrices(
     Where gravity acts along the second axis it stays as it is.
     """
     device = generator.device
-    flips = torch.randint(2, (windows, 3), generator=generator, device=device)
+    shape = (windows, 3)
+    flips = torch.randint(2, shape, generator=generator, device=device)
     signs = 1.0 - 2.0 * flips
     axes = torch.arange(3, device=device)
     order = axes.expand(windows, 3)
     if symmetry is Symmetry.SQUARE:
-        draws = torch.rand(windows, 3, generator=generator, device=device)
+        draws = torch.rand(shape, generator=generator, device=device)
         order = draws.argsort(dim=1)
     else:
         signs[:, 1] = 1.0
@@ -251,9 +254,10 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
         force = _mirror_force(force, matrix)
     obstacle = batch.obstacle
     if obstacle is not None:
+        radius = obstacle[:, -1:]
         from_centre = obstacle[:, :-1] - centre
         place = _multiply(matrix, from_centre) + centre
-        obstacle = torch.cat([place, obstacle[:, -1:]], dim=1)
+        obstacle = torch.cat([place, radius], dim=1)
     return replace(
         batch,
         position=position,
@@ -320,9 +324,16 @@ def shift_batch(batch: Batch, box: TensorBox, generator: torch.Generator) -> Bat
         origin = box.wrap(moved)
     obstacle = batch.obstacle
     if obstacle is not None:
-        place = box.wrap(obstacle[:, :-1] + shift)
-        obstacle = torch.cat([place, obstacle[:, -1:]], dim=1)
-    return replace(batch, position=position, origin=origin, obstacle=obstacle)
+        radius = obstacle[:, -1:]
+        moved = obstacle[:, :-1] + shift
+        place = box.wrap(moved)
+        obstacle = torch.cat([place, radius], dim=1)
+    return replace(
+        batch,
+        position=position,
+        origin=origin,
+        obstacle=obstacle,
+    )
 
 
 def wall_permutation(matrix: Tensor) -> Tensor:
@@ -338,7 +349,9 @@ def wall_permutation(matrix: Tensor) -> Tensor:
 
     matrix_of_walls = matrix[..., None, :, :]
     image_normals = _multiply(matrix_of_walls, normals)  # [..., wall, axis]
-    products = normals[:, None] * image_normals[..., None, :, :]
+    new_normals = normals[:, None]
+    old_normals = image_normals[..., None, :, :]
+    products = new_normals * old_normals
     cosines = products.sum(dim=-1)
     is_same_wall = cosines > 0.5
     return is_same_wall.to(matrix)
@@ -363,7 +376,10 @@ def _multiply(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def add_walk_noise(
-    position: Tensor, history: int, std: float | Tensor, generator: torch.Generator
+    position: Tensor,
+    history: int,
+    std: float | Tensor,
+    generator: torch.Generator,
 ) -> Tensor:
     """Return the positions of windows with noise on their history.
 
@@ -426,7 +442,8 @@ def draw_noise_levels(most: float, batch: Batch, generator: torch.Generator) -> 
     """
     level = torch.rand(batch.windows, generator=generator, device=generator.device)
     sample = batch.sample.to(level.device)
-    return most * level[sample][:, None, None]
+    by_particle = level[sample]
+    return most * by_particle[:, None, None]
 
 
 def draw_waves(
@@ -461,17 +478,23 @@ def draw_waves(
     device = generator.device
     shape = (windows, _WAVES)
     dimension = position.shape[1]
+    turn = 2 * math.pi
     normal = torch.randn((*shape, dimension), generator=generator, device=device)
-    direction = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    phase = 2 * math.pi * torch.rand(shape, generator=generator, device=device)
+    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    direction = normal / length
+    phase_share = torch.rand(shape, generator=generator, device=device)
+    phase = turn * phase_share
     decade = torch.rand(shape, generator=generator, device=device)
     wavelength = shortest * 10.0**decade
-    wave_strain = strain * torch.rand(shape, generator=generator, device=device)
+    strain_share = torch.rand(shape, generator=generator, device=device)
+    wave_strain = strain * strain_share
 
-    wave_vector = direction * (2 * math.pi / wavelength[..., None])
+    free_wavenumber = turn / wavelength[..., None]
+    wave_vector = direction * free_wavenumber
     periods = period.to(device)
-    waves_in_period = torch.round(wave_vector * periods / (2 * math.pi))
-    fitting = 2 * math.pi * waves_in_period / periods
+    phase_of_period = wave_vector * periods
+    waves_in_period = torch.round(phase_of_period / turn)
+    fitting = turn * waves_in_period / periods
     wave_vector = torch.where(periods.isfinite(), fitting, wave_vector)
     wavenumber = torch.linalg.vector_norm(wave_vector, dim=-1, keepdim=True)
     # A wave longer than the box fits no period: it displaces nothing.
@@ -482,7 +505,8 @@ def draw_waves(
     positions = position[:, None].to(device)
     products = wave_vector[of_particle] * positions
     angle = products.sum(dim=-1) + phase[of_particle]
-    by_wave = amplitude[of_particle] * torch.sin(angle)[..., None]
+    sine = torch.sin(angle)
+    by_wave = amplitude[of_particle] * sine[..., None]
     displacement: Tensor = by_wave.sum(dim=1)
     return displacement.to(position)
 
@@ -502,9 +526,11 @@ def augment(
     symmetry = model.options.symmetry
     noise_std = model.options.noise_std
     if symmetry is not Symmetry.NONE:
-        dimension = batch.position.shape[2]
         matrix = draw_mirror_matrices(
-            symmetry, batch.windows, generator, dimension=dimension
+            symmetry,
+            batch.windows,
+            generator,
+            dimension=batch.position.shape[2],
         )
         batch = mirror_batch(batch, matrix, model.info.bounds)
     if noise_std > 0.0:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Self
 
@@ -72,12 +72,16 @@ def _has_boolean_number(value: object, parsed: object) -> bool:
     if isinstance(value, bool):
         return isinstance(parsed, int | float) and not isinstance(parsed, bool)
 
-    pairs: Iterable[tuple[object, object]] = ()
     if isinstance(value, Mapping) and isinstance(parsed, Mapping):
-        pairs = [(part, parsed.get(name)) for name, part in value.items()]
+        for name, part in value.items():
+            parsed_part = parsed.get(name)
+            if _has_boolean_number(part, parsed_part):
+                return True
     elif isinstance(value, list | tuple) and isinstance(parsed, list | tuple):
-        pairs = zip(value, parsed, strict=False)
-    return any(_has_boolean_number(*pair) for pair in pairs)
+        for part, parsed_part in zip(value, parsed, strict=False):
+            if _has_boolean_number(part, parsed_part):
+                return True
+    return False
 
 
 class Options(Settings):
@@ -231,11 +235,16 @@ def count_parameters(model: Baseline) -> int:
 
     These are its parameters, or the coefficients of a closed form.
     """
+    count = 0
     if getattr(model, "closed_form", False):
-        tensors = [t for t in model.state_dict().values() if t.is_floating_point()]
-    else:
-        tensors = [p for p in model.parameters() if p.requires_grad]
-    return sum(tensor.numel() for tensor in tensors)
+        for tensor in model.state_dict().values():
+            if tensor.is_floating_point():
+                count += tensor.numel()
+        return count
+    for parameter in model.parameters():
+        if parameter.requires_grad:
+            count += parameter.numel()
+    return count
 
 
 def last_velocities(
@@ -258,7 +267,9 @@ def last_velocities(
     if box is None:
         velocity = frames.diff(dim=1)
     else:
-        velocity = box.displacement(frames[:, :-1], frames[:, 1:])
+        before = frames[:, :-1]
+        after = frames[:, 1:]
+        velocity = box.displacement(before, after)
     if not velocity.shape[1]:
         raise UsageError(
             "too few frames to start from",
@@ -266,7 +277,8 @@ def last_velocities(
             got=position.shape[1],
         )
     missing_count = count - velocity.shape[1]
-    repeated = velocity[:, :1].expand(-1, missing_count, -1)
+    first_velocity = velocity[:, :1]
+    repeated = first_velocity.expand(-1, missing_count, -1)
     return torch.cat([repeated, velocity], dim=1)
 
 

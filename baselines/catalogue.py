@@ -143,15 +143,18 @@ def _load_entry(point: EntryPoint) -> CatalogueEntry:
 def _check_complete(model: type[Baseline], point: EntryPoint) -> None:
     """Refuse a baseline that lacks a method of the contract."""
     missing = []
+    present = []
     for name in REQUIRED:
         if getattr(model, name) is getattr(Baseline, name):
             missing.append(name)
+        else:
+            present.append(name)
     if missing:
         raise UsageError(
             f"{point.value} lacks {', '.join(missing)}",
             where=package_of(point),
             expected=", ".join(REQUIRED),
-            got=", ".join(name for name in REQUIRED if name not in missing) or "none",
+            got=", ".join(present) or "none",
             fix="add them: docs/extending.md has the contract",
         )
 
@@ -172,7 +175,8 @@ def _find_recipes(model: type, name: str) -> Path | None:
     if path.is_absolute():
         return path
     owner = next(base for base in model.__mro__ if "recipes" in vars(base))
-    return Path(inspect.getfile(owner)).parent / path
+    module = Path(inspect.getfile(owner))
+    return module.parent / path
 
 
 def _describe_error(error: Exception) -> str:

@@ -145,11 +145,12 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         try:
             torch.save(content, temporary)
         except RuntimeError as error:  # torch raises it for any error of the system
+            first_line = str(error).split("\n")[0]
             raise WorkFailedError(
                 "cannot write there",
                 where=str(path),
                 expected="a folder that you may write to, on a disk with space",
-                got=str(error).split("\n")[0][:200],
+                got=first_line[:200],
                 fix="free disk space, or name a folder that you may write to: --output",
             ) from error
 
@@ -181,8 +182,9 @@ def load(path: str | Path) -> Checkpoint:
             optimizer=content.get("optimizer"),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise _unreadable(file, EXPECTED, f"{type(error).__name__}: {reason}") from None
+        one_line = " ".join(str(error).split())
+        got = f"{type(error).__name__}: {one_line[:200]}"
+        raise _unreadable(file, EXPECTED, got) from None
 
 
 def _check_tensors(weights: object) -> dict[str, Tensor]:
@@ -312,12 +314,12 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         MemoryError,
         RuntimeError,
     ) as error:
-        reason = str(error).split("\n")[0][:200]
+        first_line = str(error).split("\n")[0]
         raise UnreadableFileError(
             "no model can be built from it",
             where=where,
             expected=f"options of {checkpoint.baseline}",
-            got=f"{type(error).__name__}: {reason}",
+            got=f"{type(error).__name__}: {first_line[:200]}",
             fix="train anew with this version of lagbench",
         ) from None
     load_weights(model, checkpoint.weights, where=where)
@@ -334,7 +336,8 @@ def load_weights(
     """
     infinite = []
     for name, value in weights.items():
-        if not value.to(torch.float32).isfinite().all():
+        is_finite = value.to(torch.float32).isfinite()
+        if not is_finite.all():
             infinite.append(name)
     if infinite:
         raise UnreadableFileError(
@@ -347,11 +350,12 @@ def load_weights(
     try:
         model.load_state_dict(dict(weights))
     except RuntimeError as error:
+        one_line = " ".join(str(error).split())
         raise UnreadableFileError(
             "the weights do not fit the model",
             where=where,
             expected=f"weights of {type(model).__name__} with the options of the file",
-            got=" ".join(str(error).split())[:300],
+            got=one_line[:300],
             fix="train anew with this version of lagbench",
         ) from None
 
@@ -370,8 +374,11 @@ def round_weights(model: nn.Module) -> dict[str, Tensor]:
 
 def count_rounded_parameters(checkpoint: Checkpoint) -> int:
     """Return how many parameters of a file :func:`round_weights` has rounded."""
-    rounded = [w for w in checkpoint.weights.values() if w.dtype == torch.bfloat16]
-    return sum(value.numel() for value in rounded)
+    count = 0
+    for value in checkpoint.weights.values():
+        if value.dtype == torch.bfloat16:
+            count += value.numel()
+    return count
 
 
 def check_data(

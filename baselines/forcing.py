@@ -197,7 +197,8 @@ def skip_frames(forcing: Tensor, count: int = 1, *, least: int = 1) -> Tensor:
     missing_frames = least - later.shape[1]
     if missing_frames <= 0:
         return later
-    repeated = forcing[:, -1:].repeat_interleave(missing_frames, dim=1)
+    last = forcing[:, -1:]
+    repeated = last.repeat_interleave(missing_frames, dim=1)
     return torch.cat([later, repeated], dim=1)
 
 
@@ -216,9 +217,11 @@ def force_at(
         box: box that holds the particles.
     """
     low, high = box.box.bounds[1]
-    height = box.wrap(position)[:, 1] - low
+    wrapped = box.wrap(position)
+    height = wrapped[:, 1] - low
     layer_count = body_force.shape[1]
-    layer = (height * (layer_count / (high - low))).long()
+    layers_per_length = layer_count / (high - low)
+    layer = (height * layers_per_length).long()
     layer = layer.clamp(0, layer_count - 1)
     return body_force[sample, layer]
 

@@ -68,7 +68,9 @@ class FrameState(nn.Module):
         frame_count = position.shape[-3]
         if frame_count < 2:
             raise DataError(
-                "a velocity needs two frames", expected="2 or more", got=frame_count
+                "a velocity needs two frames",
+                expected="2 or more",
+                got=frame_count,
             )
         before = position[..., :-1, :, :]
         after = position[..., 1:, :, :]
@@ -107,8 +109,9 @@ class FrameState(nn.Module):
             true_position = self.position(truth)
             predicted_position = self.position(predicted)
             way = self.box.displacement(true_position, predicted_position)
+            position_difference = way / std
             velocity_difference = difference[..., dimension:]
-            difference = torch.cat([way / std, velocity_difference], dim=-1)
+            difference = torch.cat([position_difference, velocity_difference], dim=-1)
         error = difference.square()
         position_error = error[..., :dimension]
         velocity_error = error[..., dimension:]
@@ -124,13 +127,13 @@ def require_particles(counts: Iterable[int], particles: int) -> None:
     Raises:
         DataError: one has another number.
     """
-    distinct_counts = set(counts)
-    if distinct_counts != {particles}:
+    distinct_counts = sorted(set(counts))
+    if distinct_counts != [particles]:
         raise DataError(
             "a model of whole frames needs one number of particles",
             where="scenarios of this data set",
             expected=f"{particles} particles in each scenario",
-            got=", ".join(map(str, sorted(distinct_counts))),
+            got=", ".join(map(str, distinct_counts)),
             fix="train neuralmpm, or a graph network such as gns",
         )
 
@@ -269,7 +272,8 @@ class FrameModel(Baseline):
         predicted = self.next_state(state)
         new_state = self.frame_state.wrap(predicted)
         latest_states = state.state[:, 1:]
-        states = torch.cat([latest_states, new_state.unsqueeze(1)], dim=1)
+        new_frame = new_state.unsqueeze(1)
+        states = torch.cat([latest_states, new_frame], dim=1)
         force = state.body_force
         if force is not None:
             force = skip_frames(force, least=states.shape[1])
@@ -349,10 +353,14 @@ class FrameNetwork(FrameModel):
         """Return the states with independent normal noise; none without a generator."""
         if generator is None or self.options.noise_std == 0.0:
             return state
-        noise = torch.randn(
-            state.shape, generator=generator, device=state.device, dtype=state.dtype
+        normal = torch.randn(
+            state.shape,
+            generator=generator,
+            device=state.device,
+            dtype=state.dtype,
         )
-        return state + self.options.noise_std * noise
+        noise = self.options.noise_std * normal
+        return state + noise
 
     @property
     def forcing_seen(self) -> frozenset[str]:
@@ -375,7 +383,8 @@ class FrameNetwork(FrameModel):
             end_frame = max(last_frame + 1, last_known)
             frame = torch.arange(first_frame, end_frame, device=known_force.device)
             following = frame.clamp(min=0) + 1
-            force = known_force[:, following.clamp(max=last_known)]
+            known_following = following.clamp(max=last_known)
+            force = known_force[:, known_following]
         obstacle = self.forcing.find_obstacle(batch)
         return replace(window, body_force=force, obstacle=obstacle)
 

@@ -84,7 +84,12 @@ def radius_graph(
         x_array = x.cpu().numpy()
         window_array = window.cpu().numpy()
         numbers = tree_edges(
-            x_array, window_array, radius, box=box, self_edges=self_edges, most=most
+            x_array,
+            window_array,
+            radius,
+            box=box,
+            self_edges=self_edges,
+            most=most,
         )
         numbers.sort()
         edges = torch.from_numpy(numbers).to(x.device)
@@ -160,7 +165,8 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
 
     # The candidates of each particle are two runs in that order: the rest of its own
     # cell with the cell above, and three cells of the next column.
-    own_start = xp.arange(len(x), device=x.device) + 1
+    numbers = xp.arange(len(x), device=x.device)
+    own_start = numbers + 1
     above_end = xp.searchsorted(key, key + 2)
     beside_start = xp.searchsorted(key, key + (stride - 1))
     beside_end = xp.searchsorted(key, key + (stride + 2))
@@ -173,10 +179,13 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
     x_axis, y_axis = xp.stack([x[:, 0], x[:, 1]])
     dx = x_axis[i] - x_axis[j]
     dy = y_axis[i] - y_axis[j]
-    is_near = dx * dx + dy * dy <= radius * radius
+    square_distance = dx * dx + dy * dy
+    is_near = square_distance <= radius * radius
     near = xp.where(is_near)[0]
-    first = particle[i[near]]
-    second = particle[j[near]]
+    near_i = i[near]
+    near_j = j[near]
+    first = particle[near_i]
+    second = particle[near_j]
 
     forward = (first << 32) | second
     backward = (second << 32) | first
@@ -196,7 +205,8 @@ def _cell_keys(xp: Any, x: Any, window: Any, radius: float) -> tuple[Any, Any]: 
     if not len(x):
         return window, 0
     width = radius * (1.0 + MARGIN)
-    place = xp.floor(x * (1.0 / width))
+    cells_per_length = 1.0 / width
+    place = xp.floor(x * cells_per_length)
     place = xp.clip(place, -FAR, FAR)
     cell = xp.asarray(place, dtype=xp.int64)
     cell = cell - xp.amin(cell, 0)
@@ -266,7 +276,8 @@ def nearest_edges(
     sender = np.minimum(neighbours, count - 1)  # ``count`` stands for no neighbour
     way = x[receiver] - x[sender]
     dx, dy = np.moveaxis(way, -1, 0)
-    is_near = dx * dx + dy * dy <= radius * radius
+    square_distance = dx * dx + dy * dy
+    is_near = square_distance <= radius * radius
     is_neighbour = _is_neighbour(neighbours, count) & is_near
     i, rank = _nearest_pairs(is_neighbour, most)
 
@@ -339,7 +350,10 @@ def tree_edges(
 
 
 def _nearest_in_tree(
-    tree: cKDTree, members: NDArray[np.int64], radius: float, most: int
+    tree: cKDTree,
+    members: NDArray[np.int64],
+    radius: float,
+    most: int,
 ) -> NDArray[np.int64]:
     """Return the edges to the nearest neighbours of each particle of a tree."""
     count = len(members)
@@ -351,8 +365,9 @@ def _nearest_in_tree(
     neighbours = np.asarray(answer[1])
     is_neighbour = _is_neighbour(neighbours, count)
     i, rank = _nearest_pairs(is_neighbour, most)
+    nearest = neighbours[i, rank]
     receiver = members[i]
-    sender = members[neighbours[i, rank]]
+    sender = members[nearest]
     return np.asarray((receiver << 32) | sender)
 
 
@@ -367,7 +382,11 @@ class Standardisation(nn.Module):
     std: Tensor  # standard deviation over train, shape [axis]
 
     def __init__(
-        self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0
+        self,
+        mean: Sequence[float],
+        std: Sequence[float],
+        *,
+        noise: float = 0.0,
     ) -> None:
         super().__init__()
         exact_std = torch.tensor(std, dtype=torch.float64)

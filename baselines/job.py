@@ -74,7 +74,9 @@ class TrainingJob:
             # Processes that read windows ahead are still alive: the system does not
             # tell their processor time.
             training_seconds = None
-        start = (self.recipe.start or {}).get("took", {})
+        start_record = self.recipe.start or {}
+        start = start_record.get("took", {})
+        ascii_device = device.encode("ascii", "replace").decode()
 
         return Budget(
             windows=log.windows_seen or None,
@@ -86,7 +88,7 @@ class TrainingJob:
                 log.validation_cpu_seconds, start.get("validation_hours", 0.0)
             ),
             gpu_hours=_sum_hours(log.gpu_seconds, start.get("gpu_hours", 0.0)),
-            device=device.encode("ascii", "replace").decode()[:100],
+            device=ascii_device[:100],
             threads=machine["threads"],
             metric=log.metric,
             best=log.best_value,
@@ -156,7 +158,8 @@ def _sum_hours(seconds: float | None, start_hours: float | None) -> float | None
     """Return the hours of a training and its start; None where one is unknown."""
     if seconds is None or start_hours is None:
         return None
-    return round_digits(seconds / 3600.0 + start_hours, 6)
+    hours = seconds / 3600.0 + start_hours
+    return round_digits(hours, 6)
 
 
 def _select_validations(log: TrainingLog) -> tuple[tuple[int, float], ...]:
@@ -168,7 +171,10 @@ def _select_validations(log: TrainingLog) -> tuple[tuple[int, float], ...]:
     for entry in log.validation:
         value = entry[str(log.metric)]
         if math.isfinite(value):
-            validations.append((int(entry["step"]), value))
-    stride = max(1, math.ceil(len(validations) / MOST_VALIDATIONS))
-    latest_first = validations[::-1][::stride]
-    return tuple(latest_first[::-1])
+            step = int(entry["step"])
+            validations.append((step, value))
+    least_stride = math.ceil(len(validations) / MOST_VALIDATIONS)
+    stride = max(1, least_stride)
+    latest_first = validations[::-1]
+    chosen = latest_first[::stride]
+    return tuple(chosen[::-1])

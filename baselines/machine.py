@@ -45,8 +45,9 @@ def is_helper() -> bool:
 
     A helper writes no files and prints nothing.
     """
-    ranks = [os.environ.get(name, "0") for name in ("LOCAL_RANK", "RANK")]
-    return any(rank != "0" for rank in ranks)
+    local_rank = os.environ.get("LOCAL_RANK", "0")
+    rank = os.environ.get("RANK", "0")
+    return local_rank != "0" or rank != "0"
 
 
 @contextmanager
@@ -98,11 +99,12 @@ def explain_memory_errors(hint: str) -> Iterator[None]:
         is_full = isinstance(error, (MemoryError, torch.OutOfMemoryError))
         if not is_full and "can't allocate memory" not in str(error):
             raise
+        first_line = str(error).split("\n")[0]
         raise WorkFailedError(
             "out of memory",
             where="memory of the device",
             expected="room for the model and its batch",
-            got=str(error).split("\n")[0][:200],
+            got=first_line[:200],
             fix=hint,
         ) from error
 
@@ -135,7 +137,8 @@ def multiplies_bfloat16(device: str) -> bool:
     """Return whether the device has instructions for products of bfloat16."""
     if device == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    flags = _read_processor("flags").split() + _read_processor("Features").split()
+    flags = _read_processor("flags").split()  # of x86
+    flags += _read_processor("Features").split()  # of Arm
     return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 

@@ -66,8 +66,8 @@ class ProcessorLayer(nn.Module):
             _check_output(output, self.operator, nodes=len(node))
         aggregate, losses = output
 
-        update = self.update(torch.cat([node, aggregate], dim=-1))
-        next_node = node + update
+        update_input = torch.cat([node, aggregate], dim=-1)
+        next_node = node + self.update(update_input)
         next_edge = edge + message
         return next_node, next_edge, losses
 
@@ -130,7 +130,10 @@ class EncodeProcessDecode(nn.Module):
         self.processor = nn.ModuleList()
         for _ in range(layers):
             layer = ProcessorLayer(
-                operator, latent=latent, hidden=latent, sum_messages=sum_messages
+                operator,
+                latent=latent,
+                hidden=latent,
+                sum_messages=sum_messages,
             )
             self.processor.append(layer)
         self.decoder = mlp([latent, latent, latent, outputs], norm=False)
@@ -234,9 +237,11 @@ def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
     It can for a non-empty matrix of float32 on a CPU, outside autocast and
     torch.compile, and should wherever it can: see :class:`_OneDNNLinear`.
     """
-    is_cpu_matrix = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
+    if x.device.type != "cpu" or torch.is_autocast_enabled("cpu"):
+        return False
+    is_matrix = x.dim() == 2 and x.numel() > 0
     is_float32 = x.dtype == weight.dtype == torch.float32
-    if not is_cpu_matrix or not is_float32 or torch.is_autocast_enabled("cpu"):
+    if not is_matrix or not is_float32:
         return False
     if torch.compiler.is_compiling():
         return False
@@ -343,10 +348,12 @@ class Recomputed(torch.autograd.Function):
         edge_grad = torch.empty_like(edge)
         sender_grad = torch.zeros_like(sender)
         receiver_grad = torch.zeros_like(receiver)
-        weight_grads = [torch.zeros_like(each) for each in (weight, *parameters)]
+        weights = [weight, *parameters]
+        weight_grads = [torch.zeros_like(each) for each in weights]
 
         for piece in _split_edges(len(edge)):
             index = edge_index[:, piece]
+            senders, receivers = index
             with (
                 torch.enable_grad(),
                 torch.autocast("cpu", ctx.autocast_dtype, enabled=ctx.autocast_enabled),
@@ -354,13 +361,15 @@ class Recomputed(torch.autograd.Function):
                 piece_edge = edge[piece].detach().requires_grad_()
                 ends = _sum_of_ends(index, sender.detach(), receiver.detach())
                 ends = ends.requires_grad_()
-                update = ctx.rest(ends + linear(piece_edge, weight))
-            ends_grad, edge_grad[piece], *piece_grads = torch.autograd.grad(
-                update, [ends, piece_edge, weight, *parameters], update_grad[piece]
+                hidden = ends + linear(piece_edge, weight)
+                update = ctx.rest(hidden)
+            ends_grad, piece_grad, *piece_weight_grads = torch.autograd.grad(
+                update, [ends, piece_edge, *weights], update_grad[piece]
             )
-            sender_grad.index_add_(0, index[0], ends_grad)
-            receiver_grad.index_add_(0, index[1], ends_grad)
-            torch._foreach_add_(weight_grads, piece_grads)
+            edge_grad[piece] = piece_grad
+            sender_grad.index_add_(0, senders, ends_grad)
+            receiver_grad.index_add_(0, receivers, ends_grad)
+            torch._foreach_add_(weight_grads, piece_weight_grads)
         return None, None, edge_grad, sender_grad, receiver_grad, *weight_grads
 
 

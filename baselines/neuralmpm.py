@@ -224,7 +224,10 @@ class NeuralMPM(Baseline):
         )
         if self.projection is not None:
             projection = self.projection.start(
-                first_frame(given), given.material, given.sample, given.windows
+                first_frame(given),
+                given.material,
+                given.sample,
+                given.windows,
             )
             state = replace(state, projection=projection)
         if self.context is not None:
@@ -372,8 +375,9 @@ class NeuralMPM(Baseline):
         These are fields, context, viscosity and forcing.
         """
         constants = torch.cat([state.context, state.viscosity], dim=1)
+        windows, channels = constants.shape
         node_axes = [1] * self.grid.dimension
-        one_node = constants.view(*constants.shape, *node_axes)
+        one_node = constants.view(windows, channels, *node_axes)
         constant_fields = one_node.expand(-1, -1, *self.grid.shape)
         parts = [fields, constant_fields]
         if self.options.wall_velocity:
@@ -408,7 +412,10 @@ class NeuralMPM(Baseline):
         return of_images.mean(dim=0)
 
     def _integrate(
-        self, state: GridState, grid_velocity: Tensor, accelerations: Sequence[Tensor]
+        self,
+        state: GridState,
+        grid_velocity: Tensor,
+        accelerations: Sequence[Tensor],
     ) -> list[Frame]:
         """Return the frames of a bundle.
 

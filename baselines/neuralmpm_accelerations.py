@@ -59,7 +59,11 @@ class Accelerations(ABC):
 
     @abstractmethod
     def decode(
-        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+        self,
+        state: GridState,
+        stencil: Stencil,
+        output: Tensor,
+        grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles.
 
@@ -86,10 +90,15 @@ class FieldAccelerations(Accelerations):
 
     def mirror(self, matrix: Tensor) -> list[Tensor]:
         """Return the image of each acceleration."""
-        return [matrix] * (self.material_count * self.frames)
+        acceleration_count = self.material_count * self.frames
+        return [matrix] * acceleration_count
 
     def decode(
-        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+        self,
+        state: GridState,
+        stencil: Stencil,
+        output: Tensor,
+        grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles."""
         axes = self.grid.dimension
@@ -125,7 +134,11 @@ class StressAccelerations(Accelerations):
         return stresses + accelerations
 
     def decode(
-        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+        self,
+        state: GridState,
+        stencil: Stencil,
+        output: Tensor,
+        grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the grid's velocity and the accelerations at the particles."""
         grid = self.grid

@@ -165,15 +165,22 @@ class FieldEncoder(nn.Module):
 
         last_velocity = velocity[:, -1]
         scaled_velocity = last_velocity / self.velocity_std
-        changes = velocity.diff(dim=1) / self.acceleration_std
-        changes = changes.flatten(1, 2)
-        channels = [weight, scaled_velocity, changes, mean_strain]
+        changes = velocity.diff(dim=1)
+        scaled_changes = changes / self.acceleration_std
+        scaled_changes = scaled_changes.flatten(1, 2)
+        channels = [
+            weight,
+            scaled_velocity,
+            scaled_changes,
+            mean_strain,
+        ]
         per_material = torch.cat(channels, dim=1)
         per_window = per_material.reshape(windows, -1, *grid.shape)
         wall_distance = self.wall_distance.expand(windows, *self.wall_distance.shape)
         fields = torch.cat([per_window, wall_distance], dim=1)
         if self.options.mixture:
-            weight_and_velocity = sums[:, : 1 + velocity_channels]
+            channel_count = 1 + velocity_channels
+            weight_and_velocity = sums[:, :channel_count]
             return fields, self._mixture_velocity(weight_and_velocity)
         return fields, last_velocity
 

@@ -114,7 +114,9 @@ class Optimisation:
                 got=names,
                 fix="mend that class, or the weights",
             )
-        self.terms = {name: term.detach() for name, term in checked_terms.items()}
+        self.terms = {}
+        for name, term in checked_terms.items():
+            self.terms[name] = term.detach()
         self.terms[TOTAL] = total.detach()
         return total
 
@@ -153,7 +155,8 @@ class Optimisation:
         It is in the optimiser's state, which checkpoints hold. At first it moves
         faster, so that it soon forgets the weights of the start.
         """
-        share = min(self.options.ema, self.step / (self.step + 9.0))
+        early_share = self.step / (self.step + 9.0)
+        share = min(self.options.ema, early_share)
         for parameter, state in self.optimizer.state.items():
             if MEAN not in state:
                 state[MEAN] = parameter.detach().clone()

@@ -94,7 +94,8 @@ class ParticleGrid(nn.Module):
     def _node_places(self, interval: tuple[float, float], multiple: int) -> Tensor:
         """Return the nodes' places between two walls [length], shape [node]."""
         low, high = interval
-        cells = math.ceil((high - low) / self.spacing - 1e-6)
+        spacings = (high - low) / self.spacing
+        cells = math.ceil(spacings - 1e-6)
         nodes = cells + 2
         nodes += -nodes % multiple
 
@@ -181,7 +182,8 @@ class ParticleGrid(nn.Module):
         The stencil has three nodes along each axis. The distance is in cells. Along a
         periodic axis the lowest node may have a number below 0.
         """
-        origin = torch.stack([axis[0] for axis in self.axes])
+        first_places = [axis[0] for axis in self.axes]
+        origin = torch.stack(first_places)
         distance = position - origin
         s = distance / self.cell.to(position)
         corner = torch.floor(s.detach() - 0.5)
@@ -210,7 +212,8 @@ class ParticleGrid(nn.Module):
         ``value`` has shape [particle, channel]. In three dimensions the last axis is
         that of the z nodes.
         """
-        contributions = stencil.weight[:, :, None] * value[:, None]
+        weight = stencil.weight[:, :, None]
+        contributions = weight * value[:, None]
         contributions = contributions.flatten(0, 1)  # [particle * 9, channel]
 
         shape = self.shape
@@ -244,7 +247,11 @@ class ParticleGrid(nn.Module):
         return weighted.sum(dim=1)
 
     def accelerate(
-        self, stencil: Stencil, position: Tensor, stress: Tensor, mass: Tensor
+        self,
+        stencil: Stencil,
+        position: Tensor,
+        stress: Tensor,
+        mass: Tensor,
     ) -> Tensor:
         """Return accelerations (x, y) of nodes of matter under stress.
 
@@ -270,9 +277,10 @@ class ParticleGrid(nn.Module):
         columns, rows = self.shape
         _, offset = self._locate(position)
         slopes = spline_slopes(offset)
-        slopes = slopes.flatten(2)[..., None]  # [particle, 2, 9, 1]
-        slope_x, slope_y = slopes.unbind(dim=1)
-        xx, xy, yy = stress[:, None].unbind(dim=3)  # each [particle, 1, frame]
+        slopes = slopes.flatten(2)  # [particle, 2, 9]
+        slope_x, slope_y = slopes[..., None].unbind(dim=1)
+        stress_at_nodes = stress[:, None]  # [particle, 1, frame, 3]
+        xx, xy, yy = stress_at_nodes.unbind(dim=3)
 
         pull_x = xx * slope_x + xy * slope_y
         pull_y = xy * slope_x + yy * slope_y

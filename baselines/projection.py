@@ -116,7 +116,8 @@ class ShapeMatching:
         sine = y * arm_x - x * arm_y
         x_of_nodes = x.expand_as(weight)
         y_of_nodes = y.expand_as(weight)
-        moments = torch.stack([x_of_nodes, y_of_nodes, cosine, sine], dim=2)
+        components = [x_of_nodes, y_of_nodes, cosine, sine]
+        moments = torch.stack(components, dim=2)
         weighted_moments = weight[..., None] * moments
         contributions = weighted_moments.flatten(0, 1)
         sums = contributions.new_zeros(self.node_count, 4)
@@ -125,7 +126,8 @@ class ShapeMatching:
 
         # A lone particle turns nothing: the root's gradient must not be infinite there.
         turn = sums[:, 2:]
-        square = turn.square().sum(dim=1, keepdim=True)
+        squares = turn.square()
+        square = squares.sum(dim=1, keepdim=True)
         length = (square + TINY).sqrt()
         rotation = turn / length  # (cosine, sine) of R_i
         motion = torch.cat([centre, rotation], dim=1)
@@ -217,7 +219,8 @@ class DensityProjection:
         excess = density - limit
         pressure = push * excess.clamp(0.0, LARGEST_EXCESS)
         shear = torch.zeros_like(pressure)
-        stress = -torch.stack([pressure, shear, pressure], dim=1)
+        components = [pressure, shear, pressure]  # (xx, xy, yy)
+        stress = -torch.stack(components, dim=1)
         node_acceleration = self.grid.accelerate(
             stencil, position, stress[:, None], mass
         )
@@ -252,10 +255,17 @@ class Projection(nn.Module):
     """
 
     def __init__(
-        self, bounds: Bounds, *, shape: Sequence[int], density: Sequence[int]
+        self,
+        bounds: Bounds,
+        *,
+        shape: Sequence[int],
+        density: Sequence[int],
     ) -> None:
         super().__init__()
-        self.grid_cells = {"shape": tuple(shape), "density": tuple(density)}
+        self.grid_cells = {
+            "shape": tuple(shape),
+            "density": tuple(density),
+        }
         self.clusters = nn.ModuleList()
         for cells in shape:
             self.clusters.append(ParticleGrid(bounds, cells))
@@ -278,7 +288,11 @@ class Projection(nn.Module):
             self.limit = nn.Parameter(limits)
 
     def adapt_weights(
-        self, weights: Mapping[str, Tensor], options: Mapping[str, Any], *, prefix: str
+        self,
+        weights: Mapping[str, Tensor],
+        options: Mapping[str, Any],
+        *,
+        prefix: str,
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return the weights and options of a model, adapted to the grids of this one.
 
@@ -314,7 +328,11 @@ class Projection(nn.Module):
         return adapted, options
 
     def start(
-        self, first: Tensor, material: Tensor, sample: Tensor, windows: int
+        self,
+        first: Tensor,
+        material: Tensor,
+        sample: Tensor,
+        windows: int,
     ) -> ProjectionState:
         """Return the state of the projections from the first frames of windows.
 

@@ -68,7 +68,8 @@ class Schedule(Settings):
         >>> decay.factor_at(200, steps=1000)
         0.010000000000000002
         """
-        rise = min(1.0, (step + 1) / (warmup + 1))
+        warmup_share = (step + 1) / (warmup + 1)
+        rise = min(1.0, warmup_share)
         if self.kind == "exponential":
             decay = self.factor ** (step / self.every)
             return float(rise * decay)
@@ -352,8 +353,10 @@ def recipe_for(
 
     layers: Layer = {"model": file.model, "training": file.training}
     baseline_part = part.baselines.get(entry.name, _Part())
-    for above in (part, baseline_part, _Part(model=dict(learned or {}))):
-        layers = _merge(layers, {"model": above.model, "training": above.training})
+    learned_part = _Part(model=dict(learned or {}))
+    for above in (part, baseline_part, learned_part):
+        upper_layers = {"model": above.model, "training": above.training}
+        layers = _merge(layers, upper_layers)
     where = f"{entry.name}, {name}"
     if path:
         where = f"{path.name}, {name}"
@@ -377,21 +380,29 @@ def recipe_for(
 
 def _has_recipes_of(split: str, size: str, file: _RecipeFile) -> bool:
     """Return whether a file has a recipe of a split, or one of this size for all."""
-    splits = {recipe.partition("/")[0] for recipe in file.recipes}
-    return split in splits or f"{ANY}/{size}" in file.recipes
+    return split in _splits_of(file) or f"{ANY}/{size}" in file.recipes
+
+
+def _splits_of(file: _RecipeFile) -> set[str]:
+    """Return the splits that a file has recipes of."""
+    splits = set()
+    for recipe in file.recipes:
+        split, _, _ = recipe.partition("/")
+        splits.add(split)
+    return splits
 
 
 def _no_recipe_of_split(
     entry: CatalogueEntry, name: str, file: _RecipeFile
 ) -> UsageError:
     """Return the error of a split that a baseline knows nothing of, as a user's own."""
-    splits = {recipe.partition("/")[0] for recipe in file.recipes}
+    splits = sorted(_splits_of(file))
     example = f"{{format: 1, recipes: {{{name}: {{training: {{steps: 2000}}}}}}}}"
     return UsageError(
         f"{entry.name} has no recipe {name!r}",
         where="--recipe",
         expected=f"a YAML file with a recipe of {name}",
-        got=f"recipes of {', '.join(sorted(splits)) or 'no split'}",
+        got=f"recipes of {', '.join(splits) or 'no split'}",
         fix=f"write a file, as in {example}, and add --recipe FILE.yaml; "
         f"docs/exchange.md says more",
     )
@@ -421,7 +432,7 @@ def _suggest_recipe(name: str, split: str, file: _RecipeFile) -> str:
     """Return the nearest recipe, of the same split if it has any."""
     if not file.recipes:
         return "leave --recipe out"
-    same_split = [other for other in file.recipes if other.split("/")[0] == split]
+    same_split = [other for other in file.recipes if other.startswith(f"{split}/")]
     return suggest_name(name, same_split or file.recipes)
 
 
@@ -507,7 +518,10 @@ def _check_unchanged(
     kind: str, names: Iterable[str], before: Layer, after: Layer
 ) -> None:
     """Refuse changes of options that only a training can change."""
-    changed = sorted(name for name in names if before[name] != after[name])
+    changed = []
+    for name in sorted(names):
+        if before[name] != after[name]:
+            changed.append(name)
     if not changed:
         return
     raise UsageError(
@@ -522,7 +536,11 @@ def _check_unchanged(
 
 def _read_file(path: Path) -> _RecipeFile:
     return _check_options(
-        _RecipeFile, read_yaml(path), "", str(path), error_class=UnreadableFileError
+        _RecipeFile,
+        read_yaml(path),
+        "",
+        str(path),
+        error_class=UnreadableFileError,
     )
 
 
@@ -593,28 +611,30 @@ def _check_options(
         return options.model_validate(values)
     except ValidationError as error:
         detail = error.errors()[0]
-    path = [str(part) for part in (group, *detail["loc"]) if part != ""]
+    location = detail["loc"]
+    path = [str(part) for part in (group, *location) if part != ""]
     key = ".".join(path) or "the file"
     if detail["type"] == "extra_forbidden":
-        known_keys = _known_keys(options, detail["loc"][:-1])
+        *parents, unknown_key = location
+        known_keys = _known_keys(options, parents)
         raise error_class(
             f"unknown key {key!r}",
             where=where,
             expected="a key of a recipe",
             got=repr(key),
-            fix=suggest_name(str(detail["loc"][-1]), known_keys),
+            fix=suggest_name(str(unknown_key), known_keys),
         )
 
-    expected = describe_expectation(detail)
-    got = repr(detail["input"])[:80]
+    value = detail["input"]
+    got = repr(value)
     is_type_error = detail["type"].endswith("_type")
-    if isinstance(detail["input"], Mapping) and not is_type_error:
-        got = ", ".join(map(str, detail["input"]))[:80]  # the mapping as a whole
+    if isinstance(value, Mapping) and not is_type_error:
+        got = ", ".join(map(str, value))  # the mapping as a whole
     raise error_class(
         f"{key} does not fit",
         where=where,
-        expected=expected,
-        got=got,
+        expected=describe_expectation(detail),
+        got=got[:80],
         fix="give another value; docs/baselines.md has the keys and their values",
     )
 

@@ -77,7 +77,8 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
         if finite_frames:
             last_finite = predicted[finite_frames - 1]
         else:
-            last_finite = given.position[:, -1].cpu().float()
+            last_given = given.position[:, -1]
+            last_finite = last_given.cpu().float()
         predicted[finite_frames:] = last_finite
         diverged_at = int(given.frame[0]) + given.frames + finite_frames
 
@@ -134,7 +135,8 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
     Positions have shape [frame, particle, 2].
     """
     particles, _, dimension = given.position.shape
-    predicted = torch.empty((frames, particles, dimension), dtype=torch.float32)
+    shape = (frames, particles, dimension)
+    predicted = torch.empty(shape, dtype=torch.float32)
     state = model.start(given)
     for frame, row in enumerate(predicted):
         output: object = model.advance(state)
@@ -181,7 +183,9 @@ def _check_advance(
 @contextmanager
 def replace_parameters(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
     """Give parameters other values for a while."""
-    originals = {parameter: parameter.detach().clone() for parameter in values}
+    originals = {}
+    for parameter in values:
+        originals[parameter] = parameter.detach().clone()
     _copy_to_parameters(values)
     try:
         yield

@@ -47,8 +47,9 @@ def read_tensors(path: Path) -> tuple[str, dict[str, Tensor]]:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     # the library raises a type of its own, and others for types of numbers it lacks
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
-        raise _refusal(path, f"{type(error).__name__}: {reason}") from None
+        one_line = " ".join(str(error).split())
+        got = f"{type(error).__name__}: {one_line[:200]}"
+        raise _refusal(path, got) from None
     if KEY not in metadata:
         raise _refusal(
             path,
@@ -106,8 +107,9 @@ def write_tensors(path: Path, about: str, weights: Mapping[str, Tensor]) -> None
     """
     copies = {}
     for name, tensor in weights.items():
+        on_cpu = tensor.detach().cpu()
         # the format holds no two names for one memory
-        copies[name] = tensor.detach().cpu().contiguous().clone()
+        copies[name] = on_cpu.contiguous().clone()
     data = safetensors.torch.save(copies, metadata={KEY: about})
     with atomic_path(path, option="--output") as temporary:
         Path(temporary).write_bytes(data)

@@ -84,7 +84,8 @@ class ParticleState:
     def move(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
         later_velocities = self.velocity[:, 1:]
-        velocities = torch.cat([later_velocities, velocity.unsqueeze(1)], dim=1)
+        last_velocity = velocity.unsqueeze(1)
+        velocities = torch.cat([later_velocities, last_velocity], dim=1)
         wall_velocity = self.wall_velocity
         if wall_velocity is not None:
             wall_velocity = skip_frames(wall_velocity)
@@ -558,7 +559,9 @@ class GraphNetwork(Baseline):
         if self.options.recovery is not None:
             gap = self.box.displacement(state.position.detach(), true_position)
             way_back = velocity_towards_path(
-                gap, self.options.recovery, acceleration_std=self.acceleration_std
+                gap,
+                self.options.recovery,
+                acceleration_std=self.acceleration_std,
             )
             target_velocity = target_velocity + way_back
 

@@ -191,7 +191,8 @@ def _check_same(kind: str, expected: str, got: str) -> None:
 
 def _recipe_name(checkpoint: Checkpoint) -> str:
     """Return the name of the recipe of the weights, if it is one."""
-    name = str(checkpoint.training.get("recipe", {}).get("name", ""))
+    recipe = checkpoint.training.get("recipe", {})
+    name = str(recipe.get("name", ""))
     if re.fullmatch(RECIPE_NAME, name):
         return name
     return "unnamed"
@@ -211,5 +212,7 @@ def _read_costs(checkpoint: Checkpoint) -> dict[str, float | int | None]:
     steps = budget.steps
     if steps is None:
         steps = int(checkpoint.training.get("step", 0))
-    costs["steps"] = min(steps + (budget.start_steps or 0), MOST_STEPS)
+    if budget.start_steps is not None:
+        steps += budget.start_steps
+    costs["steps"] = min(steps, MOST_STEPS)
     return costs

@@ -92,11 +92,15 @@ class TensorFields:
     def _differentiate(self, field: Tensor) -> tuple[Tensor, Tensor]:
         """Return ``df/dx`` and ``df/dy`` by central differences; 0 on the rim."""
         double_spacing = 2.0 * self.grid.spacing
-        difference_x = field[..., 2:, :] - field[..., :-2, :]
-        difference_y = field[..., :, 2:] - field[..., :, :-2]
-        slope_x = difference_x / double_spacing
-        slope_y = difference_y / double_spacing
-        return pad(slope_x, (0, 0, 1, 1)), pad(slope_y, (1, 1))
+        right = field[..., 2:, :]
+        left = field[..., :-2, :]
+        above = field[..., :, 2:]
+        below = field[..., :, :-2]
+        slope_x = (right - left) / double_spacing
+        slope_y = (above - below) / double_spacing
+        rim_x = (0, 0, 1, 1)
+        rim_y = (1, 1)
+        return pad(slope_x, rim_x), pad(slope_y, rim_y)
 
 
 def tensor_fields(
@@ -127,7 +131,8 @@ def tensor_fields(
     # gradient.
     divisor = torch.where(is_filled, weight, 1.0)
     quotient = sums.momentum / divisor[..., None]
-    velocity = torch.where(is_filled[..., None], quotient, 0.0)
+    has_velocity = is_filled[..., None]
+    velocity = torch.where(has_velocity, quotient, 0.0)
     return TensorFields(grid, weight, velocity, counted, full_weight)
 
 
@@ -180,7 +185,8 @@ def transfer(
 
     one = torch.ones_like(u[:, :1])
     carried = torch.cat([one, u], dim=-1)  # (1, u, v)
-    contributions = weight[..., None] * carried[:, None, None]
+    carried = carried[:, None, None]
+    contributions = weight[..., None] * carried
     contributions = contributions.reshape(-1, 3)
     node_count = windows * side * side
     sums = contributions.new_zeros(node_count, 3)
@@ -201,7 +207,8 @@ def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> 
     if sample is None:
         axes_fit = position.ndim >= 2
     else:
-        axes_fit = position.ndim == 2 and position.shape[:1] == sample.shape
+        particles = position.shape[:1]
+        axes_fit = position.ndim == 2 and particles == sample.shape
     has_one_shape = position.shape == velocity.shape
     if axes_fit and has_one_shape and position.shape[-1] == 2:
         return

@@ -332,7 +332,12 @@ class StepBatches(Sampler[list[int]]):
     """
 
     def __init__(
-        self, sampler: WindowSampler, options: TrainingOptions, *, first: int, last: int
+        self,
+        sampler: WindowSampler,
+        options: TrainingOptions,
+        *,
+        first: int,
+        last: int,
     ) -> None:
         self.sampler = sampler  # draws the windows of one process, epoch after epoch
         self.batch = options.batch  # windows of a step
@@ -366,8 +371,9 @@ class StepBatches(Sampler[list[int]]):
         seed = np.random.SeedSequence(place_in_training)
         generator = np.random.Generator(np.random.PCG64(seed))
         # NumPy promises the same bits for `random` alone.
-        chance, place = generator.random((2, self.batch))
-        index = (place * len(self.openings)).astype(np.intp)
+        chance, share = generator.random((2, self.batch))
+        place = share * len(self.openings)
+        index = place.astype(np.intp)
         opening = self.openings[index]
         is_replaced = chance < self.opening_share
         return np.where(is_replaced, opening, windows)
@@ -483,7 +489,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         scenarios = _positions(_read_scenarios(job))
     numbers = model.fit(scenarios)  # type: ignore[operator]
     log.step = FIT_STEPS
-    log.loss = {name: float(value) for name, value in numbers.items()}
+    for name, value in numbers.items():
+        log.loss[name] = float(value)
     log.epochs = 1.0
     validation = load_validation(
         options, job.info, root=job.root, registry=job.registry
@@ -495,9 +502,13 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
     log.state = "finished"
     log.read_clocks(device=job.device)
 
-    weights = {name: value.detach() for name, value in model.state_dict().items()}
-    save(job.folder.weights, job.checkpoint(log, round_weights(model)))
-    save(job.folder.checkpoint, job.checkpoint(log, weights))
+    exact_weights = {}
+    for name, weight in model.state_dict().items():
+        exact_weights[name] = weight.detach()
+    rounded = job.checkpoint(log, round_weights(model))
+    exact = job.checkpoint(log, exact_weights)
+    save(job.folder.weights, rounded)
+    save(job.folder.checkpoint, exact)
     job.folder.write_log(job.log_as_json(model, log, steps=FIT_STEPS))
     return log, FIT_STEPS
 

@@ -203,9 +203,10 @@ class TrainingLoop:
             for name, value in self.optimisation.terms.items():
                 terms[name] = float(value)
             self.log.loss = terms
-            if not math.isfinite(terms[TOTAL]) and self.fabric.world_size == 1:
+            total = terms[TOTAL]
+            if not math.isfinite(total) and self.fabric.world_size == 1:
                 raise self.optimisation.not_finite()
-            self.job.meter.stage = f"loss {terms[TOTAL]:.3g}"
+            self.job.meter.stage = f"loss {total:.3g}"
             for name, number in terms.items():
                 self._plot(f"loss/{name}", number)
             self._plot("learning_rate", self.optimisation.learning_rate)
@@ -272,7 +273,8 @@ class TrainingLoop:
         """Write the weights to predict from."""
         with self.optimisation.use_mean():
             weights = round_weights(self.optimisation.model)
-            save(self.job.folder.weights, self.job.checkpoint(self.log, weights))
+            checkpoint = self.job.checkpoint(self.log, weights)
+            save(self.job.folder.weights, checkpoint)
 
     def _store(self) -> None:
         """Write checkpoint and log.
@@ -300,10 +302,11 @@ class TrainingLoop:
             return
         # The weights stay those of the best step; their budget is that of the training.
         best = load(folder.weights)
-        budget = self.job.budget(self.log).model_dump(mode="json")
-        save(
-            folder.weights, replace(best, training={**best.training, "budget": budget})
-        )
+        budget = self.job.budget(self.log)
+        training = dict(best.training)
+        training["budget"] = budget.model_dump(mode="json")
+        best = replace(best, training=training)
+        save(folder.weights, best)
 
     def _write_log(self) -> None:
         self.log.read_clocks(self.fabric.world_size, device=self.job.device)

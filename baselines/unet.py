@@ -50,7 +50,11 @@ class Frame(nn.Module):
 
 
 def three_node_convolution(
-    inputs: int, outputs: int, periodic: Sequence[bool], *, stride: int = 1
+    inputs: int,
+    outputs: int,
+    periodic: Sequence[bool],
+    *,
+    stride: int = 1,
 ) -> nn.Module:
     """Return a convolution over three nodes along each axis of a grid.
 

@@ -44,7 +44,11 @@ BLOCK = 1024  # rows in memory at a time, at most
 EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
 
 Matrix = NDArray[np.float64]
-Sequences = Sequence[NDArray[np.float32]]
+Frames = NDArray[np.float32]
+"""Positions or states, one row for each frame."""
+
+Rows = tuple[Matrix, Matrix]
+"""Regressors X and responses Y of the same rows."""
 
 
 class LaggedRows:
@@ -54,12 +58,17 @@ class LaggedRows:
     reaches from one sequence into the next.
     """
 
-    def __init__(self, sequences: Sequences, *, lags: int) -> None:
-        self.sequences = [states for states in sequences if len(states) > lags]
+    def __init__(self, sequences: Sequence[Frames], *, lags: int) -> None:
+        self.sequences = []
         self.lags = lags
-        self.rows = sum(len(states) - lags for states in self.sequences)
+        self.rows = 0
+        for states in sequences:
+            row_count = len(states) - lags
+            if row_count > 0:
+                self.sequences.append(states)
+                self.rows += row_count
 
-    def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
+    def __iter__(self) -> Iterator[Rows]:
         """Yield regressors and responses, at most :data:`BLOCK` rows at a time."""
         for states in self.sequences:
             frame_count = len(states)
@@ -69,7 +78,7 @@ class LaggedRows:
                 responses = states[first:last].astype(np.float64)
                 yield regressors, responses
 
-    def _regressors(self, states: NDArray[np.float32], first: int, last: int) -> Matrix:
+    def _regressors(self, states: Frames, first: int, last: int) -> Matrix:
         """Return the regressors of frames first to last, shape [row, regressor]."""
         row_count = last - first
         features = states.shape[1]
@@ -94,18 +103,19 @@ class Fitted(FrameModel):
     closed_form: ClassVar[bool] = True
 
     @abstractmethod
-    def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
+    def fit(self, scenarios: Iterable[Frames]) -> Mapping[str, float]:
         """Set the coefficients from positions; return numbers to log.
 
         Each scenario has shape [frame, particle, 2].
         """
 
-    def states(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+    def states(self, position: Frames) -> Frames:
         """Return standardised states [1], shape [frame - 1, feature].
 
         The first frame is left out: it has no velocity of its own.
         """
-        require_particles([position.shape[1]], self.info.particles)
+        particles = position.shape[1]
+        require_particles([particles], self.info.particles)
         stored_position = torch.from_numpy(position)
         exact_position = stored_position.to(torch.float64)
         state = self.frame_state.standardise(exact_position)
@@ -147,7 +157,7 @@ class VAR(Fitted):
         """One frame per lag."""
         return self.options.lags
 
-    def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
+    def fit(self, scenarios: Iterable[Frames]) -> Mapping[str, float]:
         """Fit the coefficients.
 
         Return condition number, floor and rows of :class:`LeastSquares`.
@@ -217,7 +227,7 @@ class StableVAR(Fitted):
         self.register_buffer("directions", torch.zeros(features, rank))
         self.register_buffer("response", torch.zeros(rank, features))
 
-    def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
+    def fit(self, scenarios: Iterable[Frames]) -> Mapping[str, float]:
         """Fit mean, drift, directions and response.
 
         Return the share of variance in the directions, and the rows.
@@ -343,7 +353,10 @@ def _solve_overdetermined(blocks: LaggedRows, shape: tuple[int, int]) -> LeastSq
     residual_products = _products(residuals, shape)
     solution += divide(residual_products)
     return LeastSquares(
-        coefficients=solution, condition=condition, floor=floor, rows=blocks.rows
+        coefficients=solution,
+        condition=condition,
+        floor=floor,
+        rows=blocks.rows,
     )
 
 
@@ -353,10 +366,18 @@ def _regressors_of(blocks: LaggedRows) -> Iterator[Matrix]:
         yield x
 
 
-def _residuals(blocks: LaggedRows, solution: Matrix) -> Iterator[tuple[Matrix, Matrix]]:
+def _residuals(blocks: LaggedRows, solution: Matrix) -> Iterator[Rows]:
     """Yield X and Y - X B, in blocks of rows."""
     for x, y in blocks:
-        transposed = blas.dgemm(-1.0, solution, x.T, trans_a=True, beta=1.0, c=y.T)
+        # (Y - X B)' = -B' X' + Y'
+        transposed = blas.dgemm(
+            -1.0,
+            solution,
+            x.T,
+            trans_a=True,
+            beta=1.0,
+            c=y.T,
+        )
         yield x, transposed.T
 
 
@@ -382,7 +403,10 @@ def _solve_underdetermined(blocks: LaggedRows) -> LeastSquares:
     dual += divide(residual)
     coefficients = x.T @ dual
     return LeastSquares(
-        coefficients=coefficients, condition=condition, floor=floor, rows=blocks.rows
+        coefficients=coefficients,
+        condition=condition,
+        floor=floor,
+        rows=blocks.rows,
     )
 
 
@@ -394,14 +418,18 @@ def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
     return total
 
 
-def _products(
-    blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]
-) -> Matrix:
+def _products(blocks: Iterable[Rows], shape: tuple[int, int]) -> Matrix:
     """Return X'Y from blocks of rows, Fortran-ordered."""
     total: Matrix = np.zeros(shape, order="F")
     for x, y in blocks:
         total = blas.dgemm(
-            1.0, x.T, y.T, trans_b=True, beta=1.0, c=total, overwrite_c=True
+            1.0,
+            x.T,
+            y.T,
+            trans_b=True,
+            beta=1.0,
+            c=total,
+            overwrite_c=True,
         )
     return total
 
@@ -425,7 +453,8 @@ def _factor(
             got="NaN or infinite",
             fix="check the data: lagbench verify",
         )
-    largest = _largest_eigenvalue(partial(blas.dsymv, 1.0, matrix), size)
+    multiply = partial(blas.dsymv, 1.0, matrix)
+    largest = _largest_eigenvalue(multiply, size)
 
     rounding_floor = size * np.finfo(np.float64).eps
     for floor in (0.0, rounding_floor):
@@ -465,7 +494,12 @@ def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float
     rng = np.random.default_rng(0)
     start = rng.normal(size=size)
     eigenvalues = eigsh(
-        operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False
+        operator,
+        1,
+        which="LA",
+        tol=TOLERANCE,
+        v0=start,
+        return_eigenvectors=False,
     )
     return float(eigenvalues[0])
 
@@ -477,7 +511,10 @@ ITERATIONS = 8
 
 
 def principal_directions(
-    blocks: Callable[[], Iterable[Matrix]], features: int, *, rank: int
+    blocks: Callable[[], Iterable[Matrix]],
+    features: int,
+    *,
+    rank: int,
 ) -> tuple[Matrix, Matrix]:
     """Return orthonormal directions of largest X'X, and their eigenvalues.
 
@@ -501,10 +538,11 @@ def principal_directions(
     projected = basis.T @ product
     symmetric = (projected + projected.T) / 2
     ascending, rotation = np.linalg.eigh(symmetric)
-    eigenvalues = ascending[::-1][:rank]
-    largest_first = rotation[:, ::-1][:, :rank]
-    directions = basis @ largest_first
-    return directions, eigenvalues.clip(0.0)
+    descending = ascending[::-1]
+    eigenvalues = descending[:rank].clip(0.0)
+    largest_first = rotation[:, ::-1]
+    directions = basis @ largest_first[:, :rank]
+    return directions, eigenvalues
 
 
 def _multiply_by_square(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:

@@ -25,7 +25,8 @@ class PointNet(Operator):
         super().__init__(inputs, latent, hidden)
         self.of_node = Linear(inputs, hidden)
         self.of_edge = Linear(latent, hidden, bias=False)
-        self.local = nn.Sequential(nn.ReLU(inplace=True), Linear(hidden, latent))
+        output = Linear(hidden, latent)
+        self.local = nn.Sequential(nn.ReLU(inplace=True), output)
 
     def forward(
         self,
@@ -38,7 +39,8 @@ class PointNet(Operator):
         """Return the aggregate of each node."""
         sender, receiver = edge_index
         hidden_node = self.of_node(node)
-        hidden_edge = hidden_node.index_select(0, sender) + self.of_edge(edge)
+        hidden_sender = hidden_node.index_select(0, sender)
+        hidden_edge = hidden_sender + self.of_edge(edge)
         message = self.local(hidden_edge)
         # The layer works in place, and the loop of a node starts from the same values.
         loop_message = self.local(hidden_node.clone())
