@@ -210,7 +210,11 @@ def _describe_value(value: object) -> str:
 def _relocate(error: LagbenchError, where: str) -> LagbenchError:
     """Return the same error with another place."""
     return type(error)(
-        error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
+        error.what,
+        where=where,
+        expected=error.expected,
+        got=error.got,
+        fix=error.fix,
     )
 
 
@@ -249,7 +253,10 @@ class ScenarioBatch:
         self.states = [_RECENT.draw(size, scenario) for scenario in job.scenarios]
         # extremes that each scenario has gone through so far
         unseen = Health(
-            finite=True, max_speed=0.0, jacobian_min=np.inf, jacobian_max=-np.inf
+            finite=True,
+            max_speed=0.0,
+            jacobian_min=np.inf,
+            jacobian_max=-np.inf,
         )
         self.extremes = [unseen] * scenario_count
         self.solver = _solver(solver_constants(size), job.device, scenario_count)

@@ -63,7 +63,11 @@ class BoxTables:
     """
 
     def __init__(
-        self, cells: Sequence[int], *, periodic: Sequence[bool], no_slip: bool
+        self,
+        cells: Sequence[int],
+        *,
+        periodic: Sequence[bool],
+        no_slip: bool,
     ) -> None:
         self.dimension = len(cells)
         self.cells = tuple(cells)
@@ -73,14 +77,19 @@ class BoxTables:
         self.shape = tuple(count + 2 for count in cells)
         self.node_count = math.prod(self.shape)
         # distance between the numbers of neighbours along each axis
-        self.stride = tuple(
-            math.prod(self.shape[axis + 1 :]) for axis in range(self.dimension)
-        )
+        strides = []
+        for axis in range(self.dimension):
+            later_axes = self.shape[axis + 1 :]
+            strides.append(math.prod(later_axes))
+        self.stride = tuple(strides)
         # the multi-index of each node, 0 and cells + 1 for ghosts, shape [node, axis]
-        self.index = np.indices(self.shape).reshape(self.dimension, -1).T
+        indices = np.indices(self.shape)
+        self.index = indices.reshape(self.dimension, -1).T
         self._last = np.array(self.cells)
         self._is_walled = ~np.array(self.periodic)
-        self._is_outside = (self.index < 1) | (self.index > self._last)
+        is_below = self.index < 1
+        is_above = self.index > self._last
+        self._is_outside = is_below | is_above
         # numbers of the interior nodes, shape [interior]
         is_interior = ~self._is_outside.any(axis=1)
         self.interior = np.flatnonzero(is_interior).astype(np.int32)
@@ -89,7 +98,8 @@ class BoxTables:
 
     def _number(self, index: NDArray[np.integer]) -> Integers:
         """Return the numbers of nodes with these multi-indices."""
-        return np.asarray((index * self.stride).sum(axis=-1), np.int32)
+        steps = index * self.stride
+        return np.asarray(steps.sum(axis=-1), np.int32)
 
     def _tangential_sign(self) -> int:
         """Return the sign with which a wall mirrors a tangential component."""
@@ -110,26 +120,31 @@ class BoxTables:
         index = self.index[node]
         mirrored = np.clip(index, 1, self._last)
         wrapped = (index - 1) % self._last + 1
-        source = self._number(np.where(self._is_walled, mirrored, wrapped))
+        source_index = np.where(self._is_walled, mirrored, wrapped)
+        source = self._number(source_index)
 
         # whether a wall lies between a ghost and its source, shape [ghost, axis]
         is_across = self._is_outside[node] & self._is_walled
         sign = np.ones((len(node), LANES), np.float32)
         for axis in range(self.dimension):
-            factor = np.where(is_across[:, axis, None], self._reflection(axis), 1)
+            is_mirrored = is_across[:, axis, None]
+            factor = np.where(is_mirrored, self._reflection(axis), 1)
             sign *= factor.astype(np.float32)
 
         # Only one wall moves a ghost; where two meet, none does.
         is_single = is_across.sum(axis=1) == 1
         normal = np.argmax(is_across, axis=1)
-        along_normal = np.take_along_axis(index, normal[:, None], axis=1)[:, 0]
-        is_upper = along_normal > 1
+        ghosts = np.arange(len(node))
+        is_upper = index[ghosts, normal] > 1
         wall = np.where(is_single, 2 * normal + is_upper, 0)
         axes = np.arange(self.dimension)
-        is_tangential = is_single[:, None] & (axes != normal[:, None])
+        is_along_wall = axes != normal[:, None]
+        is_tangential = is_single[:, None] & is_along_wall
         # In the last cells before a wall that the motion runs into it is halved.
-        is_last = ((index == 1) | (index == self._last)) & self._is_walled
-        drive = np.where(is_last, 1.0, 2.0) * is_tangential
+        is_at_end = (index == 1) | (index == self._last)
+        is_last = is_at_end & self._is_walled
+        share = np.where(is_last, 1.0, 2.0)
+        drive = share * is_tangential
         return Ghosts(
             node=node,
             source=source,
@@ -157,20 +172,25 @@ class BoxTables:
         for crossed in itertools.product((False, True), repeat=self.dimension):
             if any(crossed):
                 subsets.append(np.array(crossed))
-        ghost = np.full((len(node), len(subsets)), -1, np.int32)
-        sign = np.ones((len(subsets), LANES), np.int64)
-        wall = np.full((len(node), len(subsets), self.dimension), -1, np.int32)
+        edge_count = len(node)
+        image_count = len(subsets)
+        ghost = np.full((edge_count, image_count), -1, np.int32)
+        sign = np.ones((image_count, LANES), np.int64)
+        wall = np.full((edge_count, image_count, self.dimension), -1, np.int32)
         for image, subset in enumerate(subsets):
-            exists = (is_low | is_high | ~subset).all(axis=1)
-            number = self._number(np.where(subset, beyond, index))
+            may_cross = is_low | is_high | ~subset
+            exists = may_cross.all(axis=1)
+            ghost_index = np.where(subset, beyond, index)
+            number = self._number(ghost_index)
             ghost[:, image] = np.where(exists, number, -1)
-            crosses_wall = exists[:, None] & subset & self._is_walled
+            walled_subset = subset & self._is_walled
+            crosses_wall = exists[:, None] & walled_subset
             wall[:, image] = np.where(crosses_wall, wall_across, -1)
-            for axis in np.flatnonzero(subset & self._is_walled):
+            for axis in np.flatnonzero(walled_subset):
                 sign[image] *= self._reflection(int(axis))
         return Images(node=node, ghost=ghost, sign=sign, wall=wall)
 
-    def ghost_drive(self, wall_velocity: NDArray[np.float32]) -> Singles:
+    def ghost_drive(self, wall_velocity: Singles) -> Singles:
         """Return what moving walls add to the velocity of the ghosts [length/s].
 
         Args:
@@ -181,12 +201,13 @@ class BoxTables:
             Shape [scenario, ghost, lane].
         """
         ghosts = self.ghosts
-        drive = np.zeros((len(wall_velocity), len(ghosts.node), LANES), np.float32)
+        shape = (len(wall_velocity), len(ghosts.node), LANES)
+        drive = np.zeros(shape, np.float32)
         moved = wall_velocity[:, ghosts.wall]
         drive[..., : self.dimension] = ghosts.drive * moved
         return drive
 
-    def image_drag(self, wall_velocity: NDArray[np.float32]) -> Singles:
+    def image_drag(self, wall_velocity: Singles) -> Singles:
         """Return the momentum per particle that moving walls give to what ghosts got.
 
         It is twice the tangential velocity of each wall that an image crosses.
@@ -201,9 +222,12 @@ class BoxTables:
         shape = (len(wall_velocity), *images.ghost.shape, LANES)
         drag = np.zeros(shape, np.float32)
         axes = np.arange(self.dimension)
+        twice_wall_velocity = np.float32(2.0) * wall_velocity
         for normal in range(self.dimension):
             wall = images.wall[..., normal]
-            moved = np.float32(2.0) * wall_velocity[:, np.maximum(wall, 0)]
-            counts = (wall >= 0)[..., None] & (axes != normal)
-            drag[..., : self.dimension] += np.where(counts, moved, np.float32(0.0))
+            is_crossed = wall >= 0
+            moved = twice_wall_velocity[:, np.maximum(wall, 0)]
+            counts = is_crossed[..., None] & (axes != normal)
+            momentum = np.where(counts, moved, np.float32(0.0))
+            drag[..., : self.dimension] += momentum
         return drag

@@ -36,7 +36,7 @@ from .draws import (
     log_uniform,
     uniform,
 )
-from .split import ClosedBoxParameters, InitialState, Material
+from .split import ClosedBoxParameters, InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -51,7 +51,12 @@ DRIVEN = (
 )
 """The sets of walls that move, by id % 6: six consecutive scenarios hold each once."""
 
-BELTS = (("left", "bottom"), ("bottom", "right"), ("right", "top"), ("top", "left"))
+BELTS = (
+    ("left", "bottom"),
+    ("bottom", "right"),
+    ("right", "top"),
+    ("top", "left"),
+)
 """The pairs of walls that meet in a corner, in the order of a turn anticlockwise."""
 
 _TURN = {"left": -1.0, "bottom": 1.0, "right": 1.0, "top": -1.0}
@@ -98,7 +103,9 @@ def _draw_motion(
     if belt is not None:
         speed = draw_program(rng, frame_count, amplitude=speed_max, knot_gap=knot_gap)
         for wall in belt:
-            velocity[:, WALLS.index(wall), _TANGENT[wall]] = _TURN[wall] * speed
+            number = WALLS.index(wall)
+            tangent = _TANGENT[wall]
+            velocity[:, number, tangent] = _TURN[wall] * speed
         return velocity
 
     for wall in DRIVEN[scenario % len(DRIVEN)]:
@@ -109,9 +116,14 @@ def _draw_motion(
             speed = np.where(is_moving, constant_speed, 0.0)
         else:
             speed = draw_program(
-                rng, frame_count, amplitude=speed_max, knot_gap=knot_gap
+                rng,
+                frame_count,
+                amplitude=speed_max,
+                knot_gap=knot_gap,
             )
-        velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
+        number = WALLS.index(wall)
+        tangent = _TANGENT[wall]
+        velocity[:, number, tangent] = speed
     return velocity
 
 
@@ -146,7 +158,11 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     reynolds = log_uniform(rng, *interval(size, reynolds_range))
     viscosity = 0.5 * size.value("speed_max") * (high - low) / reynolds
     position = fill(
-        rng, size.particles, low=low, high=high, jitter=size.value("jitter")
+        rng,
+        size.particles,
+        low=low,
+        high=high,
+        jitter=size.value("jitter"),
     )
     if belt is not None:
         motion_kind = "belt"
@@ -158,7 +174,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         position=position,
         velocity=np.zeros((size.particles, 2)),
         affine=np.zeros((size.particles, 2, 2)),
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=(high - low) * (high - low),
         viscosity=viscosity,
         wall_velocity=motion,

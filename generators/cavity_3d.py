@@ -31,7 +31,7 @@ from .decaying_vortices import particles_per_side
 from .draws import RandomSource, draw_integer, draw_program, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import fill_box
-from .split import InitialState, Material
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -91,13 +91,17 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     side = particles_per_side(size)
     box = size.box
     position = fill_box(
-        rng, (side,) * 3, low=box.low, high=box.high, jitter=size.value("jitter")
+        rng,
+        (side, side, side),
+        low=box.low,
+        high=box.high,
+        jitter=size.value("jitter"),
     )
     return InitialState(
         position=position,
         velocity=np.zeros((size.particles, 3)),
         affine=np.zeros((size.particles, 3, 3)),
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=box.volume,
         viscosity=viscosity,
         wall_velocity=motion,

@@ -19,6 +19,11 @@ from .nodal_stress import NodalStress, broken_jacobian_bounds
 from .solver import Health
 from .split import ClosedBoxParameters, InitialState
 
+# left and right face along x, bottom and top along y
+_WALL_NUMBERS = (0, 1, 2, 3)
+_NORMAL_AXES = (0, 0, 1, 1)
+_TANGENT_AXES = (1, 1, 0, 0)
+
 
 class ClosedBox(Driver[ClosedBoxParameters]):
     """Solver of a full box; its methods are those of :class:`.Solver`."""
@@ -47,12 +52,12 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its
         next frame.
         """
-        # left and right move along y, bottom and top along x
-        tangential = velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)]
+        tangential = velocity[:, _WALL_NUMBERS, _TANGENT_AXES]
         self._kernels.walls.speed.from_numpy(tangential)
 
     def _move_walls_towards(self, frame: int) -> None:
-        velocity = np.stack([state.walls_towards(frame) for state in self._states])
+        velocities = [state.walls_towards(frame) for state in self._states]
+        velocity = np.stack(velocities)
         self.move_walls(velocity.astype(np.float32))
 
     def _drive(self, end: int) -> int:
@@ -81,13 +86,15 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
         Node (i, j) lies at (i, j) / grid; nodes beyond the ghost layer hold 0.
         """
-        return self._on_grid(self._kernels.moved.to_numpy()[..., :2])
+        moved = self._kernels.moved.to_numpy()
+        return self._on_grid(moved[..., :2])
 
     def mean_grid_velocity(self) -> NDArray[np.float64]:
         """Mean nodal velocity of the substeps advanced with ``average=True``; shape as
         above.
         """
-        return self._on_grid(self._kernels.total.to_numpy()) / max(self._averaged, 1)
+        total = self._on_grid(self._kernels.total.to_numpy())
+        return total / max(self._averaged, 1)
 
     def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
         width = self.parameters.grid + 1
@@ -101,12 +108,13 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         peaks = self._kernels.peak.to_numpy().max(axis=1)
         healths = []
         for extreme, peak in zip(extremes, peaks, strict=True):
+            u, v, jacobian, minus_jacobian = extreme
             is_finite = np.isfinite(extreme).all() and np.isfinite(peak)
             health = Health(
                 finite=bool(is_finite),
-                max_speed=float(np.max([extreme[0], extreme[1], peak])),
-                jacobian_min=float(-extreme[3]),
-                jacobian_max=float(extreme[2]),
+                max_speed=float(np.max([u, v, peak])),
+                jacobian_min=float(-minus_jacobian),
+                jacobian_max=float(jacobian),
             )
             healths.append(health)
         return healths
@@ -124,14 +132,14 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         super()._check_state(index, state)
         speed_bound = self._kernels.speed_bound / 2.0
         speeds = np.abs(state.wall_velocity)
-        # of left and right along x, of bottom and top along y
-        normal = state.wall_velocity[..., (0, 1, 2, 3), (0, 0, 1, 1)]
+        normal = state.wall_velocity[..., _WALL_NUMBERS, _NORMAL_AXES]
         has_normal_motion = bool(np.any(normal != 0.0))
         is_slow_enough = bool(np.all(speeds <= speed_bound))
         is_sliding = bool(np.any(state.wall_velocity != 0.0))
         may_slide = self.parameters.no_slip or not is_sliding
         if has_normal_motion or not is_slow_enough or not may_slide:
-            largest_speeds = speeds.reshape(-1, 4, 2).max(axis=0).tolist()
+            by_frame = speeds.reshape(-1, 4, 2)
+            largest_speeds = by_frame.max(axis=0).tolist()
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",

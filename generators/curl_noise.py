@@ -29,7 +29,7 @@ from lagbench.errors import UsageError
 from .constants import closed_box_walls, constants, shift_number
 from .draws import RandomSource, fill_grid, quantise
 from .noise import Jet, coordinates, gradients, noise, ramp
-from .split import ClosedBoxParameters, InitialState, Material
+from .split import ClosedBoxParameters, InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -43,7 +43,12 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
 
 
 def stream_function(
-    position: Array, lattice: Array, *, low: float, high: float, scale: float
+    position: Array,
+    lattice: Array,
+    *,
+    low: float,
+    high: float,
+    scale: float,
 ) -> Jet:
     """Return psi [length^2/s] and its derivatives at points between the walls.
 
@@ -59,16 +64,19 @@ def stream_function(
     cell_count = float(len(lattice) - 1)
     per_length = cell_count / (high - low)
     x, y = coordinates(position)
+    minus_x = x.scale(-1.0)
+    minus_y = y.scale(-1.0)
     # distances from the walls in cells of the lattice; measured from its own wall, the
     # ramp is exactly 0 there
     from_left = x.shift(-low).scale(per_length)
     from_bottom = y.shift(-low).scale(per_length)
-    from_right = x.scale(-1.0).shift(high).scale(per_length)
-    from_top = y.scale(-1.0).shift(high).scale(per_length)
+    from_right = minus_x.shift(high).scale(per_length)
+    from_top = minus_y.shift(high).scale(per_length)
 
     psi = noise(from_left, from_bottom, lattice)
     for distance in (from_left, from_bottom, from_right, from_top):
-        psi = psi * ramp(distance.scale(2.0))
+        half_cells = distance.scale(2.0)
+        psi = psi * ramp(half_cells)
     return psi.scale(scale * (high - low))
 
 
@@ -77,14 +85,16 @@ def flow(psi: Jet) -> tuple[Array, Array]:
     2^-20.
     """
     velocity = np.stack([psi.y, -psi.x], axis=-1)
-    rows = np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1)
-    affine = rows.reshape(-1, 2, 2)
+    gradient_of_u = np.stack([psi.xy, psi.yy], axis=-1)
+    gradient_of_v = np.stack([-psi.xx, -psi.xy], axis=-1)
+    affine = np.stack([gradient_of_u, gradient_of_v], axis=1)
     return quantise(velocity), quantise(affine)
 
 
 def _root_mean_square(values: Array) -> float:
     flat = values.ravel().tolist()
-    return math.sqrt(math.fsum(v * v for v in flat) / len(flat))
+    square_sum = math.fsum(value * value for value in flat)
+    return math.sqrt(square_sum / len(flat))
 
 
 def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
@@ -107,14 +117,20 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     v = (-psi.x).reshape(node_count, node_count)
 
     # neighbours of the inner nodes
-    east = slice(2, None), slice(1, -1)
-    west = slice(None, -2), slice(1, -1)
-    north = slice(1, -1), slice(2, None)
-    south = slice(1, -1), slice(None, -2)
-    slope = 0.5 * size.grid
-    divergence = (u[east] - u[west] + v[north] - v[south]) * slope
-    vorticity = (v[east] - v[west] - u[north] + u[south]) * slope
-    return _root_mean_square(divergence), _root_mean_square(vorticity)
+    inner = slice(1, -1)
+    after = slice(2, None)
+    before = slice(None, -2)
+    east = (after, inner)
+    west = (before, inner)
+    north = (inner, after)
+    south = (inner, before)
+    per_difference = 0.5 * size.grid  # slope for a difference over two cells
+    divergence = u[east] - u[west] + v[north] - v[south]
+    vorticity = v[east] - v[west] - u[north] + u[south]
+    return (
+        _root_mean_square(divergence * per_difference),
+        _root_mean_square(vorticity * per_difference),
+    )
 
 
 def _scale_of(size: Size, frequency: int) -> float:
@@ -153,7 +169,12 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             fix="correct the number of particles in the file of the split",
         )
     position = fill_grid(
-        rng, columns, rows, low=low, high=high, jitter=size.value("jitter")
+        rng,
+        columns,
+        rows,
+        low=low,
+        high=high,
+        jitter=size.value("jitter"),
     )
     frequency = _frequency(size, scenario)
     noise_gradients = gradients(rng, frequency)
@@ -162,13 +183,14 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     psi = stream_function(position, noise_gradients, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)
     divergence, vorticity = _grid_rates(noise_gradients, size, scale)
-    speed_sum = math.fsum(v * v for v in velocity.ravel().tolist())
-    energy = 0.5 * speed_sum / size.particles
+    components = velocity.ravel().tolist()
+    square_sum = math.fsum(component * component for component in components)
+    energy = 0.5 * square_sum / size.particles
     return InitialState(
         position=position,
         velocity=velocity,
         affine=affine,
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=(high - low) * (high - low),
         parameters={
             "frequency": frequency,

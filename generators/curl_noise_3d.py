@@ -39,7 +39,7 @@ from .periodic_noise import (
     scaled_to,
     wrapped_offset,
 )
-from .split import InitialState, Material
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -77,18 +77,21 @@ def ring_potential(
         radius: R, at most half of the cube's side [length].
     """
     offset = wrapped_offset(position, centre)
-    way = [coordinate(offset[:, axis], axis, 3) for axis in range(3)]
-    square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
-    left = square.scale(-1.0 / (radius * radius)).shift(1.0)
+    x = coordinate(offset[:, 0], 0, 3)
+    y = coordinate(offset[:, 1], 1, 3)
+    z = coordinate(offset[:, 2], 2, 3)
+    square = x * x + y * y + z * z
+    square_share = square.scale(-1.0 / (radius * radius))
+    left = square_share.shift(1.0)
     inside = left.only_where(left.value > 0.0)
-    strength = (inside * inside) * (inside * inside)
-    components = []
-    for axis in range(3):
-        first = (axis + 1) % 3
-        second = (axis + 2) % 3
-        crossed = way[second].scale(normal[first]) + way[first].scale(-normal[second])
-        components.append(strength * crossed)
-    return components[0], components[1], components[2]
+    square_inside = inside * inside
+    strength = square_inside * square_inside
+    # the cross product of the normal and the way from the centre
+    n_x, n_y, n_z = normal
+    crossed_x = z.scale(n_y) + y.scale(-n_z)
+    crossed_y = x.scale(n_z) + z.scale(-n_x)
+    crossed_z = y.scale(n_x) + x.scale(-n_y)
+    return strength * crossed_x, strength * crossed_y, strength * crossed_z
 
 
 def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
@@ -99,7 +102,8 @@ def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
         normal = draw_direction(rng, 3)
         radius = uniform(rng, *interval(size, "ring_radius"))
         ring = ring_potential(position, centre=centre, normal=normal, radius=radius)
-        potential = [a + b for a, b in zip(potential, ring, strict=True)]
+        for axis in range(3):
+            potential[axis] = potential[axis] + ring[axis]
     return curl(potential)
 
 
@@ -114,7 +118,11 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     side = particles_per_side(size)
     box = size.box
     position = fill_box(
-        rng, (side,) * 3, low=box.low, high=box.high, jitter=size.value("jitter")
+        rng,
+        (side, side, side),
+        low=box.low,
+        high=box.high,
+        jitter=size.value("jitter"),
     )
     if has_rings(scenario):
         kind = "rings"
@@ -134,7 +142,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         position=position,
         velocity=flow.velocity,
         affine=flow.affine,
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=box.volume,
         viscosity=viscosity,
         wall_velocity=np.zeros((6, 3)),

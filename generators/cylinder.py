@@ -33,7 +33,7 @@ from .draws import RandomSource, choice, draw_integer, log_uniform, quantise, un
 from .full_box_parameters import FullBoxParameters
 from .obstacle import Obstacle, is_inside
 from .periodic_noise import fill_box
-from .split import InitialState, Material
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -57,8 +57,10 @@ def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
 def lattice_counts(size: Size) -> tuple[int, int]:
     """Return the particles along each axis of the lattice that fills the channel."""
     per_length = int(size.value("lattice"))
-    along_x, along_y = size.box.lengths.tolist()
-    return round(per_length * along_x), round(per_length * along_y)
+    length, height = size.box.lengths.tolist()
+    columns = round(per_length * length)
+    rows = round(per_length * height)
+    return columns, rows
 
 
 def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
@@ -71,7 +73,8 @@ def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
     steps = choice(rng, 2 * most_steps + 1) - most_steps
     x = float(size.value("obstacle_x"))
     middle = float(size.box.centre[1])
-    return x, middle + steps / size.value("lattice")
+    offset = steps / size.value("lattice")
+    return x, middle + offset
 
 
 def _square(vectors: Array) -> Array:
@@ -87,11 +90,16 @@ def moved_out(position: Array, centre: Array, radius: float) -> Array:
     distance = np.sqrt(_square(way))
     is_in = distance < radius
     stretch = np.where(is_in, radius / distance, 1.0)
-    return quantise(centre + stretch[:, None] * way)
+    stretched_way = stretch[:, None] * way
+    return quantise(centre + stretched_way)
 
 
 def potential_flow(
-    position: Array, centre: Array, *, radius: float, speed: float
+    position: Array,
+    centre: Array,
+    *,
+    radius: float,
+    speed: float,
 ) -> tuple[Array, Array]:
     """Return velocity [length/s] and gradient [1/s] of potential flow past a disc.
 
@@ -111,12 +119,14 @@ def potential_flow(
     y = way[:, 1]
     square = _square(way)
     dipole = speed * radius * radius / (square * square)
-    velocity = np.stack(
-        [speed - dipole * (x * x - y * y), -2.0 * dipole * x * y], axis=1
-    )
+    u = speed - dipole * (x * x - y * y)
+    v = -2.0 * dipole * x * y
+    velocity = np.stack([u, v], axis=1)
     # The flow is harmonic: two numbers make the gradient.
-    stretch = 2.0 * dipole * x * (x * x - 3.0 * y * y) / square
-    shear = 2.0 * dipole * y * (3.0 * x * x - y * y) / square
+    real_part = x * x - 3.0 * y * y  # of (x + iy)^3, over x
+    imaginary_part = 3.0 * x * x - y * y  # of (x + iy)^3, over y
+    stretch = 2.0 * dipole * x * real_part / square
+    shear = 2.0 * dipole * y * imaginary_part / square
     gradient = np.empty((len(position), 2, 2))
     gradient[:, 0, 0] = stretch
     gradient[:, 0, 1] = shear
@@ -126,7 +136,11 @@ def potential_flow(
 
 
 def eddy(
-    position: Array, centre: Array, *, radius: float, speed: float
+    position: Array,
+    centre: Array,
+    *,
+    radius: float,
+    speed: float,
 ) -> tuple[Array, Array]:
     """Return velocity [length/s] and gradient [1/s] of an eddy of finite size.
 
@@ -163,20 +177,32 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     box = size.box
     diameter = float(size.value("obstacle_diameter"))
     radius = 0.5 * diameter
-    centre = np.array(draw_centre(size, rng))
+    x, y = draw_centre(size, rng)
+    centre = np.array([x, y])
     position = fill_box(
-        rng, counts, low=box.low, high=box.high, jitter=size.value("jitter")
+        rng,
+        counts,
+        low=box.low,
+        high=box.high,
+        jitter=size.value("jitter"),
     )
     cell = np.indices(counts).reshape(2, -1).T
-    places = quantise(np.array(box.low) + (cell + 0.5) / size.value("lattice"))
-    x, y = centre.tolist()
+    from_corner = (cell + 0.5) / size.value("lattice")
+    places = quantise(np.array(box.low) + from_corner)
     is_solid = is_inside(places, (x, y), radius)
     _check_counts(size, int(is_solid.sum()), len(places))
+    obstacle = Obstacle(
+        centre=(x, y),
+        radius=radius,
+        position=places[is_solid],
+    )
 
     speed = float(size.value("speed"))
     # The eddy ends before the disc and the walls: they would stop it at once, and that
     # compresses the fluid.
-    way = np.array([uniform(rng, 2.0, 2.5), uniform(rng, -0.5, 0.5)])
+    diameters_behind = uniform(rng, 2.0, 2.5)
+    diameters_above = uniform(rng, -0.5, 0.5)
+    way = np.array([diameters_behind, diameters_above])
     eddy_radius = uniform(rng, 0.75, 1.0) * diameter
     eddy_speed = uniform(rng, 0.5, 1.0) * speed
     if choice(rng, 2):
@@ -194,10 +220,10 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         position=fluid,
         velocity=quantise(velocity),
         affine=quantise(affine),
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=box.volume * size.particles / len(places),
         viscosity=viscosity,
-        obstacle=Obstacle(centre=(x, y), radius=radius, position=places[is_solid]),
+        obstacle=obstacle,
         stream=np.array([speed, 0.0]),
         start_frame=start,
         parameters={

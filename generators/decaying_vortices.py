@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from lagbench.errors import UsageError
 
 from .constants import constants, interval
@@ -28,7 +26,7 @@ from .periodic_noise import (
     rotated_gradient,
     scaled_to,
 )
-from .split import InitialState, Material
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -70,7 +68,11 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     side = particles_per_side(size)
     box = size.box
     position = fill_box(
-        rng, (side, side), low=box.low, high=box.high, jitter=size.value("jitter")
+        rng,
+        (side, side),
+        low=box.low,
+        high=box.high,
+        jitter=size.value("jitter"),
     )
     count = size.value("frequency_count")
     frequency = size.value("frequency_min") + scenario % count
@@ -83,7 +85,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         position=position,
         velocity=flow.velocity,
         affine=flow.affine,
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=box.volume,
         viscosity=viscosity,
         parameters={

@@ -36,7 +36,11 @@ class RandomSource(Protocol):
 
 
 def entropy(
-    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+    split: str,
+    size: str,
+    major: int,
+    scenario: int,
+    draw_seed: str | None = None,
 ) -> tuple[int, ...]:
     """Return what seeds a scenario: a word of its data set, its version and its id.
 
@@ -59,22 +63,32 @@ def entropy(
         season = bytes.fromhex(draw_seed)
         words = []
         for start in range(0, len(season), 8):
-            words.append(int.from_bytes(season[start : start + 8], "big"))
+            eight_bytes = season[start : start + 8]
+            words.append(int.from_bytes(eight_bytes, "big"))
         return (*words, scenario)
     digest = hashlib.sha256(f"{split}/{size}".encode()).digest()
     return int.from_bytes(digest[:8], "big"), major, scenario
 
 
 def generator(
-    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+    split: str,
+    size: str,
+    major: int,
+    scenario: int,
+    draw_seed: str | None = None,
 ) -> np.random.Generator:
     """Return the PCG64 stream of one scenario, a function of its names only."""
     words = entropy(split, size, major, scenario, draw_seed)
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    seed = np.random.SeedSequence(words)
+    return np.random.Generator(np.random.PCG64(seed))
 
 
 def seed_text(
-    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+    split: str,
+    size: str,
+    major: int,
+    scenario: int,
+    draw_seed: str | None = None,
 ) -> str:
     """Return the seed as the files state it, for ``SeedSequence([...])``."""
     words = entropy(split, size, major, scenario, draw_seed)
@@ -88,12 +102,13 @@ def quantise(values: ArrayLike) -> NDArray[np.float64]:
     again on its way into the solver. Negative zero becomes zero.
     """
     exact = np.asarray(values, dtype=np.float64)
-    if not np.all(np.abs(exact) < _LARGEST):
+    magnitude = np.abs(exact)
+    if not np.all(magnitude < _LARGEST):
         raise WorkFailedError(
             "a drawn value has no exact float32 form",
             where="datasets.yaml",
             expected=f"finite, magnitude below {_LARGEST}",
-            got=float(np.max(np.abs(exact))),
+            got=float(np.max(magnitude)),
             fix="check the ranges and scales of this split in datasets.yaml",
         )
     rounded = np.rint(exact / QUANTUM) * QUANTUM
@@ -118,12 +133,15 @@ def add_in_order(values: Iterable[float]) -> float:
 
 def _draw_unit(rng: RandomSource) -> float:
     """Draw from the uniform distribution on [0, 1)."""
-    return float(rng.random((1,))[0])
+    (share,) = rng.random((1,))
+    return float(share)
 
 
 def uniform(rng: RandomSource, low: float, high: float) -> float:
     """Draw uniformly from [low, high), rounded to a multiple of 2^-20."""
-    return float(quantise(low + (high - low) * _draw_unit(rng)))
+    share = _draw_unit(rng)
+    value = low + (high - low) * share
+    return float(quantise(value))
 
 
 def log_uniform(rng: RandomSource, low: float, high: float) -> float:
@@ -167,7 +185,9 @@ def choice(rng: RandomSource, count: int) -> int:
 
 def draw_integer(rng: RandomSource, low: float, high: float) -> int:
     """Draw an integer, end points included."""
-    return int(low) + choice(rng, int(high) - int(low) + 1)
+    first = int(low)
+    last = int(high)
+    return first + choice(rng, last - first + 1)
 
 
 def direction(rng: RandomSource) -> tuple[float, float]:
@@ -186,7 +206,9 @@ def direction(rng: RandomSource) -> tuple[float, float]:
 def direction_in_space(rng: RandomSource) -> tuple[float, float, float]:
     """Draw a unit vector, uniform over the sphere, as :func:`direction` does."""
     while True:
-        x, y, z = (2.0 * rng.random((3,)) - 1.0).tolist()
+        unit = rng.random((3,))
+        vector = 2.0 * unit - 1.0
+        x, y, z = vector.tolist()
         square = x * x + y * y + z * z
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
@@ -222,16 +244,23 @@ def draw_program(
         end_value = uniform(rng, 0.0, amplitude)
         if start_value > 0.0:
             end_value = -end_value
-        s = np.arange(min(end, frame_count) - start) / (end - start)
+        frames = np.arange(min(end, frame_count) - start)  # since the knot
+        s = frames / (end - start)
         rise = s * s * (3.0 - 2.0 * s)
-        values[start:end] = start_value + (end_value - start_value) * rise
+        difference = end_value - start_value
+        values[start:end] = start_value + difference * rise
         start = end
         start_value = end_value
     return quantise(values)
 
 
 def fill(
-    rng: RandomSource, count: int, *, low: float, high: float, jitter: float
+    rng: RandomSource,
+    count: int,
+    *,
+    low: float,
+    high: float,
+    jitter: float,
 ) -> NDArray[np.float64]:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
@@ -249,8 +278,10 @@ def fill(
         Positions [length], multiples of 2^-20, shape [particle, 2].
     """
     columns = math.isqrt(count)
-    ends = np.array([count * column // columns for column in range(columns + 1)])
-    return _fill_columns(rng, ends, low=low, high=high, jitter=jitter)
+    ends = []
+    for column in range(columns + 1):
+        ends.append(count * column // columns)
+    return _fill_columns(rng, np.array(ends), low=low, high=high, jitter=jitter)
 
 
 def fill_grid(
@@ -284,13 +315,17 @@ def _fill_columns(
     column_count = len(column_sizes)
     # column and row of each particle's cell, shape [particle]
     column = np.repeat(np.arange(column_count), column_sizes)
-    row = np.arange(len(column)) - np.repeat(ends[:-1], column_sizes)
+    column_start = np.repeat(ends[:-1], column_sizes)
+    row = np.arange(len(column)) - column_start
     cell = np.stack([column, row], axis=-1)
     # cells across the square each way, shape [particle, 2]
     columns_across = np.full(len(column), column_count)
     rows_across = np.repeat(column_sizes, column_sizes)
     cell_counts = np.stack([columns_across, rows_across], axis=-1)
 
-    displacement = (rng.random(cell.shape) - 0.5) * jitter
+    unit = rng.random(cell.shape)
+    displacement = (unit - 0.5) * jitter
     middle = cell + 0.5
-    return quantise(low + (high - low) * (middle + displacement) / cell_counts)
+    side = high - low
+    from_corner = side * (middle + displacement) / cell_counts
+    return quantise(low + from_corner)

@@ -129,34 +129,37 @@ class Driver(ABC, Generic[Parameters]):
         """
         if len(states) != self.scenarios:
             raise UsageError(
-                "wrong number of scenarios", expected=self.scenarios, got=len(states)
+                "wrong number of scenarios",
+                expected=self.scenarios,
+                got=len(states),
             )
         for index, state in enumerate(states):
             self._check_state(index, state)
 
+        p = self.parameters
+        kernels = self._kernels
         self._fixed = self._fixed_positions(states)
         self._place(stack(states, "position"))
-        carried = np.empty((self.scenarios, self.parameters.particles, 4), np.float32)
+        carried = np.empty((self.scenarios, p.particles, 4), np.float32)
         # what stands behind the velocity keeps its value at rest; its slopes are 0
-        carried[...] = self._kernels.at_rest
+        carried[...] = kernels.at_rest
         carried[..., : self.dimension] = stack(states, "velocity")
-        self._write(self._kernels.carried, carried, at_rest=self._kernels.at_rest)
+        self._write(kernels.carried, carried, at_rest=kernels.at_rest)
         affine = stack(states, "affine")
-        for axis, field in enumerate(self._kernels.slopes):
+        for axis, field in enumerate(kernels.slopes):
             slope = np.zeros_like(carried)
             slope[..., : self.dimension] = affine[..., axis]
             self._write(field, slope)
 
         # volume of a particle [length^d], shape [scenario]
-        self._volume = np.array(
-            [state.area / self.parameters.particles for state in states]
-        )
+        volumes = [state.area / p.particles for state in states]
+        self._volume = np.array(volumes)
         # volume of a particle in cells
-        fill = self._volume * self.parameters.grid**self.dimension
-        self._kernels.fill.from_numpy(fill.astype(np.float32))
+        fill = self._volume * p.grid**self.dimension
+        kernels.fill.from_numpy(fill.astype(np.float32))
         self._start(states)
         self._substeps = 0
-        self._kernels.restart_extremes()
+        kernels.restart_extremes()
 
     def advance(self, substeps: int) -> None:
         """Advance every scenario; one that leaves the solver's bounds is a
@@ -220,7 +223,8 @@ class Driver(ABC, Generic[Parameters]):
 
     def position(self) -> NDArray[np.float32]:
         """Particle positions [length], shape [scenario, particle, axis]."""
-        return self._read(self._kernels.x)[..., : self.dimension]
+        x = self._read(self._kernels.x)
+        return x[..., : self.dimension]
 
     def velocity(self) -> NDArray[np.float32]:
         """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
@@ -229,9 +233,10 @@ class Driver(ABC, Generic[Parameters]):
 
     def _read(self, field: Field) -> NDArray[np.float32]:
         """Return a field of the particles, shape [scenario, particle, 4]."""
+        particles = self.parameters.particles
         if self.device is not Device.CPU:
-            return field.to_numpy()[:, : self.parameters.particles]
-        values = np.empty((1, self.parameters.particles, 4), np.float32)
+            return field.to_numpy()[:, :particles]
+        values = np.empty((1, particles, 4), np.float32)
         _copy(field, values)
         return values
 
@@ -271,7 +276,8 @@ class Driver(ABC, Generic[Parameters]):
         """
         fixed = np.empty_like(self._fixed)
         fixed[...] = at_rest
-        field.from_numpy(np.concatenate([values, fixed], axis=1))
+        rows = np.concatenate([values, fixed], axis=1)
+        field.from_numpy(rows)
 
     def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return positions clipped to the box [length], shape [..., axis]."""
@@ -300,7 +306,8 @@ class Driver(ABC, Generic[Parameters]):
 
         speed_bound = self._kernels.speed_bound
         speed = np.abs(state.velocity).max()
-        stretch = np.abs(state.affine).max() * self.parameters.dt
+        largest_slope = np.abs(state.affine).max()
+        stretch = largest_slope * self.parameters.dt
         is_finite = np.isfinite(state.position)
         if not (is_finite.all() and speed <= speed_bound and stretch <= 2.0):
             raise WorkFailedError(
@@ -347,4 +354,5 @@ def _copy(field: Template, values: ti.types.ndarray()) -> Nothing:  # type: igno
 
 def stack(states: Sequence[InitialState], name: str) -> NDArray[np.float32]:
     """Return an array of every state as float32, shape [scenario, ...]."""
-    return np.stack([getattr(state, name) for state in states]).astype(np.float32)
+    arrays = [getattr(state, name) for state in states]
+    return np.stack(arrays).astype(np.float32)

@@ -36,7 +36,7 @@ from .shapes import (
     place,
     sample_points,
 )
-from .split import FreeSurfaceParameters, InitialState, Material
+from .split import FreeSurfaceParameters, InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -51,7 +51,12 @@ COLUMN = "column"
 
 # Families whose bodies start in one region with one range of velocities share its
 # parameters.
-_START = dict(zip(FAMILIES, ("falling", "thrown", "falling", "splash"), strict=True))
+_START = {
+    "falling-rectangle": "falling",
+    "thrown": "thrown",
+    "falling-circle": "falling",
+    "splash": "splash",
+}
 
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
@@ -66,7 +71,8 @@ def _draw_shape(rng: RandomSource, family: str, area: float, size: Size) -> Shap
         return Disc.of_area(area)
     if family == "thrown" and choice(rng, 2) == 1:
         return Disc.of_area(area)
-    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
+    aspect = uniform(rng, *interval(size, "aspect"))
+    return Rectangle.of_area(area, aspect)
 
 
 def _draw_blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
@@ -96,12 +102,15 @@ def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> 
     total = np.zeros_like(position)
     weights = np.zeros((len(position), 1))
     for centre, velocity in zip(body.shape.centres, blob_velocities, strict=True):
-        x, y = (position - body.centre - np.array(centre)).T
-        weight = 1.0 / (x * x + y * y + softening * softening)
+        way = position - body.centre - np.array(centre)
+        x, y = way.T
+        square_distance = x * x + y * y + softening * softening
+        weight = 1.0 / square_distance
         weight = weight[:, None]  # shape [particle, 1]
         total = total + weight * velocity
         weights = weights + weight
-    return total / weights + normal(rng, size.value("particle_speed"), position.shape)
+    noise = normal(rng, size.value("particle_speed"), position.shape)
+    return total / weights + noise
 
 
 def _start_region(size: Size, start: str) -> Region:
@@ -186,7 +195,7 @@ def _liquid_at(
         position=position,
         velocity=velocity,
         affine=np.zeros((size.particles, 2, 2)),
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=area,
         parameters={
             "family": family,

@@ -30,7 +30,7 @@ from .split import (
     FreeSurface3DParameters,
     FreeSurfaceParameters,
     InitialState,
-    Material,
+    liquid,
 )
 
 if TYPE_CHECKING:
@@ -62,31 +62,36 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
     """Draw where a solid hangs: within the walls' margin, its centre above a height."""
     low, high = free_surface_walls(size)
     margin = size.value("margin")
+    least = low + margin
+    most = high - margin
     reach_x, reach_y, reach_z = solid.reach
-    x = uniform(rng, low + margin + reach_x, high - margin - reach_x)
-    y = uniform(rng, max(lowest, low + margin + reach_y), high - margin - reach_y)
-    z = uniform(rng, low + margin + reach_z, high - margin - reach_z)
+    lowest = max(lowest, least + reach_y)
+    x = uniform(rng, least + reach_x, most - reach_x)
+    y = uniform(rng, lowest, most - reach_y)
+    z = uniform(rng, least + reach_z, most - reach_z)
     return x, y, z
 
 
 def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
-    ball = Ball(uniform(rng, *interval(size, "ball_radius")))
+    radius = uniform(rng, *interval(size, "ball_radius"))
+    ball = Ball(radius)
     centre = _draw_place(rng, size, ball, size.value("fall_height"))
     velocity = _draw_vector(rng, size, "fall_velocity")
     return _state(rng, size, "falling-ball", [(ball, centre, velocity)])
 
 
 def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
-    sides = []
-    for _ in range(3):
-        sides.append(uniform(rng, *interval(size, "block_side")))
-    block = Block((sides[0], sides[1], sides[2]))
+    side_range = interval(size, "block_side")
+    width = uniform(rng, *side_range)
+    height = uniform(rng, *side_range)
+    depth = uniform(rng, *side_range)
+    block = Block((width, height, depth))
     centre = _draw_place(rng, size, block, 0.0)
-    velocity = _draw_vector(rng, size, "throw_velocity")
+    u, v, w = _draw_vector(rng, size, "throw_velocity")
     # towards either end of both horizontal axes
     sign_x = 1.0 - 2.0 * choice(rng, 2)
     sign_z = 1.0 - 2.0 * choice(rng, 2)
-    thrown = (sign_x * velocity[0], velocity[1], sign_z * velocity[2])
+    thrown = (sign_x * u, v, sign_z * w)
     return _state(rng, size, "thrown-block", [(block, centre, thrown)])
 
 
@@ -114,8 +119,9 @@ def _splash(rng: RandomSource, size: Size) -> InitialState:
     pool = Block((high - low, depth, high - low))
     middle = 0.5 * (low + high)
     pool_centre = (middle, low + 0.5 * depth, middle)
-    ball = Ball(uniform(rng, *interval(size, "drop_radius")))
-    lowest = low + depth + size.value("margin") + ball.radius
+    radius = uniform(rng, *interval(size, "drop_radius"))
+    ball = Ball(radius)
+    lowest = low + depth + size.value("margin") + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
     bodies: list[tuple[Solid, Point, Point]] = [
@@ -142,11 +148,13 @@ def _state(
     for index, (solid, centre, velocity) in enumerate(bodies):
         count = left_count
         if index < len(bodies) - 1:
-            count = int(size.particles * (solid.measure / total_volume))
+            volume_share = solid.measure / total_volume
+            count = int(size.particles * volume_share)
         left_count -= count
         body = Body(solid, np.array(centre))
-        positions.append(sample_points(rng, body, count))
-        velocities.append(np.tile(np.array(velocity), (count, 1)))
+        position = sample_points(rng, body, count)
+        positions.append(position)
+        velocities.append(np.full(position.shape, velocity))
 
     low, high = free_surface_walls(size)
     position = np.clip(np.concatenate(positions), low, high)
@@ -162,7 +170,7 @@ def _state(
         position=position,
         velocity=quantise(np.concatenate(velocities)),
         affine=np.zeros((size.particles, 3, 3)),
-        material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
+        material=liquid(size.particles),
         area=total_volume,
         wall_velocity=np.zeros((6, 3)),
         parameters=parameters,

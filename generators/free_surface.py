@@ -88,10 +88,11 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         matter[:, :, 1:] = 1.0
         kernels.matter.from_numpy(matter)
         identity = np.eye(self.dimension, dtype=np.float32)
-        gradients = np.broadcast_to(identity, (*shape, *identity.shape))
-        self._set_deformation(gradients.copy())
-        friction = np.array([state.friction for state in states], np.float32)
-        kernels.friction.from_numpy(friction)
+        gradients = np.empty((*shape, *identity.shape), np.float32)
+        gradients[...] = identity
+        self._set_deformation(gradients)
+        frictions = [state.friction for state in states]
+        kernels.friction.from_numpy(np.array(frictions, np.float32))
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
@@ -99,7 +100,8 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         # largest abs(v) + abs(A o) of each scenario
         self._reach = extremes[:, :, 3].max(axis=1)
         # The kernels keep a huge number where they saw something that is none.
-        extremes = np.where(np.abs(extremes) < _LARGEST, extremes, np.nan)
+        is_number = np.abs(extremes) < _LARGEST
+        extremes = np.where(is_number, extremes, np.nan)
         healths = []
         for extreme in extremes:
             health = Health(
@@ -123,15 +125,17 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
     def affine(self) -> NDArray[np.float32]:
         """APIC matrices C = grad v [1/s], shape [scenario, particle, axis, axis]."""
         columns = []
-        for slope in self._kernels.slopes:
-            columns.append(slope.to_numpy()[..., : self.dimension])
+        for field in self._kernels.slopes:
+            slope = field.to_numpy()
+            columns.append(slope[..., : self.dimension])
         return np.stack(columns, axis=-1)
 
     def volume_ratio(self) -> NDArray[np.float32]:
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario,
         particle].
         """
-        return self._read(self._kernels.matter)[..., 1]
+        matter = self._read(self._kernels.matter)
+        return matter[..., 1]
 
     def volume_ratio_extremes(
         self,
@@ -154,13 +158,17 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         """Return the energy of each scenario, in float64 from the particles."""
         p = self.parameters
         mass = p.density * self._volume  # of a particle, shape [scenario]
-        height = self.position()[..., 1].astype(np.float64) - self._kernels.least
-        velocity_square = (self.velocity().astype(np.float64) ** 2).sum(axis=-1)
-        affine_square = (self.affine().astype(np.float64) ** 2).sum(axis=(-2, -1))
+        position = self.position().astype(np.float64)
+        velocity = self.velocity().astype(np.float64)
+        affine = self.affine().astype(np.float64)
+        height = position[..., 1] - self._kernels.least
+        velocity_square = (velocity**2).sum(axis=-1)
+        affine_square = (affine**2).sum(axis=(-2, -1))
         spin = affine_square / (4.0 * p.grid**2)
+        motion = velocity_square + spin
         elastic_density = self._elastic_density()
         return Energy(
-            kinetic=0.5 * mass * (velocity_square + spin).sum(axis=-1),
+            kinetic=0.5 * mass * motion.sum(axis=-1),
             gravitational=p.gravity * mass * height.sum(axis=-1),
             elastic=self._volume * elastic_density.sum(axis=-1),
         )
@@ -176,12 +184,15 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         stretches = np.linalg.svd(f, compute_uv=False)
         jacobian = np.linalg.det(f)
         stretches[..., -1] *= np.sign(jacobian)
-        shear = ((stretches - 1.0) ** 2).sum(axis=-1)
+        strains = stretches - 1.0
+        shear = (strains**2).sum(axis=-1)
         bulk = 0.5 * (jacobian - 1.0) ** 2
-        hardening = np.exp(p.snow_hardening * (1.0 - ratio))
+        exponent = p.snow_hardening * (1.0 - ratio)
+        hardening = np.exp(exponent)
         hardening = np.clip(hardening, p.snow_hardening_min, p.snow_hardening_max)
 
-        density = p.liquid_modulus * (ratio - 1.0 - np.log(ratio))
+        compression = ratio - 1.0 - np.log(ratio)
+        density = p.liquid_modulus * compression
         moduli = {
             Material.JELLY: kernels.jelly,
             Material.ROPE: kernels.rope,

@@ -7,11 +7,10 @@ rules of walls and periodic axes in :mod:`.box_tables`.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .box_tables import LANES
+from .box_tables import LANES, Singles
 from .driver import Driver
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import broken_jacobian_bounds
@@ -59,7 +58,7 @@ class FullBox(Driver[FullBoxParameters]):
         for field in (kernels.drag, kernels.node, kernels.moved, kernels.gain):
             field.fill(0.0)
 
-    def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _inside(self, position: Singles) -> Singles:
         """Return positions between the walls, wrapped along periodic axes [length]."""
         box = self.parameters.box
         wrapped = box.wrap(position).astype(np.float32)
@@ -70,10 +69,10 @@ class FullBox(Driver[FullBoxParameters]):
         clipped = super()._inside(wrapped)
         return np.where(box.periodic, wrapped, clipped)
 
-    def _fixed_positions(self, states: Sequence[InitialState]) -> NDArray[np.float32]:
+    def _fixed_positions(self, states: Sequence[InitialState]) -> Singles:
         """Return the positions of the obstacles' particles, filled up with zeros."""
-        count = self.parameters.obstacle_particles
-        position = np.zeros((len(states), count, LANES), np.float32)
+        shape = (len(states), self.parameters.obstacle_particles, LANES)
+        position = np.zeros(shape, np.float32)
         for rows, state in zip(position, states, strict=True):
             if state.obstacle is not None:
                 rows[:, : self.dimension] = state.obstacle.position
@@ -82,10 +81,12 @@ class FullBox(Driver[FullBoxParameters]):
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""
         walls = [state.walls_towards(frame) for state in self._states]
-        self._kernels.move_walls(np.stack(walls).astype(np.float32))
+        wall_velocity = np.stack(walls)
+        self._kernels.move_walls(wall_velocity.astype(np.float32))
         if self.parameters.force_layers:
             forces = [state.force_towards(frame) for state in self._states]
-            self._kernels.apply_force(np.stack(forces).astype(np.float32))
+            body_force = np.stack(forces)
+            self._kernels.apply_force(body_force.astype(np.float32))
 
     def _drive(self, end: int) -> int:
         if not any(_has_program(state) for state in self._states):
@@ -96,18 +97,19 @@ class FullBox(Driver[FullBoxParameters]):
             self._drive_towards(frame + 1)
         return min(end, (frame + 1) * interval)
 
-    def jacobian(self) -> NDArray[np.float32]:
+    def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
         carried = self._kernels.carried.to_numpy()
         return np.asarray(carried[:, : self.parameters.particles, 3])
 
-    def grid_velocity(self) -> NDArray[np.float32]:
+    def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s].
 
         The shape is [scenario, *cells, axis]; a node is the middle of its cell.
         """
-        shape = (self.scenarios, *self._kernels.tables.shape, -1)
-        values = self._kernels.moved.to_numpy().reshape(shape)
+        nodes = self._kernels.tables.shape
+        moved = self._kernels.moved.to_numpy()
+        values = moved.reshape(self.scenarios, *nodes, -1)
         interior = (slice(1, -1),) * self.dimension
         inside = values[(slice(None), *interior)]
         return np.asarray(inside[..., : self.dimension])
@@ -116,17 +118,20 @@ class FullBox(Driver[FullBoxParameters]):
         """Return what each scenario went through during the last advance."""
         # largest velocity of any particle by component, and J, shape [scenario, 4]
         extremes = self._read(self._kernels.extremes).max(axis=1)
-        lowest = self._read(self._kernels.x)[..., 3].max(axis=1)
+        # the fields of positions hold the largest -J of each particle
+        positions = self._read(self._kernels.x)
+        lowest = positions[..., 3].max(axis=1)
         # largest velocity component of any node, shape [scenario]
         peaks = self._kernels.peak.to_numpy().max(axis=1)
         healths = []
         for extreme, low, peak in zip(extremes, lowest, peaks, strict=True):
-            is_finite = np.isfinite(extreme).all() and np.isfinite([low, peak]).all()
+            *speeds, jacobian = extreme
+            is_finite = np.isfinite([*extreme, low, peak])
             health = Health(
-                finite=bool(is_finite),
-                max_speed=float(np.max([*extreme[:3], peak])),
+                finite=bool(is_finite.all()),
+                max_speed=float(np.max([*speeds, peak])),
                 jacobian_min=float(-low),
-                jacobian_max=float(extreme[3]),
+                jacobian_max=float(jacobian),
             )
             healths.append(health)
         return healths
@@ -156,10 +161,13 @@ class FullBox(Driver[FullBoxParameters]):
         has_walls = speeds.shape[-2:] == shape
         if has_walls:
             wall = np.arange(2 * self.dimension)
+            normal = wall // 2
+            is_periodic = np.repeat(p.box.periodic, 2)
             may_move = np.full(shape, p.no_slip)
-            may_move[wall, wall // 2] = False  # a wall does not move along its normal
-            may_move[np.repeat(p.box.periodic, 2)] = False
-            is_allowed = (speeds == 0.0) | (may_move & (speeds <= speed_bound))
+            may_move[wall, normal] = False  # a wall does not move along its normal
+            may_move[is_periodic] = False
+            moves_well = may_move & (speeds <= speed_bound)
+            is_allowed = (speeds == 0.0) | moves_well
         if not has_walls or not is_allowed.all():
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
@@ -175,7 +183,8 @@ class FullBox(Driver[FullBoxParameters]):
         """Refuse a body force of other layers than the solver has."""
         layer_count = self.parameters.force_layers
         force = state.force_towards(0)
-        if force.shape != (layer_count, self.dimension) or not np.isfinite(force).all():
+        has_layers = force.shape == (layer_count, self.dimension)
+        if not has_layers or not np.isfinite(force).all():
             raise UsageError(
                 "the body force does not fit the box",
                 where=f"scenario {index}, body_force",
@@ -211,7 +220,9 @@ class FullBox(Driver[FullBoxParameters]):
         gap = LEAST_GAP / self.parameters.grid
         centre = np.asarray(obstacle.centre)
         reach = obstacle.radius + gap
-        is_clear = (centre - reach >= box.low) & (centre + reach <= box.high)
+        is_clear_below = centre - reach >= box.low
+        is_clear_above = centre + reach <= box.high
+        is_clear = is_clear_below & is_clear_above
         is_finite = np.isfinite(obstacle.position).all()
         if not is_clear.all():
             expected = f"a centre {reach:g} or more from all faces of the box"
@@ -242,7 +253,7 @@ class FullBox(Driver[FullBoxParameters]):
             stream is not None
             and self.parameters.fringe_rate > 0.0
             and stream.shape == (self.dimension,)
-            and bool((np.abs(stream) <= speed_bound).all())
+            and float(np.abs(stream).max()) <= speed_bound
         )
         if not is_valid:
             raise UsageError(
@@ -260,7 +271,7 @@ def _obstacles_of(states: Sequence[InitialState]) -> list[Obstacle]:
     return [state.obstacle for state in states if state.obstacle is not None]
 
 
-def _streams_of(states: Sequence[InitialState]) -> NDArray[np.float32]:
+def _streams_of(states: Sequence[InitialState]) -> Singles:
     """Return the streams of states that all have one, shape [scenario, axis]."""
     streams = [state.stream for state in states if state.stream is not None]
     return np.stack(streams).astype(np.float32)

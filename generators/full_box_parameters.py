@@ -51,7 +51,8 @@ class FullBoxParameters:
     @property
     def cells(self) -> tuple[int, ...]:
         """Cells along each axis, shape [axis]."""
-        return tuple(round(length * self.grid) for length in self.box.lengths.tolist())
+        lengths = self.box.lengths.tolist()
+        return tuple(round(length * self.grid) for length in lengths)
 
     @property
     def origin(self) -> tuple[float, ...]:

@@ -40,6 +40,8 @@ from .split import FreeSurfaceParameters, InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
+Array = NDArray[np.float64]
+
 PAIRS = (
     (Material.LIQUID, Material.SNOW),
     (Material.ROPE, Material.SNOW),
@@ -84,7 +86,8 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 
 def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
-    return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
+    aspect = uniform(rng, *interval(size, "aspect"))
+    return Rectangle.of_area(area, aspect)
 
 
 def _draw_rope(rng: RandomSource, size: Size, length: float) -> Shape:
@@ -98,7 +101,10 @@ PLANE_SHAPES = BodyShapes(
 
 
 def _draw_shape(
-    rng: RandomSource, material: Material, size: Size, kinds: BodyShapes
+    rng: RandomSource,
+    material: Material,
+    size: Size,
+    kinds: BodyShapes,
 ) -> Shape:
     """Draw a rope, a ball of jelly, or a block or ball of anything else."""
     if material is Material.ROPE:
@@ -110,25 +116,40 @@ def _draw_shape(
     return kinds.block(rng, size, measure)
 
 
-def _probe_nodes(shape: Shape, cell_count: int) -> NDArray[np.float64]:
+def _probe_nodes(shape: Shape, cell_count: int) -> Array:
     """Return nodes of a grid over a bounding box about the origin [length], shape
     [node, axis].
     """
-    side = (2.0 * np.arange(cell_count + 1) - cell_count) / cell_count
-    coordinates = np.meshgrid(*(side * reach for reach in shape.reach))
-    return np.stack([along.ravel() for along in coordinates], axis=-1)
+    numbers = np.arange(cell_count + 1)
+    unit_axis = (2.0 * numbers - cell_count) / cell_count  # from -1 to 1
+    axes = [unit_axis * reach for reach in shape.reach]
+    coordinates = np.meshgrid(*axes)
+    columns = [along.ravel() for along in coordinates]
+    return np.stack(columns, axis=-1)
 
 
 def _keeps_gap(
-    first: Body, second: Body, offsets: NDArray[np.float64], gap: float
+    first: Body,
+    second: Body,
+    offsets: Array,
+    gap: float,
 ) -> bool:
     """Tell whether the second body keeps a gap [length] from the first.
 
     It is probed at those offsets from its centre that lie inside it.
     """
     nodes = second.centre + offsets
-    inside = nodes[second.distance(nodes) <= 0.0]
-    return float(np.min(first.distance(inside))) >= gap
+    is_inside = second.distance(nodes) <= 0.0
+    distance = first.distance(nodes[is_inside])
+    return float(distance.min()) >= gap
+
+
+def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
+    """Tell whether all bodies keep a gap [length] from one another."""
+    for i, j in combinations(range(len(bodies)), 2):
+        if not _keeps_gap(bodies[i], bodies[j], offsets[j], gap):
+            return False
+    return True
 
 
 def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list[Body]:
@@ -138,15 +159,16 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
     box, each way.
     """
     low, high = free_surface_walls(size)
-    inner = (low + size.value("margin"), high - size.value("margin"))
+    margin = size.value("margin")
+    inner = (low + margin, high - margin)
+    region = size.dimension * [inner]
     gap = float(size.value("gap"))
     cell_count = int(size.value("gap_cells"))
     offsets = [_probe_nodes(shape, cell_count) for shape in shapes]
 
     for _ in range(_ATTEMPTS):
-        bodies = [place(rng, shape, size.dimension * [inner]) for shape in shapes]
-        pairs = combinations(range(len(bodies)), 2)
-        if all(_keeps_gap(bodies[i], bodies[j], offsets[j], gap) for i, j in pairs):
+        bodies = [place(rng, shape, region) for shape in shapes]
+        if _are_apart(bodies, offsets, gap):
             return bodies
     raise WorkFailedError(
         f"{len(shapes)} bodies have no room side by side",
@@ -158,7 +180,10 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
 
 
 def _body_parameters(
-    name: str, body: Body, measure: float, velocity: NDArray[np.float64]
+    name: str,
+    body: Body,
+    measure: float,
+    velocity: Array,
 ) -> dict[str, int | float | str]:
     """Return what a file states of one body: shape, area or volume, centre and
     velocity.
@@ -170,7 +195,8 @@ def _body_parameters(
         f"{name}_shape": type(body.shape).__name__.lower(),
         f"{name}_{measure_name}": measure,
     }
-    for quantity, vector in (("centre", body.centre), ("velocity", velocity)):
+    vectors = {"centre": body.centre, "velocity": velocity}
+    for quantity, vector in vectors.items():
         for axis, component in zip("xyz", vector.tolist(), strict=False):
             parameters[f"{name}_{quantity}_{axis}"] = component
     return parameters
@@ -194,11 +220,12 @@ def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
     return TRIPLES[number % len(TRIPLES)]
 
 
-def _draw_attractor(rng: RandomSource, size: Size) -> NDArray[np.float64]:
+def _draw_attractor(rng: RandomSource, size: Size) -> Array:
     """Draw the point that attracts all bodies [length], shape [axis]."""
     point = []
     for axis in "xyz"[: size.dimension]:
-        point.append(uniform(rng, *interval(size, f"attractor_{axis}")))
+        coordinate = uniform(rng, *interval(size, f"attractor_{axis}"))
+        point.append(coordinate)
     return np.array(point)
 
 
@@ -230,7 +257,10 @@ def draw_bodies(
     # the attractor: velocity of each body = rate (point - centre) [length/s]
     point = _draw_attractor(rng, size)
     rate = uniform(rng, *interval(size, "attraction"))
-    velocities = [quantise(rate * (point - body.centre)) for body in bodies]
+    velocities = []
+    for body in bodies:
+        way = point - body.centre
+        velocities.append(quantise(rate * way))
 
     friction = 0.0
     if Material.LIQUID not in materials:
@@ -247,11 +277,13 @@ def draw_bodies(
     for body_values in zip(_NAMES, bodies, measures, velocities, strict=False):
         parameters |= _body_parameters(*body_values)
     dimension = size.dimension
+    body_velocity = np.stack(velocities)
+    body_material = np.array(materials, dtype=np.int8)
     return InitialState(
         position=np.concatenate(points),
-        velocity=np.repeat(np.stack(velocities), counts, axis=0),
+        velocity=np.repeat(body_velocity, counts, axis=0),
         affine=np.zeros((size.particles, dimension, dimension)),
-        material=np.repeat(np.array(materials, dtype=np.int8), counts),
+        material=np.repeat(body_material, counts),
         area=add_in_order(measures),
         wall_velocity=np.zeros((2 * dimension, dimension)),
         friction=friction,

@@ -12,7 +12,7 @@ width to choose:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,14 +52,20 @@ class Jet:
 
     def __mul__(self, other: Jet) -> Jet:
         """Multiply by the product rule."""
-        f = self
-        g = other
-        x = f.x * g.value + f.value * g.x
-        y = f.y * g.value + f.value * g.y
-        xx = f.xx * g.value + 2.0 * (f.x * g.x) + f.value * g.xx
-        xy = f.xy * g.value + f.x * g.y + f.y * g.x + f.value * g.xy
-        yy = f.yy * g.value + 2.0 * (f.y * g.y) + f.value * g.yy
-        return Jet(f.value * g.value, x, y, xx, xy, yy)
+        f = self.value
+        g = other.value
+        f_x = self.x
+        f_y = self.y
+        g_x = other.x
+        g_y = other.y
+        return Jet(
+            f * g,
+            f_x * g + f * g_x,
+            f_y * g + f * g_y,
+            self.xx * g + 2.0 * (f_x * g_x) + f * other.xx,
+            self.xy * g + f_x * g_y + f_y * g_x + f * other.xy,
+            self.yy * g + 2.0 * (f_y * g_y) + f * other.yy,
+        )
 
     def scale(self, factor: Array | float) -> Jet:
         """Multiply by numbers that do not depend on the point's coordinates."""
@@ -74,7 +80,8 @@ class Jet:
 
     def shift(self, amount: Array | float) -> Jet:
         """Add numbers that do not depend on the point's coordinates."""
-        return Jet(self.value + amount, self.x, self.y, self.xx, self.xy, self.yy)
+        value = self.value + amount
+        return replace(self, value=value)
 
     def polynomial(self, *coefficients: float) -> Jet:
         """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
@@ -94,11 +101,12 @@ def coordinates(position: Array) -> tuple[Jet, Jet]:
     return x_jet, y_jet
 
 
-def gradients(rng: RandomSource, frequency: int) -> NDArray[np.float64]:
+def gradients(rng: RandomSource, frequency: int) -> Array:
     """Draw the unit gradients of a lattice, shape [frequency + 1, frequency + 1, 2]."""
-    node_count = frequency + 1
-    vectors = [direction(rng) for _ in range(node_count * node_count)]
-    return np.array(vectors).reshape(node_count, node_count, 2)
+    side = frequency + 1
+    node_count = side * side
+    vectors = [direction(rng) for _ in range(node_count)]
+    return np.array(vectors).reshape(side, side, 2)
 
 
 def fade(t: Jet) -> Jet:
@@ -108,31 +116,37 @@ def fade(t: Jet) -> Jet:
     return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
 
 
-def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
+def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     """Return gradient noise of a lattice at points in units of its cells.
 
     Eqs. 5.40 and 5.41 of the thesis. It is 0 at every node and its slope there is the
     node's gradient. The lattice has the shape [node, node, 2].
     """
     last = len(lattice) - 2
+    column = np.floor(x.value).astype(np.int64)
+    row = np.floor(y.value).astype(np.int64)
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
-    i = np.minimum(np.floor(x.value).astype(np.int64), last)
-    j = np.minimum(np.floor(y.value).astype(np.int64), last)
+    i = np.minimum(column, last)
+    j = np.minimum(row, last)
     # distances from the low corner of the cell
     p = x.shift(-i.astype(np.float64))
     q = y.shift(-j.astype(np.float64))
 
     def corner(k: int, m: int) -> Jet:
         """Return the ramp along the gradient of one corner of the cell."""
-        slope = lattice[i + k, j + m]
-        along_x = p.shift(-float(k)).scale(slope[:, 0])
-        along_y = q.shift(-float(m)).scale(slope[:, 1])
-        return along_x + along_y
+        slope_x, slope_y = lattice[i + k, j + m].T
+        from_corner_x = p.shift(-float(k))
+        from_corner_y = q.shift(-float(m))
+        return from_corner_x.scale(slope_x) + from_corner_y.scale(slope_y)
 
     u = fade(p)
     w = fade(q)
-    low = corner(0, 0) + u * (corner(1, 0) - corner(0, 0))
-    high = corner(0, 1) + u * (corner(1, 1) - corner(0, 1))
+    low_left = corner(0, 0)
+    low_right = corner(1, 0)
+    high_left = corner(0, 1)
+    high_right = corner(1, 1)
+    low = low_left + u * (low_right - low_left)
+    high = high_left + u * (high_right - high_left)
     return low + w * (high - low)
 
 

@@ -64,14 +64,18 @@ class Smooth:
         f = self.value[:, None]
         g = other.value[:, None]
         gradient = g * self.gradient + f * other.gradient
+        # f'_i g'_j and its transpose, shape [point, axis, axis]
         crossed = self.gradient[:, :, None] * other.gradient[:, None, :]
-        hessian = g[..., None] * self.hessian + f[..., None] * other.hessian
-        hessian = hessian + (crossed + crossed.transpose(0, 2, 1))
+        both_crossed = crossed + crossed.transpose(0, 2, 1)
+        f_curved = g[..., None] * self.hessian
+        g_curved = f[..., None] * other.hessian
+        hessian = f_curved + g_curved + both_crossed
         return Smooth(self.value * other.value, gradient, hessian)
 
     def scale(self, factor: Array | float) -> Smooth:
         """Multiply by numbers that do not depend on the point's coordinates."""
-        factors = np.broadcast_to(np.asarray(factor, np.float64), self.value.shape)
+        exact = np.asarray(factor, np.float64)
+        factors = np.broadcast_to(exact, self.value.shape)
         return Smooth(
             factors * self.value,
             factors[:, None] * self.gradient,
@@ -86,15 +90,18 @@ class Smooth:
         """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
         result = self.scale(0.0)
         for coefficient in reversed(coefficients):
-            result = (result * self).shift(coefficient)
+            product = result * self
+            result = product.shift(coefficient)
         return result
 
     def only_where(self, chosen: NDArray[np.bool_]) -> Smooth:
         """Return the function at some points, and zero at the others."""
+        of_gradient = chosen[:, None]
+        of_hessian = chosen[:, None, None]
         return Smooth(
             np.where(chosen, self.value, 0.0),
-            np.where(chosen[:, None], self.gradient, 0.0),
-            np.where(chosen[:, None, None], self.hessian, 0.0),
+            np.where(of_gradient, self.gradient, 0.0),
+            np.where(of_hessian, self.hessian, 0.0),
         )
 
 
@@ -108,16 +115,18 @@ class Flow:
     @property
     def speed_rms(self) -> float:
         """Root mean square of the speed over the points [length/s]."""
-        squares = self.velocity.ravel().tolist()
-        total = math.fsum(value * value for value in squares)
-        return math.sqrt(total / len(self.velocity))
+        components = self.velocity.ravel().tolist()
+        square_sum = math.fsum(component * component for component in components)
+        return math.sqrt(square_sum / len(self.velocity))
 
 
 def coordinate(values: Array, axis: int, dimension: int) -> Smooth:
     """Return a coordinate, or it less a constant, as a function of the position."""
-    gradient = np.zeros((len(values), dimension))
+    point_count = len(values)
+    gradient = np.zeros((point_count, dimension))
     gradient[:, axis] = 1.0
-    return Smooth(values, gradient, np.zeros((len(values), dimension, dimension)))
+    hessian = np.zeros((point_count, dimension, dimension))
+    return Smooth(values, gradient, hessian)
 
 
 def constant(value: float, point_count: int, dimension: int) -> Smooth:
@@ -133,10 +142,13 @@ def draw_direction(rng: RandomSource, dimension: int) -> Array:
     """Draw a unit vector, uniform over the circle or sphere, without sine or cosine."""
     # until a point of the cube lies in the unit ball, and not at its very centre
     while True:
-        vector = 2.0 * rng.random((dimension,)) - 1.0
-        square = math.fsum(value * value for value in vector.tolist())
+        unit = rng.random((dimension,))
+        vector = 2.0 * unit - 1.0
+        components = vector.tolist()
+        square = math.fsum(component * component for component in components)
         if 2.0**-20 <= square <= 1.0:
-            return np.asarray(vector / math.sqrt(square))
+            length = math.sqrt(square)
+            return np.asarray(vector / length)
 
 
 def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
@@ -146,7 +158,8 @@ def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
     """
     count = frequency**dimension
     vectors = [draw_direction(rng, dimension) for _ in range(count)]
-    return np.array(vectors).reshape(*(frequency,) * dimension, dimension)
+    nodes = [frequency] * dimension
+    return np.array(vectors).reshape(*nodes, dimension)
 
 
 def _fade(t: Smooth) -> Smooth:
@@ -167,24 +180,28 @@ def noise(position: Array, lattice: Array) -> Smooth:
     frequency = len(lattice)
     point_count, dimension = position.shape
     scaled = position * float(frequency)
-    cell = np.minimum(np.floor(scaled).astype(np.int64), frequency - 1)
+    cell = np.floor(scaled).astype(np.int64)
+    cell = np.minimum(cell, frequency - 1)
     # distances from the low corner of the cell, and the weights of the two corners
     along = []
     weights = []
     for axis in range(dimension):
-        distance = scaled[:, axis] - cell[:, axis].astype(np.float64)
+        low_corner = cell[:, axis].astype(np.float64)
+        distance = scaled[:, axis] - low_corner
         t = coordinate(distance, axis, dimension)
         along.append(t)
         rising = _fade(t)
-        weights.append((rising.scale(-1.0).shift(1.0), rising))
+        falling = rising.scale(-1.0).shift(1.0)
+        weights.append((falling, rising))
 
     total = constant(0.0, point_count, dimension)
     for corner in itertools.product((0, 1), repeat=dimension):
-        node = tuple(((cell + np.array(corner)) % frequency).T)
-        gradient = lattice[node]
+        node = (cell + np.array(corner)) % frequency  # shape [point, axis]
+        gradient = lattice[tuple(node.T)]
         term = constant(0.0, point_count, dimension)
         for axis, side in enumerate(corner):
-            term = term + along[axis].shift(-float(side)).scale(gradient[:, axis])
+            from_corner = along[axis].shift(-float(side))
+            term = term + from_corner.scale(gradient[:, axis])
         for axis, side in enumerate(corner):
             term = term * weights[axis][side]
         total = total + term
@@ -208,8 +225,10 @@ def wrapped_offset(position: Array, centre: Array) -> Array:
 
 def rotated_gradient(psi: Smooth) -> Flow:
     """Return the flow u = dpsi/dy, v = -dpsi/dx."""
-    velocity = np.stack([psi.gradient[:, 1], -psi.gradient[:, 0]], axis=1)
-    affine = np.stack([psi.hessian[:, 1], -psi.hessian[:, 0]], axis=1)
+    slope_x, slope_y = np.moveaxis(psi.gradient, 1, 0)
+    gradient_of_slope_x, gradient_of_slope_y = np.moveaxis(psi.hessian, 1, 0)
+    velocity = np.stack([slope_y, -slope_x], axis=1)
+    affine = np.stack([gradient_of_slope_y, -gradient_of_slope_x], axis=1)
     return Flow(velocity, affine)
 
 
@@ -220,19 +239,19 @@ def curl(potential: Sequence[Smooth]) -> Flow:
     for axis in range(3):
         first = (axis + 1) % 3
         second = (axis + 2) % 3
-        velocity.append(
-            potential[second].gradient[:, first] - potential[first].gradient[:, second]
-        )
-        affine.append(
-            potential[second].hessian[:, first] - potential[first].hessian[:, second]
-        )
+        a = potential[first]
+        b = potential[second]
+        velocity.append(b.gradient[:, first] - a.gradient[:, second])
+        affine.append(b.hessian[:, first] - a.hessian[:, second])
     return Flow(np.stack(velocity, axis=1), np.stack(affine, axis=1))
 
 
 def scaled_to(flow: Flow, speed_rms: float) -> Flow:
     """Return a flow of another root mean square speed, as multiples of 2^-20."""
     factor = speed_rms / flow.speed_rms
-    return Flow(quantise(factor * flow.velocity), quantise(factor * flow.affine))
+    velocity = quantise(factor * flow.velocity)
+    affine = quantise(factor * flow.affine)
+    return Flow(velocity, affine)
 
 
 def fill_box(
@@ -256,8 +275,11 @@ def fill_box(
         Positions [length], multiples of 2^-20, shape [particle, axis].
     """
     dimension = len(counts)
-    cell = np.indices(tuple(counts)).reshape(dimension, -1).T
-    displacement = (rng.random(cell.shape) - 0.5) * jitter
+    indices = np.indices(tuple(counts))
+    cell = indices.reshape(dimension, -1).T
+    unit = rng.random(cell.shape)
+    displacement = (unit - 0.5) * jitter
+    share = (cell + 0.5 + displacement) / np.asarray(counts)  # of the extent
     start = np.asarray(low, np.float64)
     extent = np.asarray(high, np.float64) - start
-    return quantise(start + extent * ((cell + 0.5 + displacement) / np.asarray(counts)))
+    return quantise(start + extent * share)

@@ -93,9 +93,12 @@ class Rectangle:
         c, s = self.axis
         x, y = position.T
         # distances beyond the ends and beyond the sides, negative between them
-        along = np.abs(c * x + s * y) - 0.5 * self.length
-        across = np.abs(c * y - s * x) - 0.5 * self.width
-        inside = np.minimum(np.maximum(along, across), 0.0)
+        from_middle_along = np.abs(c * x + s * y)
+        from_middle_across = np.abs(c * y - s * x)
+        along = from_middle_along - 0.5 * self.length
+        across = from_middle_across - 0.5 * self.width
+        farther = np.maximum(along, across)
+        inside = np.minimum(farther, 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
         outside = np.sqrt(along * along + across * across)
@@ -126,7 +129,8 @@ class Disc:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y = position.T
-        return np.asarray(np.sqrt(x * x + y * y) - self.radius)
+        from_centre = np.sqrt(x * x + y * y)
+        return np.asarray(from_centre - self.radius)
 
 
 @dataclass(frozen=True)
@@ -152,21 +156,23 @@ class Blobs:
         low = offsets.min(axis=0) - 1.0
         high = offsets.max(axis=0) + 1.0
         centres = offsets - 0.5 * (low + high)
-        extent = high - low
+        width, height = high - low
         middle = (np.arange(cells) + 0.5) / cells - 0.5
-        x, y = np.meshgrid(middle * extent[0], middle * extent[1])
-        x = x.ravel()
-        y = y.ravel()
-        covered = np.zeros(cells * cells, dtype=np.bool_)
-        for centre in centres:
-            dx = x - centre[0]
-            dy = y - centre[1]
-            covered |= dx * dx + dy * dy <= 1.0
-        box_area = extent[0] * extent[1]
-        unit_area = float(np.count_nonzero(covered) * box_area) / (cells * cells)
+        x, y = np.meshgrid(middle * width, middle * height)
+        cell_count = cells * cells
+        is_covered = np.zeros((cells, cells), dtype=np.bool_)
+        for centre_x, centre_y in centres:
+            dx = x - centre_x
+            dy = y - centre_y
+            is_covered |= dx * dx + dy * dy <= 1.0
+        box_area = width * height
+        covered_count = np.count_nonzero(is_covered)
+        unit_area = float(covered_count * box_area) / cell_count
         scale = math.sqrt(area / unit_area)
-        scaled = tuple((float(x) * scale, float(y) * scale) for x, y in centres)
-        return cls(scaled, scale, area)
+        scaled = []
+        for centre_x, centre_y in centres.tolist():
+            scaled.append((centre_x * scale, centre_y * scale))
+        return cls(tuple(scaled), scale, area)
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -177,7 +183,10 @@ class Blobs:
     def distance(self, position: Array) -> Array:
         """Return the signed distance, exact outside and on the outline."""
         disc = Disc(self.radius)
-        distances = [disc.distance(position - np.array(c)) for c in self.centres]
+        distances = []
+        for centre in self.centres:
+            way = position - np.array(centre)
+            distances.append(disc.distance(way))
         return np.asarray(np.minimum.reduce(distances))
 
 
@@ -238,11 +247,14 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     missing_count = count
     start = 1
     while missing_count > 0:
-        index = np.arange(start, start + block_size, dtype=np.float64)[:, None]
-        turns = shift + index * steps
-        local = (turns - np.floor(turns) - 0.5) * side
+        end = start + block_size
+        index = np.arange(start, end, dtype=np.float64)
+        turns = shift + index[:, None] * steps
+        place = turns - np.floor(turns)  # in the unit square or cube
+        local = (place - 0.5) * side
         is_inside = body.shape.distance(local) <= 0.0
-        points = local[is_inside][:missing_count]
+        inside = local[is_inside]
+        points = inside[:missing_count]
         blocks.append(points)
         missing_count -= len(points)
         start += block_size

@@ -286,11 +286,14 @@ def _diagnose(
 def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
     """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
-    seed = (*entropy(size.split, size.name, size.major, scenario, size.draw_seed), 1)
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+    words = entropy(size.split, size.name, size.major, scenario, size.draw_seed)
+    seed = np.random.SeedSequence((*words, 1))
+    rng = np.random.Generator(np.random.PCG64(seed))
     shape = (size.particles, size.box.dimension)
-    signs = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
-    return (QUANTUM * signs).astype(np.float32)
+    is_negative = rng.random(shape) < 0.5
+    signs = np.where(is_negative, -1.0, 1.0)
+    displacement = QUANTUM * signs
+    return displacement.astype(np.float32)
 
 
 def measure_predictability(
@@ -304,7 +307,10 @@ def measure_predictability(
     """
     size = job.size
     input_frames = size.task.input_frames
-    frame_counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
+    frame_counts = []
+    for scenario in job.scenarios:
+        frames_ahead = size.frame_count(scenario) - size.frames_behind(scenario)
+        frame_counts.append(frames_ahead)
     batch = ScenarioBatch(job, report, frames=frame_counts)
     # displacements of the batch [length], shape [scenario, particle, axis]
     shape = (len(frame_counts), size.particles, size.box.dimension)
@@ -323,8 +329,9 @@ def measure_predictability(
                 batch.displace(offsets)
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
-                truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                limits[index].append(_root_mean_square_error(position, truth, size.box))
+                truth = truths[index].read("position", frame)
+                error = _root_mean_square_error(position, truth, size.box)
+                limits[index].append(error)
     return {
         scenario: tuple(limit)
         for scenario, limit in zip(job.scenarios, limits, strict=True)
@@ -334,5 +341,8 @@ def measure_predictability(
 def _root_mean_square_error(
     position: NDArray[np.float32], truth: NDArray[np.float32], box: Box
 ) -> float:
-    error = box.displacement(truth.astype(np.float64), position.astype(np.float64))
-    return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)
+    exact_truth = truth.astype(np.float64)
+    exact_position = position.astype(np.float64)
+    error = box.displacement(exact_truth, exact_position)
+    squares = (error * error).ravel().tolist()
+    return math.sqrt(math.fsum(squares) / error.size)

@@ -38,12 +38,14 @@ class Ball:
     @classmethod
     def of_volume(cls, volume: float) -> Ball:
         """Return the ball that fills this volume [length^3]."""
-        return cls(cube_root(volume / (4.0 / 3.0 * math.pi)))
+        radius_cubed = volume / (4.0 / 3.0 * math.pi)
+        return cls(cube_root(radius_cubed))
 
     @property
     def measure(self) -> float:
         """Four thirds of pi times the radius cubed."""
-        return 4.0 / 3.0 * math.pi * self.radius * self.radius * self.radius
+        r = self.radius
+        return 4.0 / 3.0 * math.pi * r * r * r
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -53,7 +55,8 @@ class Ball:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y, z = position.T
-        return np.asarray(np.sqrt(x * x + y * y + z * z) - self.radius)
+        from_centre = np.sqrt(x * x + y * y + z * z)
+        return np.asarray(from_centre - self.radius)
 
 
 @dataclass(frozen=True)
@@ -68,18 +71,21 @@ class Block:
         its height [1].
         """
         along_x, along_z = aspects
-        height = cube_root(volume / (along_x * along_z))
+        height_cubed = volume / (along_x * along_z)
+        height = cube_root(height_cubed)
         return cls((along_x * height, height, along_z * height))
 
     @property
     def measure(self) -> float:
         """Product of the sides."""
-        return self.sides[0] * self.sides[1] * self.sides[2]
+        width, height, depth = self.sides
+        return width * height * depth
 
     @property
     def reach(self) -> tuple[float, float, float]:
         """Half the sides."""
-        return 0.5 * self.sides[0], 0.5 * self.sides[1], 0.5 * self.sides[2]
+        width, height, depth = self.sides
+        return 0.5 * width, 0.5 * height, 0.5 * depth
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
@@ -110,8 +116,10 @@ class Rod:
         return x, y, z
 
     def _reach_along(self, component: float) -> float:
-        sine = math.sqrt(max(0.0, 1.0 - component * component))
-        return 0.5 * self.length * abs(component) + self.radius * sine
+        square_sine = 1.0 - component * component
+        sine = math.sqrt(max(0.0, square_sine))
+        half_length = 0.5 * self.length * abs(component)
+        return half_length + self.radius * sine
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
@@ -122,7 +130,8 @@ class Rod:
         # distances beyond the ends and beyond the side, negative between them
         along = np.abs(height) - 0.5 * self.length
         across = np.sqrt(np.maximum(square, 0.0)) - self.radius
-        inside = np.minimum(np.maximum(along, across), 0.0)
+        farther = np.maximum(along, across)
+        inside = np.minimum(farther, 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
         outside = np.sqrt(along * along + across * across)
@@ -139,7 +148,9 @@ def cube_root(value: float) -> float:
     """
     root = max(1.0, value)
     while True:
-        smaller = root - (root * root * root - value) / (3.0 * root * root)
+        excess = root * root * root - value
+        slope = 3.0 * root * root
+        smaller = root - excess / slope
         if not smaller < root:
             return root
         root = smaller

@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from .split import FreeSurfaceParameters, Material
 
+Singles = NDArray[np.float32]
+
 BIN = 1e-3
 """Width of the bins by which quantiles of Mach numbers and of J are counted [1]."""
 
@@ -69,7 +71,8 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
 
 def wave_modulus(young: float, poisson: float) -> float:
     """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)) [mass/s^2]."""
-    return young * (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    divisor = (1.0 + poisson) * (1.0 - 2.0 * poisson)
+    return young * (1.0 - poisson) / divisor
 
 
 class SoundnessRecorder:
@@ -87,27 +90,28 @@ class SoundnessRecorder:
         self._is_snow = material == Material.SNOW
         speeds = sound_speeds(parameters)
         # of each particle [length/s], shape [particle]
-        self._sound_speed = np.array([speeds[Material(kind)] for kind in material])
+        sound_speeds_of_particles = [speeds[Material(kind)] for kind in material]
+        self._sound_speed = np.array(sound_speeds_of_particles)
         self._mach_counts = np.zeros(_BIN_COUNT, np.int64)
         self._mach_max = 0.0
         self._jacobian_counts = np.zeros(_BIN_COUNT, np.int64)
 
-    def add(self, velocity: NDArray[np.float32], ratio: NDArray[np.float32]) -> None:
+    def add(self, velocity: Singles, ratio: Singles) -> None:
         """Add a recorded frame.
 
         Args:
             velocity: particle velocities [length/s], shape [particle, 2].
             ratio: J of liquid [1], shape [particle]; of others it is not read.
         """
-        velocity_square = np.square(velocity, dtype=np.float64).sum(axis=-1)
-        mach = np.sqrt(velocity_square) / self._sound_speed
+        squares = np.square(velocity, dtype=np.float64)
+        speed = np.sqrt(squares.sum(axis=-1))
+        mach = speed / self._sound_speed
         self._mach_max = max(self._mach_max, float(mach.max()))
         self._mach_counts += _count_bins(mach)
-        self._jacobian_counts += _count_bins(ratio[self._is_liquid].astype(np.float64))
+        liquid_jacobian = ratio[self._is_liquid].astype(np.float64)
+        self._jacobian_counts += _count_bins(liquid_jacobian)
 
-    def summary(
-        self, least: NDArray[np.float32], greatest: NDArray[np.float32]
-    ) -> FreeSurfaceSoundness:
+    def summary(self, least: Singles, greatest: Singles) -> FreeSurfaceSoundness:
         """Return what the frames and substeps so far have shown.
 
         Args:
@@ -118,7 +122,8 @@ class SoundnessRecorder:
         liquid_jacobian_999 = 1.0
         if self._is_liquid.any():
             # the other tail: the start of the bin that holds it
-            liquid_jacobian_999 = _quantile(self._jacobian_counts, 0.001) - BIN
+            end_of_bin = _quantile(self._jacobian_counts, 0.001)
+            liquid_jacobian_999 = end_of_bin - BIN
         return FreeSurfaceSoundness(
             mach_999=round(_quantile(self._mach_counts, 0.999), 3),
             mach_max=self._mach_max,
@@ -130,37 +135,39 @@ class SoundnessRecorder:
             clamped_particles=self._count_clamped(least, greatest),
         )
 
-    def _count_clamped(
-        self, least: NDArray[np.float32], greatest: NDArray[np.float32]
-    ) -> int:
+    def _count_clamped(self, least: Singles, greatest: Singles) -> int:
         p = self._parameters
         # Jp at which the hardening factor meets its caps [1]
         stiffest = 1.0 - math.log(p.snow_hardening_max) / p.snow_hardening
         softest = 1.0 - math.log(p.snow_hardening_min) / p.snow_hardening
-        is_clamped_liquid = self._is_liquid & (least <= np.float32(p.jacobian_min))
-        lowest_plastic = np.float32(max(p.snow_jp_min, stiffest))
-        is_clamped_snow = self._is_snow & (
-            (least <= lowest_plastic) | (greatest >= np.float32(softest))
-        )
+        lowest_plastic = max(p.snow_jp_min, stiffest)
+
+        is_thin = least <= np.float32(p.jacobian_min)
+        is_hard = least <= np.float32(lowest_plastic)
+        is_soft = greatest >= np.float32(softest)
+        is_clamped_liquid = self._is_liquid & is_thin
+        is_clamped_snow = self._is_snow & (is_hard | is_soft)
         return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
 
 
 def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return how many values lie in each bin; the last one holds all that is beyond."""
-    index = np.minimum(values / BIN, _BIN_COUNT - 1).astype(np.int64)
+    place = np.minimum(values / BIN, _BIN_COUNT - 1)
+    index = place.astype(np.int64)
     return np.bincount(index, minlength=_BIN_COUNT)
 
 
 def _quantile(counts: NDArray[np.int64], share: float) -> float:
     """Return the end of the first bin up to which a share of the values lies."""
     cumulative = np.cumsum(counts)
-    index = int(np.searchsorted(cumulative, share * cumulative[-1]))
+    total = cumulative[-1]
+    index = int(np.searchsorted(cumulative, share * total))
     return (index + 1) * BIN
 
 
-def _least(values: NDArray[np.float32]) -> float:
+def _least(values: Singles) -> float:
     return float(values.min()) if values.size else 1.0
 
 
-def _greatest(values: NDArray[np.float32]) -> float:
+def _greatest(values: Singles) -> float:
     return float(values.max()) if values.size else 1.0

@@ -28,6 +28,7 @@ __all__ = [
     "Material",
     "SolverParameters",
     "SplitGenerator",
+    "liquid",
 ]
 
 
@@ -193,6 +194,11 @@ class InitialState:
             return program
         row: NDArray[np.float64] = program[min(frame, len(program) - 1)]
         return row
+
+
+def liquid(particle_count: int) -> NDArray[np.int8]:
+    """Return the material of particles that are all liquid, shape [particle]."""
+    return np.full(particle_count, Material.LIQUID, dtype=np.int8)
 
 
 class SplitGenerator(Protocol):
