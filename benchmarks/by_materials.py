@@ -48,7 +48,8 @@ def main() -> int:
     for method in options.methods:
         values_by_method[method] = read_values(size, method, metric)
 
-    kinds = np.array(read_kinds(size, resolve_root(options.root)))
+    root = resolve_root(options.root)
+    kinds = np.array(read_kinds(size, root))
     names, counts = np.unique(kinds, return_counts=True)
     heads = [metric]
     for name, count in zip(names, counts, strict=True):
@@ -58,7 +59,8 @@ def main() -> int:
     for method, values in values_by_method.items():
         cells = [method]
         for name in names:
-            mean = np.mean(values[kinds == name])
+            is_kind = kinds == name
+            mean = np.mean(values[is_kind])
             cells.append(f"{mean:.4f}")
         cells.append(f"{np.mean(values):.4f}")
         lines.append(cells)
@@ -70,32 +72,40 @@ def read_kinds(size: Size, root: Path) -> list[str]:
     """Return the materials of each test scenario, as in "liquid + snow"."""
     kinds = []
     for scenario in sorted(size.subsets["test"]):
-        with read_scenario(size.path(root, scenario)) as file:
+        path = size.path(root, scenario)
+        with read_scenario(path) as file:
             materials = np.unique(file.read("material"))
-        kinds.append(" + ".join(MATERIALS[material] for material in materials))
+        names = [MATERIALS[material] for material in materials]
+        kinds.append(" + ".join(names))
     return kinds
 
 
 def read_values(size: Size, method: str, metric: str) -> NDArray[np.float64]:
     """Return a metric of an entry, the mean over its seeds, shape [scenario]."""
     folder = BOARD / "scores" / size.split / size.name
-    files = sorted(folder.glob("*.nc"))
-    seed_files = [path for path in files if path.stem.rpartition("_")[0] == method]
+    seed_files = []
+    methods = set()
+    for path in sorted(folder.glob("*.nc")):
+        file_method, _, _ = path.stem.rpartition("_")
+        methods.add(file_method or path.stem)
+        if file_method == method:
+            seed_files.append(path)
     single_file = folder / f"{method}.nc"
     if single_file.is_file():
         seed_files = [single_file]
     if not seed_files:
-        names = sorted({path.stem.partition("_")[0] for path in files})
         raise UsageError(
             f"no entry {method!r} of {size.split} {size.name}",
             where="METHOD",
-            fix=suggest_name(method, names),
+            fix=suggest_name(method, sorted(methods)),
         )
     seeds = []
     for path in seed_files:
-        scores = read_published_scores(path).scores["submission"]
-        seeds.append(scores[metric].values)
-    return np.asarray(np.mean(seeds, axis=0))
+        published = read_published_scores(path)
+        score = published.scores["submission"][metric]
+        seeds.append(score.values)
+    mean = np.mean(seeds, axis=0)
+    return np.asarray(mean)
 
 
 if __name__ == "__main__":

@@ -51,23 +51,31 @@ def main() -> int:
             f"{speed:.4f} | {reversals} | {energy:.3e} |"
         )
 
-    distinct_parameters = len({row[:-1] for row in rows})
-    distinct_energies = len({row[-1] for row in rows})
-    alike_count = len(rows) - min(distinct_parameters, distinct_energies)
+    distinct_parameters = set()
+    distinct_energies = set()
+    for *parameters, energy in rows:
+        distinct_parameters.add(tuple(parameters))
+        distinct_energies.add(energy)
+    distinct_count = min(len(distinct_parameters), len(distinct_energies))
+    alike_count = len(rows) - distinct_count
     print(f"\n{len(rows)} scenarios, {alike_count} alike")
     return 1 if alike_count else 0
 
 
 def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
     frame_count = size.frame_count(scenario)
-    energy = []
-    with read_scenario(size.path(root, scenario)) as file:
+    energies = []
+    path = size.path(root, scenario)
+    with read_scenario(path) as file:
         parameters = file.header.parameters
         for frame in range(frame_count):
-            velocity = file.read("velocity", frame).astype(np.float64)
+            stored_velocity = file.read("velocity", frame)
+            velocity = stored_velocity.astype(np.float64)
             squared_speed = np.sum(velocity**2, axis=-1)
-            energy.append(0.5 * float(squared_speed.mean()))
-        wall_velocity = file.read("wall_velocity").astype(np.float64)
+            energy = 0.5 * float(squared_speed.mean())
+            energies.append(energy)
+        stored_walls = file.read("wall_velocity")
+    wall_velocity = stored_walls.astype(np.float64)
 
     # velocity components of the walls that move, shape [frame, component]
     components = wall_velocity.reshape(frame_count, -1)
@@ -75,11 +83,19 @@ def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
     moving = components[:, ever_moves]
     mean_square = np.mean(moving**2)
     speed = float(np.sqrt(mean_square))
-    sign_changes = np.diff(np.sign(moving), axis=0)
+    signs = np.sign(moving)
+    sign_changes = np.diff(signs, axis=0)
     reversals = int(np.count_nonzero(sign_changes))
-    mean_energy = float(np.mean(energy))
     wall, motion, reynolds, start = (parameters[name] for name in NAMES)
-    return (wall, motion, reynolds, start, speed, reversals, mean_energy)
+    return (
+        wall,
+        motion,
+        reynolds,
+        start,
+        speed,
+        reversals,
+        float(np.mean(energies)),
+    )
 
 
 if __name__ == "__main__":

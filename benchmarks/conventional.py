@@ -58,15 +58,22 @@ class ConventionalSquare(ConventionalFluid):
         top = WALLS.index("top")
         self.lid = float(state.wall_velocity[top, 0])
         side = parameters.grid + 1
-        mass = parameters.density * state.area / parameters.particles
-        super().__init__(parameters, state, nodes=(side, side), mass=mass)
-        self.inset = (self.low + 0.5 + 1e-3) * self.dx
+        fluid_mass = parameters.density * state.area
+        super().__init__(
+            parameters,
+            state,
+            nodes=(side, side),
+            mass=fluid_mass / parameters.particles,
+        )
+        inset_cells = self.low + 0.5 + 1e-3
+        self.inset = inset_cells * self.dx
 
     @ti.func
     def weights(self, x):
         """Return base node, offset in cells and quadratic B-spline weights."""
-        base = ti.cast(x * self.p.grid - 0.5, ti.i32)
-        f = x * self.p.grid - ti.cast(base, ti.f32)
+        cells = x * self.p.grid
+        base = ti.cast(cells - 0.5, ti.i32)
+        f = cells - ti.cast(base, ti.f32)
         return (base, f, self.spline(f))
 
     @ti.func
@@ -92,9 +99,10 @@ class ConventionalSquare(ConventionalFluid):
         """Add the mirror image of a ghost node to its interior node."""
         ghost_mass = self.m[ghost]
         wall_momentum = ti.Vector([2.0 * moved * ghost_mass, 0.0])
+        mirrored_momentum = flip * self.gv[ghost]
         self.m[inner] += ghost_mass
         self.q[inner] += self.q[ghost]
-        self.gv[inner] += flip * self.gv[ghost] + wall_momentum
+        self.gv[inner] += mirrored_momentum + wall_momentum
 
     @ti.kernel
     def substep(self):
@@ -133,7 +141,8 @@ class ConventionalSquare(ConventionalFluid):
             if mass > 0.0:
                 self.gv[i, k] /= mass
                 self.q[i, k] /= mass
-                self.m[i, k] = mass / (self.p.density * self.dx * self.dx)
+                rest_mass = self.p.density * self.dx * self.dx
+                self.m[i, k] = mass / rest_mass
             else:
                 self.q[i, k] = 1.0
         for k in range(self.first, self.high):
@@ -157,9 +166,12 @@ class ConventionalSquare(ConventionalFluid):
             gradient = ti.Vector([gradient_x, gradient_y])
 
             v = ti.static(self.gv)
-            neighbours = v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1]
-            laplacian = neighbours - 4.0 * v[i, k]
-            self.ga[i, k] = self.pressure * gradient + self.diffusion * laplacian
+            beside = v[i + 1, k] + v[i - 1, k]
+            above_and_below = v[i, k + 1] + v[i, k - 1]
+            laplacian = beside + above_and_below - 4.0 * v[i, k]
+            push = self.pressure * gradient
+            drag = self.diffusion * laplacian
+            self.ga[i, k] = push + drag
         for i, k in ti.ndrange(self.inside, self.inside):
             self.gv[i, k] += self.ga[i, k]
         for k in range(self.first, self.high):
@@ -217,11 +229,12 @@ class ConventionalSquare(ConventionalFluid):
             apart = offset - f
             weight = w[i][0] * w[k][1]
             carried = weight * self.gv[node]
+            node_density = weight * self.m[node]
             v += carried
             a += weight * self.ga[node]
             c += carried.outer_product(apart)
-            density += weight * self.m[node]
-            thinner += weight * self.m[node] * apart
+            density += node_density
+            thinner += node_density * apart
             smooth += weight * self.q[node]
         c *= 4.0 * self.p.grid
         density = ti.max(density, 0.5)
@@ -247,7 +260,10 @@ def main() -> int:
         log_level=ti.ERROR,
     )
     experiment = plan(
-        Case.CAVITY, reynolds=100.0, grid=options.grid, substeps=options.substeps
+        Case.CAVITY,
+        reynolds=100.0,
+        grid=options.grid,
+        substeps=options.substeps,
     )
     parameters = solver_parameters(experiment)
     state = initial_state(experiment)

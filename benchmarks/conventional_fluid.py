@@ -39,7 +39,9 @@ class ConventionalFluid:
         self.p = p
         self.dx = 1.0 / p.grid
         self.mass = mass
-        self.pressure = 0.5 * p.grid * p.dt * p.modulus / p.density
+        square_sound_speed = p.modulus / p.density
+        half_slope = 0.5 * p.grid  # of a difference over two cells
+        self.pressure = p.dt * half_slope * square_sound_speed
         self.diffusion = state.viscosity * p.dt * p.grid**2
 
         # Particles: position, velocity, affine velocity and J.
@@ -85,7 +87,8 @@ class ConventionalFluid:
         """
         # Particles move a little to where the matter is thinner.
         limit = 0.1 * self.dx
-        wanted_shift = -4.0 * self.p.shift * self.dx * thinner / density
+        relative_gradient = 4.0 * thinner / density  # per cell
+        wanted_shift = -self.p.shift * self.dx * relative_gradient
         shift = ti.math.clamp(wanted_shift, -limit, limit)
         moved = self.v[p] + a
         relaxation = self.p.velocity_relaxation * (v - moved)
@@ -93,7 +96,8 @@ class ConventionalFluid:
         self.c[p] = c
 
         old = self.j[p]
-        expanded = old * (1.0 + self.p.dt * c.trace())
+        divergence = c.trace()
+        expanded = old * (1.0 + self.p.dt * divergence)
         smoothing = self.p.jacobian_relaxation * (smooth - old)
         coupling = self.p.density_coupling * (1.0 / density - smooth)
         self.j[p] = expanded + smoothing + coupling

@@ -36,23 +36,33 @@ def main() -> int:
     print(HEADER)
     for size in options.size:
         for split in options.split:
-            before = _cpu_seconds()
+            cpu_start = _cpu_seconds()
             result = generate(
-                split, size, root=options.root, workers=options.workers, force=True
+                split,
+                size,
+                root=options.root,
+                workers=options.workers,
+                force=True,
             )
-            print(_row(result, _cpu_seconds() - before), flush=True)
+            cpu = _cpu_seconds() - cpu_start
+            print(_row(result, cpu), flush=True)
     return 0
 
 
 def _row(result: GenerationResult, cpu: float) -> str:
     size = load().size(result.split, result.size)
-    frames = sum(size.frame_count(i) for i in size.scenarios)
-    files = sum(path.stat().st_size for path in result.folder.rglob("*.nc"))
-    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1000
+    frame_count = 0
+    for scenario in size.scenarios:
+        frame_count += size.frame_count(scenario)
+    disk_bytes = 0
+    for path in result.folder.rglob("*.nc"):
+        disk_bytes += path.stat().st_size
+    workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+    largest = workers.ru_maxrss / 1000  # [MB]
     return (
-        f"| {result.split} | {result.size} | {len(size.scenarios)} | {frames} | "
+        f"| {result.split} | {result.size} | {len(size.scenarios)} | {frame_count} | "
         f"{result.seconds:.0f} "
-        f"| {cpu:.0f} | {largest:.0f} | {files / 1e6:.1f} |"
+        f"| {cpu:.0f} | {largest:.0f} | {disk_bytes / 1e6:.1f} |"
     )
 
 

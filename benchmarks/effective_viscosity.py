@@ -66,15 +66,18 @@ def _print_fits(name: str, fits: Sequence[ViscosityFit]) -> None:
             f"{name}, frequency {frequency}: nu = {viscosity:.2e} length^2/s, "
             f"{energy_share:.0%} of E left"
         )
-    viscosity = np.median([fit.viscosity for fit in fits])
-    energy_share = np.median([fit.energy_share for fit in fits])
+    all_viscosities = [fit.viscosity for fit in fits]
+    all_shares = [fit.energy_share for fit in fits]
+    viscosity = np.median(all_viscosities)
+    energy_share = np.median(all_shares)
     print(f"{name}: median nu = {viscosity:.2e} length^2/s, {energy_share:.0%} left")
 
 
 def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
     """Fit dE/dt = - nu * enstrophy to the energy E of a scenario."""
     task = size.task
-    grid = Grid(task.score_grid.cells, task.score_grid.placement)
+    score_grid = task.score_grid
+    grid = Grid(score_grid.cells, score_grid.placement)
     (low, high), _ = size.bounds
     area = (high - low) ** 2
     full_weight = grid.full_weight(size.particles, area)
@@ -84,15 +87,17 @@ def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
     path = size.path(root, scenario)
     with read_scenario(path) as file:
         for frame in range(frame_count):
-            position = file.read("position", frame).astype(np.float64)
-            velocity = file.read("velocity", frame).astype(np.float64)
+            stored_position = file.read("position", frame)
+            stored_velocity = file.read("velocity", frame)
+            position = stored_position.astype(np.float64)
+            velocity = stored_velocity.astype(np.float64)
             squared_speed = np.sum(velocity**2, axis=-1)
             energy = 0.5 * np.mean(squared_speed)
             energies.append(energy)
             node_fields = fields(position, velocity, grid, full=full_weight)
             enstrophy = np.nanmean(node_fields.vorticity**2)
             enstrophies.append(enstrophy)
-        frequency = int(file.header.parameters["frequency"])
+        parameters = file.header.parameters
 
     # integral of the enstrophy up to each frame, and the energy lost up to it
     interval = size.frame_interval
@@ -103,6 +108,7 @@ def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
     square = dissipation @ dissipation
     viscosity = float(product / square)
     energy_share = energies[-1] / initial_energy
+    frequency = int(parameters["frequency"])
     return ViscosityFit(frequency, viscosity, energy_share)
 
 

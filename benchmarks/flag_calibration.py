@@ -34,6 +34,8 @@ from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import Predictions, open_predictions
 
 Floats = NDArray[np.float64]
+Numbers = list[float]
+"""The numbers of a scenario, in the order of the columns."""
 
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 COLUMNS = ("autocorrelation", "drop", "shift_gain", "growth", "steps")
@@ -59,7 +61,8 @@ class CalibrationScenario:
         self.positions = positions[: self.end + 2]
         self.truth = positions[self.first : self.end]
         self.rng = np.random.Generator(np.random.PCG64(0))
-        displacement = np.diff(positions[: self.end], axis=0)
+        path = positions[: self.end]
+        displacement = np.diff(path, axis=0)
         mean_square = np.mean(displacement**2)
         self.step = float(np.sqrt(mean_square))  # [length/frame]
 
@@ -87,7 +90,13 @@ class CalibrationScenario:
         displacement = position - before
         return position, displacement
 
-    def extrapolate(self, first: int, count: int, decay: float = 1.0) -> Floats:
+    def extrapolate(
+        self,
+        first: int,
+        count: int,
+        *,
+        decay: float = 1.0,
+    ) -> Floats:
         """Return ``count`` frames at the velocity before absolute frame ``first``."""
         position, displacement = self.last_motion(first)
         frames = []
@@ -104,8 +113,12 @@ class CalibrationScenario:
         """
         position, displacement = self.last_motion(first)
         grid = self.scenario.config.grid
-        full = self.scenario.full_weight
-        grid_fields = fields(position, displacement, grid, full=full)
+        grid_fields = fields(
+            position,
+            displacement,
+            grid,
+            full=self.scenario.full_weight,
+        )
         node_velocity = grid_fields.velocity
         frames = []
         for _ in range(count):
@@ -187,7 +200,7 @@ def constant_velocity(test: CalibrationScenario) -> Floats:
 
 def decaying_velocity(test: CalibrationScenario) -> Floats:
     """Return motion at a velocity that loses 5 % per frame."""
-    return test.extrapolate(test.first, test.horizon, 0.95)
+    return test.extrapolate(test.first, test.horizon, decay=0.95)
 
 
 def fixed_field(test: CalibrationScenario) -> Floats:
@@ -221,6 +234,16 @@ def moving_average(test: CalibrationScenario) -> Floats:
     return (test.truth + before + after) / 3.0
 
 
+def jittered_field(test: CalibrationScenario) -> Floats:
+    """Return motion in the last given velocity field, with a jitter of 0.1 steps."""
+    return fixed_field(test) + 0.1 * test.noise()
+
+
+def noisy_truth(test: CalibrationScenario, steps: float) -> Floats:
+    """Return the truth with noise of so many steps."""
+    return test.truth + steps * test.noise()
+
+
 Predict = Callable[[CalibrationScenario], Floats]
 
 HONEST: Mapping[str, Predict] = {
@@ -228,15 +251,15 @@ HONEST: Mapping[str, Predict] = {
     "constant velocity": constant_velocity,
     "decaying velocity": decaying_velocity,
     "fixed field": fixed_field,
-    "fixed field, jitter": lambda test: fixed_field(test) + 0.1 * test.noise(),
+    "fixed field, jitter": jittered_field,
     "other scenario": other_scenario,
     "accurate, smooth": lambda test: drift(test, smooth=True),
     "accurate, white": lambda test: drift(test, smooth=False),
 }
 DISHONEST: Mapping[str, Predict] = {
-    "truth, noise of 0.01 steps": lambda test: test.truth + 0.01 * test.noise(),
-    "truth, noise of 1 step": lambda test: test.truth + test.noise(),
-    "truth, noise of 10 steps": lambda test: test.truth + 10.0 * test.noise(),
+    "truth, noise of 0.01 steps": lambda test: noisy_truth(test, 0.01),
+    "truth, noise of 1 step": lambda test: noisy_truth(test, 1.0),
+    "truth, noise of 10 steps": lambda test: noisy_truth(test, 10.0),
     "truth, offset of 1 step": lambda test: test.truth + test.step,
     "one step, constant velocity": lambda test: test.restart(1),
     "one step, fixed field": field_steps,
@@ -295,7 +318,9 @@ def open_trained(
 
 def read_positions(predictions: Predictions, scenario: int) -> Floats:
     """Return the predicted positions of a scenario, shape [frame, particle, 2]."""
-    blocks = [block for _, block in predictions.blocks(scenario)]
+    blocks = []
+    for _, block in predictions.blocks(scenario):
+        blocks.append(block)
     positions = np.concatenate(blocks)
     return positions.astype(float)
 
@@ -317,10 +342,11 @@ def main() -> int:
     print(f"{'prediction':32s} {'split':14s}{heads}  copy_suspect")
 
     tables = {"honest": HONEST, "made from the truth": DISHONEST}
-    all_numbers: dict[str, list[list[float]]] = {}
+    all_numbers: dict[str, list[Numbers]] = {}
     for kind in (*tables, "trained"):
         all_numbers[kind] = []
-    for split in options.splits.split(","):
+    splits = options.splits.split(",")
+    for split in splits:
         size = load().size(split, options.size)
         task = load_scored_task(size, root)
         tests = read_tests(task)
@@ -335,7 +361,8 @@ def main() -> int:
                 all_numbers[kind] += print_line(name, split, traces)
 
         print(f"-- {split} {options.size}, trained")
-        for name, predictions in open_trained(options.trained, split, options.size):
+        trained = open_trained(options.trained, split, options.size)
+        for name, predictions in trained:
             traces = []
             for number, test in tests.items():
                 predicted = read_positions(predictions, number)
@@ -349,7 +376,7 @@ def main() -> int:
     return 0
 
 
-def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
+def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[Numbers]:
     """Print the line of a prediction; return its numbers by scenario."""
     numbers = []
     for trace in traces:
@@ -363,7 +390,7 @@ def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[list[floa
     return numbers
 
 
-def numbers_of(trace: Trace) -> list[float]:
+def numbers_of(trace: Trace) -> Numbers:
     """Return the numbers of one scenario, in the order of the columns."""
     copy_evidence = analyse_error(trace)
     numbers = []

@@ -76,14 +76,17 @@ def _judge_frozen_field(size: Size, root: Path, each: bool) -> bool:
     correlations = []
     errors = []
     for scenario in size.subsets["test"]:
-        with read_scenario(size.path(root, scenario)) as file:
+        path = size.path(root, scenario)
+        with read_scenario(path) as file:
             correlation, error = _score_frozen_field(size, file, root)
             parameters = file.header.parameters
         correlations.append(correlation)
         errors.append(error)
         if each:
-            names = ("wall", "motion", "reynolds_number", "frequency")
-            kind = [parameters[name] for name in names if name in parameters]
+            kind = []
+            for name in ("wall", "motion", "reynolds_number", "frequency"):
+                if name in parameters:
+                    kind.append(parameters[name])
             print(
                 f"  {scenario}: correlation {correlation:.3f}, error {error:.3f}; "
                 f"{kind}",
@@ -113,7 +116,9 @@ def _score_frozen_field(
     """Return correlation at frame 54 and relative error over the horizon."""
     first = size.task.input_frames - 1
     last = first + size.task.horizon
-    truth = file.read("position", slice(0, last + 1)).astype(np.float64)
+    frames = slice(0, last + 1)
+    stored_truth = file.read("position", frames)
+    truth = stored_truth.astype(np.float64)
     given = given_in(file, size, root)
     box = size.box
     score_grid = size.task.score_grid
@@ -152,9 +157,11 @@ def _judge_activity(size: Size, root: Path, each: bool) -> bool:
     """Print the median of active frames of each pair or family, over all scenarios."""
     counts_by_kind = defaultdict(list)
     for scenario in size.scenarios:
-        with read_scenario(size.path(root, scenario)) as file:
+        path = size.path(root, scenario)
+        with read_scenario(path) as file:
             parameters = file.header.parameters
-        kind = parameters[KINDS[size.split]]
+        kind_name = KINDS[size.split]
+        kind = parameters[kind_name]
         active_frames = parameters["active_frames"]
         counts_by_kind[kind].append(active_frames)
         if each:

@@ -18,8 +18,11 @@ Graph = Mapping[str, set[str]]
 
 ImportStatement = ast.Import | ast.ImportFrom
 
+Modules = dict[str, Path]
+"""The file of each module, by its dotted name."""
 
-def package_modules(root: Path) -> dict[str, Path]:
+
+def package_modules(root: Path) -> Modules:
     """Return the file of every module of lagbench, by its dotted name.
 
     A package has the name of its folder.
@@ -39,11 +42,12 @@ def package_modules(root: Path) -> dict[str, Path]:
     return paths
 
 
-def list_modules(folder: Path, prefix: str) -> dict[str, Path]:
+def list_modules(folder: Path, prefix: str) -> Modules:
     """Return the file of every module below a folder, by its dotted name."""
     paths = {}
     for path in folder.rglob("*.py"):
-        parts = path.relative_to(folder).with_suffix("").parts
+        inner_path = path.relative_to(folder)
+        parts = inner_path.with_suffix("").parts
         name = ".".join((prefix, *parts))
         paths[name.removesuffix(".__init__")] = path
     return paths
@@ -77,15 +81,18 @@ def imported_names(name: str, path: Path, *, for_types: bool) -> Iterator[str]:
 @functools.cache
 def _import_statements(source: str) -> list[tuple[ImportStatement, bool]]:
     """Return the imports of a source, and whether only a type checker sees them."""
+    module = ast.parse(source)
     statements: list[tuple[ImportStatement, bool]] = []
-    pending: list[tuple[ast.AST, bool]] = [(ast.parse(source), False)]
+    pending: list[tuple[ast.AST, bool]] = [(module, False)]
     while pending:
         node, is_for_types = pending.pop()
         if isinstance(node, ast.Import | ast.ImportFrom):
             statements.append((node, is_for_types))
         elif _is_for_types(node):
-            pending += [(child, True) for child in node.body]
-            pending += [(child, is_for_types) for child in node.orelse]
+            for child in node.body:
+                pending.append((child, True))
+            for child in node.orelse:
+                pending.append((child, is_for_types))
         elif not isinstance(node, ast.expr):  # no expression holds a statement
             for child in ast.iter_child_nodes(node):
                 pending.append((child, is_for_types))
@@ -103,7 +110,9 @@ def _base_of(node: ast.ImportFrom, package_parts: list[str]) -> str:
     """Return the dotted name between ``from`` and ``import``, made absolute."""
     parts = []
     if node.level:
-        parts += package_parts[: len(package_parts) - node.level + 1]
+        # One dot names the package itself, each further one its parent.
+        part_count = len(package_parts) - node.level + 1
+        parts += package_parts[:part_count]
     if node.module:
         parts.append(node.module)
     return ".".join(parts)
@@ -130,10 +139,17 @@ def longest_chains(graph: Graph) -> dict[str, list[str]]:
     Raises:
         graphlib.CycleError: following imports leads back to a module.
     """
-    chains: dict[str, list[str]] = {}
     # sorted, so that of two chains of one length always the same is told
-    order = graphlib.TopologicalSorter({name: sorted(graph[name]) for name in graph})
+    imports = {}
+    for name in graph:
+        imports[name] = sorted(graph[name])
+    chains: dict[str, list[str]] = {}
+    order = graphlib.TopologicalSorter(imports)
     for name in order.static_order():
-        below = [chains[imported] for imported in sorted(graph[name])]
-        chains[name] = [name, *max(below, key=len, default=[])]
+        longest: list[str] = []
+        for imported in imports[name]:
+            chain = chains[imported]
+            if len(chain) > len(longest):
+                longest = chain
+        chains[name] = [name, *longest]
     return chains

@@ -13,6 +13,7 @@ into `inference_cost.md` there. The solver's exponents are in table_3_1.py's tab
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import time
 from pathlib import Path
@@ -46,7 +47,8 @@ def make_dataset_info(q: int) -> DatasetInfo:
     statistics_by_name = {}
     if size.measured:
         for name, (x, y) in size.measured.statistics.items():
-            statistics_by_name[name] = (float(x), float(y))
+            components = (float(x), float(y))
+            statistics_by_name[name] = components
     task = size.task
     return DatasetInfo(
         split=SPLIT,
@@ -72,11 +74,13 @@ def make_given_frames(info: DatasetInfo) -> Batch:
     There is one particle in each cell of a lattice.
     """
     count = info.particles
-    side = int(np.ceil(np.sqrt(count)))
+    even_side = math.sqrt(count)
+    side = math.ceil(even_side)
     axis = np.arange(side)
     coordinates = np.meshgrid(axis, axis, indexing="ij")
-    cells = np.stack(coordinates, axis=-1)
-    cells = cells.reshape(-1, 2)[:count]
+    lattice = np.stack(coordinates, axis=-1)
+    all_cells = lattice.reshape(-1, 2)
+    cells = all_cells[:count]
     rng = np.random.default_rng(0)
     offset = rng.random((count, 2))
     # positions in a box of side 1, shape [particle, 2]
@@ -88,7 +92,8 @@ def make_given_frames(info: DatasetInfo) -> Batch:
     speed = info.statistics["velocity_std"][0]
     velocity = 2.0 * speed * unit_velocity
     low, high = np.transpose(info.bounds)
-    first = low + (high - low) * unit_position
+    extent = high - low
+    first = low + extent * unit_position
     frames = []
     for step in range(info.input_frames):
         frame = first + step * velocity
@@ -108,7 +113,8 @@ def measure_milliseconds(name: str, q: int) -> float:
     """Return the median processor time of a frame of a model."""
     info = make_dataset_info(q)
     entry = find(name)
-    options = dict(recipe_for(entry, SPLIT, SIZE).model)
+    recipe = recipe_for(entry, SPLIT, SIZE)
+    options = dict(recipe.model)
     if "cells" in options:
         options["cells"] *= q
     torch.manual_seed(0)
@@ -120,7 +126,8 @@ def measure_milliseconds(name: str, q: int) -> float:
         start = time.process_time()
         roll_out(model, given_frames, FRAMES)
         seconds = time.process_time() - start
-        milliseconds.append(1e3 * seconds / FRAMES)
+        seconds_per_frame = seconds / FRAMES
+        milliseconds.append(1e3 * seconds_per_frame)
     return statistics.median(milliseconds)
 
 
@@ -133,23 +140,31 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="folder of the table")
     options = parser.parse_args()
     first, _, last = options.rows.partition("-")
-    rows = range(int(first), int(last or first) + 1)
+    first_q = int(first)
+    last_q = int(last or first)
+    rows = range(first_q, last_q + 1)
     torch.set_num_threads(1)
 
     counts = PARTICLES * np.square(rows)
-    times = {}
+    times: dict[str, list[float]] = {}  # [ms]
     for name in MODELS:
-        times[name] = [measure_milliseconds(name, q) for q in rows]
+        times[name] = []
+        for q in rows:
+            milliseconds = measure_milliseconds(name, q)
+            times[name].append(milliseconds)
     lines = []
     for i, q in enumerate(rows):
         cells = [str(q), f"{counts[i]:,}"]
         for name in MODELS:
-            cells.append(f"{times[name][i]:.3g}")
+            milliseconds = times[name][i]
+            cells.append(f"{milliseconds:.3g}")
         lines.append(cells)
     if len(rows) > 1:
+        log_counts = np.log(counts)
         exponents = []
         for name in MODELS:
-            slope, _ = np.polyfit(np.log(counts), np.log(times[name]), 1)
+            log_times = np.log(times[name])
+            slope, _ = np.polyfit(log_counts, log_times, 1)
             exponents.append(f"{slope:.2f}")
         lines.append(["", "exponent", *exponents])
     caption = (
@@ -158,10 +173,13 @@ def main() -> int:
         "holds 2,000 q^2 particles; q is the factor of resolution along each axis. The "
         "time grows as a power of their number; the last row has the exponent."
     )
-    text = f"{caption}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
+    heads = ("q", "particles", *MODELS)
+    table = markdown(heads, lines)
+    text = f"{caption}\n\n{table}\n"
     print(text)
     if options.output:
-        (options.output / "inference_cost.md").write_text(text, encoding="utf-8")
+        path = options.output / "inference_cost.md"
+        path.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -38,7 +38,9 @@ OWN_LOCALS = 0x02  # flag of code objects of functions; class bodies lack it
 
 def trace_command(words: list[str]) -> Counter[Path]:
     """Run a command; return how many functions ran in each file of the package."""
-    package_files = {path.resolve() for path in MODULES.values()}
+    package_files = set()
+    for path in MODULES.values():
+        package_files.add(path.resolve())
     real_paths: dict[str, Path] = {}
     functions: set[tuple[Path, int]] = set()
     modules_at_import = 0  # modules that are being imported, each by the one before
@@ -48,17 +50,24 @@ def trace_command(words: list[str]) -> Counter[Path]:
         nonlocal modules_at_import
         code = frame.f_code
         if code.co_name == "<module>":
-            modules_at_import += {"call": 1, "return": -1}.get(event, 0)
+            if event == "call":
+                modules_at_import += 1
+            elif event == "return":
+                modules_at_import -= 1
         is_named = not code.co_name.startswith("<")  # as <module> and <lambda>
         if event != "call" or not is_named or modules_at_import:
             return
-        if code.co_filename not in real_paths:
-            real_paths[code.co_filename] = Path(os.path.realpath(code.co_filename))
-        file = real_paths[code.co_filename]
+        path = code.co_filename
+        if path not in real_paths:
+            real_path = os.path.realpath(path)
+            real_paths[path] = Path(real_path)
+        file = real_paths[path]
         if file in package_files and code.co_flags & OWN_LOCALS:
-            functions.add((file, code.co_firstlineno))
+            function = (file, code.co_firstlineno)
+            functions.add(function)
 
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+    output = io.StringIO()
+    with redirect_stdout(output), redirect_stderr(output):
         sys.setprofile(watch)
         try:
             app(words, standalone_mode=False)
@@ -79,8 +88,10 @@ def count_comments(text: str) -> int:
 def print_files(name: str, functions: Counter[Path]) -> None:
     """Print the files of a command, each with the number of functions that ran."""
     print(f"\n{name}")
+    clone = CLONE.resolve()
     for file in sorted(functions):
-        print(f"  {functions[file]:4d}  {file.relative_to(CLONE.resolve())}")
+        inner_path = file.relative_to(clone)
+        print(f"  {functions[file]:4d}  {inner_path}")
 
 
 def main() -> int:
@@ -110,9 +121,10 @@ def main() -> int:
     too_long = []
     print("| command | files | functions | at most |\n|---|---:|---:|---:|")
     for name, functions in traces.items():
+        file_count = len(functions)
         most_files = MOST_FILES.get(name, "")
-        print(f"| `{name}` | {len(functions)} | {functions.total()} | {most_files} |")
-        if len(functions) > MOST_FILES.get(name, len(functions)):
+        print(f"| `{name}` | {file_count} | {functions.total()} | {most_files} |")
+        if file_count > MOST_FILES.get(name, file_count):
             too_long.append(name)
 
     line_count = 0
@@ -122,7 +134,8 @@ def main() -> int:
         line_count += text.count("\n")
         comment_count += count_comments(text)
     comments_per_100 = 100 * comment_count / line_count
-    chains = longest_chains(import_graph(MODULES, for_types=True))
+    graph = import_graph(MODULES, for_types=True)
+    chains = longest_chains(graph)
     chain = max(chains.values(), key=len)
     print(
         f"\n{len(MODULES)} files, {line_count} lines, {comments_per_100:.1f} comments "

@@ -65,6 +65,9 @@ GOLDEN_RATIO = 0.6180339887498949  # the smaller one; its multiples spread evenl
 
 Choice = Mapping[str, float]
 Clouds = dict[int, Floats]  # positions by frame [length], each [particle, axis]
+Kinds = tuple[int, ...]  # numbers of materials
+Materials = NDArray[np.int8]  # material of each particle, shape [particle]
+PartnerPath = Callable[..., Floats]  # from frames on to positions [member, axis]
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ class AnalogCase:
     thinning: int  # every so many particles are predicted
 
     @property
-    def material(self) -> NDArray[np.int8]:
+    def material(self) -> Materials:
         """Materials of the predicted particles, shape [particle]."""
         return self.given.material[:: self.thinning]
 
@@ -159,7 +162,7 @@ def quantiles(values: Floats) -> Floats:
 def describe(
     position: Floats,
     velocity: Floats,
-    material: NDArray[np.int8],
+    material: Materials,
     kinds: Sequence[int],
     velocity_weight: float,
 ) -> Floats:
@@ -171,8 +174,9 @@ def describe(
         weight = math.sqrt(share)
         position_levels = quantiles(position[members])
         velocity_levels = quantiles(velocity[members])
+        weight_of_velocity = weight * velocity_weight
         parts.append(weight * position_levels)
-        parts.append(weight * velocity_weight * velocity_levels)
+        parts.append(weight_of_velocity * velocity_levels)
     return np.concatenate(parts)
 
 
@@ -185,19 +189,24 @@ class Library:
         self.mirrors: tuple[Mirror, ...] = mirrors_of(size)
         self._states: dict[tuple[object, ...], States | None] = {}
 
-    def motion(self, state: State) -> tuple[Floats, NDArray[np.int8]]:
+    def motion(self, state: State) -> tuple[Floats, Materials]:
         """Return the mirrored positions of a scenario [length], and its materials."""
         return self._image(state.scenario, state.mirror)
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - one library lives as long as the run
-    def _image(self, scenario: int, mirror: int) -> tuple[Floats, NDArray[np.int8]]:
+    def _image(self, scenario: int, mirror: int) -> tuple[Floats, Materials]:
         path = self.size.path(self.root, scenario)
         train = read_train_scenario(path)
-        image = self.mirrors[mirror].positions(train.position)
+        reflection = self.mirrors[mirror]
+        image = reflection.positions(train.position)
         return image, train.material
 
     def states(
-        self, kinds: tuple[int, ...], velocity_weight: float, *, is_exact: bool
+        self,
+        kinds: Kinds,
+        velocity_weight: float,
+        *,
+        is_exact: bool,
     ) -> States | None:
         """Return the states of scenarios that have some materials; None without any.
 
@@ -213,7 +222,11 @@ class Library:
         return self._states[key]
 
     def _build(
-        self, kinds: tuple[int, ...], velocity_weight: float, *, is_exact: bool
+        self,
+        kinds: Kinds,
+        velocity_weight: float,
+        *,
+        is_exact: bool,
     ) -> States | None:
         box = self.size.box
         states = []
@@ -233,7 +246,11 @@ class Library:
                     position = image[frame]
                     velocity = box.displacement(before, position)
                     feature = describe(
-                        position, velocity, material, kinds, velocity_weight
+                        position,
+                        velocity,
+                        material,
+                        kinds,
+                        velocity_weight,
                     )
                     features.append(feature)
                     state = State(scenario, mirror, frame)
@@ -244,7 +261,11 @@ class Library:
 
 
 def nearest(
-    states: States, feature: Floats, *, count: int, without: int | None
+    states: States,
+    feature: Floats,
+    *,
+    count: int,
+    without: int | None,
 ) -> tuple[list[State], list[float]]:
     """Return the nearest states and their distances.
 
@@ -282,12 +303,16 @@ class Predictors:
     def __init__(self, library: Library) -> None:
         self.library = library
 
-    def _kinds(self, case: AnalogCase) -> tuple[int, ...]:
+    def _kinds(self, case: AnalogCase) -> Kinds:
         kinds = np.unique(case.given.material)
         return tuple(kinds.tolist())
 
     def _compare(
-        self, case: AnalogCase, steps: int, choice: Choice, kinds: tuple[int, ...]
+        self,
+        case: AnalogCase,
+        steps: int,
+        choice: Choice,
+        kinds: Kinds,
     ) -> tuple[list[State], list[float]]:
         """Return the analogs of the state after some frames of flight."""
         weight = float(choice.get("velocity_weight", 20.0))
@@ -306,14 +331,18 @@ class Predictors:
         state: State,
         position: Floats,
         members: NDArray[np.intp],
-    ) -> Callable[[int], Floats]:
-        """Return the way of the members' partners: frames on to [member, axis]."""
+    ) -> PartnerPath:
+        """Return the way of the members' partners."""
         image, material = self.library.motion(state)
         own_position = position[members]
         own_material = case.material[members]
         image_position = image[state.frame]
         partner = assign_particles(
-            own_position, image_position, own_material, material, case.given.box
+            own_position,
+            image_position,
+            own_material,
+            material,
+            case.given.box,
         )
         offset = own_position - image_position[partner]
         last_frame = len(image) - 1
@@ -330,7 +359,7 @@ class Predictors:
         self,
         case: AnalogCase,
         flown: int,
-        follow: Callable[[int], Floats],
+        follow: PartnerPath,
     ) -> Clouds:
         """Return free flight, then what a function of the frames since then gives."""
         box = case.given.box
@@ -357,8 +386,9 @@ class Predictors:
         kinds = self._kinds(case)
         states, _ = self._compare(case, flown, choice, kinds)
         followers = []
+        everybody = np.arange(len(position))
         for number, state in enumerate(states):
-            members = np.arange(number, len(position), len(states))
+            members = everybody[number :: len(states)]
             path = self._paths(case, state, position, members)
             followers.append((members, path))
         fading = float(choice.get("fading", 0.95))
@@ -386,7 +416,8 @@ class Predictors:
         upper_ends = np.cumsum(weights)
         # low discrepancy: every stretch of particles has the same shares
         numbers = np.arange(len(position))
-        place = np.mod(numbers * GOLDEN_RATIO, 1.0)
+        multiples = numbers * GOLDEN_RATIO
+        place = np.mod(multiples, 1.0)
         owner = np.searchsorted(upper_ends, place)
         owner = np.minimum(owner, len(states) - 1)
         followers = []
@@ -442,8 +473,9 @@ class Predictors:
         position, _ = case.flown(flown)
         followers = []
         for kind in self._kinds(case):
+            kinds = (kind,)
             of_kind = np.flatnonzero(case.material == kind)
-            states, _ = self._compare(case, flown, choice, (kind,))
+            states, _ = self._compare(case, flown, choice, kinds)
             for number, state in enumerate(states):
                 members = of_kind[number :: len(states)]
                 path = self._paths(case, state, position, members)
@@ -471,7 +503,7 @@ class Predictors:
         position, velocity = case.flown(flown)
         everybody = np.arange(len(position))
         start = flown
-        path: Callable[[int], Floats] | None = None
+        path: PartnerPath | None = None
         box = case.given.box
         clouds = {}
         for frame in case.frames:
@@ -486,9 +518,13 @@ class Predictors:
                     velocity = position - before
                     start += window
                 feature = describe(position, velocity, case.material, kinds, weight)
-                analogs, _ = nearest(states, feature, count=1, without=case.without)
-                analog = analogs[0]
-                path = self._paths(case, analog, position, everybody)
+                analogs, _ = nearest(
+                    states,
+                    feature,
+                    count=1,
+                    without=case.without,
+                )
+                path = self._paths(case, analogs[0], position, everybody)
             cloud = path(steps - start)
             clouds[frame] = box.inside(cloud)
         return clouds
@@ -513,8 +549,9 @@ class Predictors:
         count = int(choice["analogs"])
         chosen, _ = nearest(starts, feature, count=count, without=case.without)
         followers = []
+        everybody = np.arange(len(position))
         for number, state in enumerate(chosen):
-            members = np.arange(number, len(position), len(chosen))
+            members = everybody[number :: len(chosen)]
             path = self._paths(case, state, position, members)
             followers.append((members, path))
 
@@ -546,10 +583,8 @@ class Predictors:
             velocity = velocity + given.fall * has_fallen
             velocity = velocity * (1.0 - friction * has_touched)
             position = position + velocity
-            for axis in range(position.shape[1]):
-                is_below = position[:, axis] < low[axis]
-                is_above = position[:, axis] > high[axis]
-                velocity[is_below | is_above, axis] *= -bounce
+            is_beyond = (position < low) | (position > high)
+            velocity[is_beyond] *= -bounce
             position = np.clip(position, low, high)
             if frame in wanted:
                 clouds[frame] = position.copy()
@@ -592,7 +627,8 @@ class Predictors:
         The shape is [particle, axis]; materials are those of the case.
         """
         particles = len(case.material)
-        climate = np.empty((particles, case.given.box.dimension))
+        dimension = case.given.box.dimension
+        climate = np.empty((particles, dimension))
         for kind in self._kinds(case):
             clouds = []
             for state in images:
@@ -604,8 +640,9 @@ class Predictors:
             train_particles = np.concatenate(clouds)
 
             members = np.flatnonzero(case.material == kind)
-            numbers = np.arange(len(members))
-            drawn = numbers * len(train_particles) // len(members)
+            count = len(members)
+            numbers = np.arange(count)
+            drawn = numbers * len(train_particles) // count
             climate[members] = train_particles[drawn]
         return climate
 
@@ -622,8 +659,10 @@ def _share_since_flight(case: AnalogCase, frame: int, choice: Choice) -> float:
     """Return how far a prediction is drawn to a target: more with time since flight."""
     most = float(choice["most"])
     time_scale = float(choice["time"])  # [frame]
-    frames_since = max(0, case.steps(frame) - case.flight)
-    return most * -math.expm1(-frames_since / time_scale)
+    steps = case.steps(frame)
+    frames_since = max(0, steps - case.flight)
+    share = -math.expm1(-frames_since / time_scale)
+    return most * share
 
 
 def _weights(distances: Sequence[float], sharpness: float) -> Floats:
@@ -635,7 +674,7 @@ def _weights(distances: Sequence[float], sharpness: float) -> Floats:
     return np.asarray(weights / total)
 
 
-def _matched(here: Floats, there: Floats, material: NDArray[np.int8]) -> Floats:
+def _matched(here: Floats, there: Floats, material: Materials) -> Floats:
     """Return the other cloud in the order in which it lies nearest to this one."""
     partner = assign_particles(here, there, material, material)
     return np.asarray(there[partner])
@@ -656,8 +695,10 @@ def _pool(case: AnalogCase) -> Floats:
     number = np.arange(count)
     column = number % columns
     row = number // columns
-    x = low[0] + width * (column + 0.5) / columns
-    y = low[1] + height * (row + 0.5) / rows
+    from_left = width * (column + 0.5) / columns
+    from_floor = height * (row + 0.5) / rows
+    x = low[0] + from_left
+    y = low[1] + from_floor
     return np.stack([x, y], axis=1)
 
 
@@ -675,27 +716,41 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
             name="offset",
             what="the same; the offset from the partner fades at other rates",
             predict=own.shared,
-            choices=grid(lag=(0, 10), analogs=(1, 2), fading=(0.8, 0.9, 0.98, 1.0)),
+            choices=grid(
+                lag=(0, 10),
+                analogs=(1, 2),
+                fading=(0.8, 0.9, 0.98, 1.0),
+            ),
         ),
         Attempt(
             name="velocities",
             what="the same; velocities count less or more when states are compared",
             predict=own.shared,
             choices=grid(
-                lag=(0, 10), analogs=(1, 2), velocity_weight=(0.0, 5.0, 10.0, 40.0)
+                lag=(0, 10),
+                analogs=(1, 2),
+                velocity_weight=(0.0, 5.0, 10.0, 40.0),
             ),
         ),
         Attempt(
             name="weighted",
             what="mixture of k analogs; nearer ones get more particles",
             predict=own.weighted,
-            choices=grid(lag=(0, 10), analogs=(2, 4, 8), sharpness=(1.0, 3.0)),
+            choices=grid(
+                lag=(0, 10),
+                analogs=(2, 4, 8),
+                sharpness=(1.0, 3.0),
+            ),
         ),
         Attempt(
             name="barycentre",
             what="Wasserstein mean of k analogs, matched anew at every frame",
             predict=own.barycentre,
-            choices=grid(lag=(0, 10), analogs=(2, 3, 5), sharpness=(0.0, 2.0)),
+            choices=grid(
+                lag=(0, 10),
+                analogs=(2, 3, 5),
+                sharpness=(0.0, 2.0),
+            ),
         ),
         Attempt(
             name="per-material",
@@ -713,7 +768,10 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
             name="from-the-start",
             what="mixture of the k scenarios that start most alike",
             predict=own.from_the_start,
-            choices=grid(analogs=(1, 2, 4, 8), velocity_weight=(0.0, 20.0, 60.0)),
+            choices=grid(
+                analogs=(1, 2, 4, 8),
+                velocity_weight=(0.0, 20.0, 60.0),
+            ),
         ),
         Attempt(
             name="damped",
@@ -726,7 +784,10 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
             what="ballistic-analog, drawn towards a flat pool",
             predict=own.to_the_pool,
             choices=grid(
-                lag=(0, 10), analogs=(2,), most=(0.2, 0.5), time=(50.0, 200.0)
+                lag=(0, 10),
+                analogs=(2,),
+                most=(0.2, 0.5),
+                time=(50.0, 200.0),
             ),
         ),
         Attempt(
@@ -734,7 +795,10 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
             what="ballistic-analog, drawn towards the mean cloud of train",
             predict=own.with_climatology,
             choices=grid(
-                lag=(0, 10), analogs=(2,), most=(0.2, 0.5), time=(50.0, 200.0)
+                lag=(0, 10),
+                analogs=(2,),
+                most=(0.2, 0.5),
+                time=(50.0, 200.0),
             ),
         ),
     )
@@ -772,15 +836,20 @@ def cases_of_train(size: Size, root: Path) -> dict[int, AnalogCase]:
         with read_scenario(path) as file:
             given = given_in(file, size, root)
         active = active_frames(path)
-        frames = measured_frames(size, CHOSEN_EVERY, active)
         cases[scenario] = AnalogCase(
-            given=given, frames=frames, without=scenario, thinning=THINNING
+            given=given,
+            frames=measured_frames(size, CHOSEN_EVERY, active),
+            without=scenario,
+            thinning=THINNING,
         )
     return cases
 
 
 def error_on_train(
-    cases: Mapping[int, AnalogCase], library: Library, attempt: Attempt, choice: Choice
+    cases: Mapping[int, AnalogCase],
+    library: Library,
+    attempt: Attempt,
+    choice: Choice,
 ) -> float:
     """Return the mean distance of clouds when scenarios of train predict each other."""
     errors = []
@@ -790,15 +859,20 @@ def error_on_train(
         truth, _ = library.motion(unmirrored)
         frame_errors = []
         for frame in case.frames:
-            true_cloud = truth[frame][::THINNING]
-            error = cloud_distance_by_material(clouds[frame], true_cloud, case.material)
+            error = cloud_distance_by_material(
+                clouds[frame],
+                truth[frame, ::THINNING],
+                case.material,
+            )
             frame_errors.append(error)
         errors.append(float(np.mean(frame_errors)))
     return float(np.mean(errors))
 
 
 def cloud_distance_by_material(
-    cloud: Floats, true_cloud: Floats, material: NDArray[np.int8]
+    cloud: Floats,
+    true_cloud: Floats,
+    material: Materials,
 ) -> float:
     """Return the sliced Wasserstein-2 distance of two clouds [length].
 
@@ -813,17 +887,28 @@ def cloud_distance_by_material(
     return error
 
 
-def score_on_test(size: Size, root: Path, attempt: Attempt, choice: Choice) -> float:
+def score_on_test(
+    size: Size,
+    root: Path,
+    attempt: Attempt,
+    choice: Choice,
+) -> float:
     """Return the ranking metric on test."""
     task = load_scored_task(size, root, is_hashed=True)
     frames = measured_frames(size, MEASURED_EVERY, None)
     first = size.task.input_frames
-    horizon = range(first, first + size.task.horizon)
+    end = first + size.task.horizon
+    horizon = range(first, end)
     tallies = {}
     for scenario in task.scenarios:
         with task.opened(scenario) as truth:
             given = given_in(truth.file, size, root)
-        case = AnalogCase(given=given, frames=frames, without=None, thinning=1)
+        case = AnalogCase(
+            given=given,
+            frames=frames,
+            without=None,
+            thinning=1,
+        )
         clouds = attempt.predict(case, choice)
         shape = (len(horizon), *given.last.shape)
         position = np.empty(shape, np.float32)
@@ -851,7 +936,8 @@ def baseline_score(size: Size) -> float:
     references = shipped(size)
     if references is None:
         raise ValueError(f"{size.split} {size.name}: nothing was shipped")
-    return references[BASELINE].scores[METRIC].mean
+    scores = references[BASELINE].scores
+    return scores[METRIC].mean
 
 
 def run(

@@ -42,9 +42,11 @@ def main() -> None:
     """Print the processor time of a frame of both, and how far they differ."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--root", type=Path)
-    root = resolve_root(parser.parse_args().root)
+    options = parser.parse_args()
+    root = resolve_root(options.root)
     size = load().size("cavity", "mini")
-    scenario_file = size.path(root, size.subsets["test"][0])
+    first_scenario = size.subsets["test"][0]
+    scenario_file = size.path(root, first_scenario)
     names = readme_model()
     with tempfile.TemporaryDirectory() as folder:
         path = export_onnx(
@@ -63,15 +65,22 @@ def main() -> None:
             rollout = model.roll_out(scenario_file)
             onnx_seconds.append(rollout.seconds)
             started = time.process_time()
-            _, expected = next(
-                predict(names["step"], "cavity", size="mini", history=2, root=root)
+            predictions = predict(
+                names["step"],
+                "cavity",
+                size="mini",
+                history=2,
+                root=root,
             )
+            _, expected = next(predictions)
             torch_seconds.append(time.process_time() - started)
     frames = size.task.horizon
+    onnx_milliseconds = 1e3 * min(onnx_seconds)
+    torch_milliseconds = 1e3 * min(torch_seconds)
     difference = np.abs(rollout.position - expected).max()
     sys.stdout.write(
-        f"ONNX {1e3 * min(onnx_seconds) / frames:.2f} ms per frame, "
-        f"PyTorch {1e3 * min(torch_seconds) / frames:.2f} ms, "
+        f"ONNX {onnx_milliseconds / frames:.2f} ms per frame, "
+        f"PyTorch {torch_milliseconds / frames:.2f} ms, "
         f"positions within {difference:.1e} after {frames} frames\n"
     )
 

@@ -25,8 +25,9 @@ def spent(root: Path | None, split: str, size: str, *, files: int, count: int) -
     """Return the processor time of so many windows with so many files kept open [s]."""
     windows.OPEN_FILES = files
     data = WindowDataset(split, size=size, root=root, history=1, future=1)
+    sampler = WindowSampler(data, seed=0)
     start = time.process_time()
-    for drawn, index in enumerate(WindowSampler(data, seed=0), 1):
+    for drawn, index in enumerate(sampler, 1):
         data[index]
         if drawn == count:
             break
@@ -44,7 +45,8 @@ def main() -> int:
     parser.add_argument("--windows", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
-    scenarios = len(load().size(options.split, options.size).subsets["train"])
+    size = load().size(options.split, options.size)
+    scenarios = len(size.subsets["train"])
     if scenarios <= FEW:
         parser.error(
             f"{options.split} {options.size} trains on {scenarios} scenarios: name a "

@@ -81,18 +81,21 @@ def step_seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:
     stride = len(data) // (STEPS * batch)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     generator = torch.Generator().manual_seed(0)
+    is_rounded = uses_bfloat16(recipe)
     seconds = []
     for step in range(STEPS):
         samples = []
         for place in range(batch):
-            samples.append(data[(step + STEPS * place) * stride])
+            number = step + STEPS * place
+            samples.append(data[number * stride])
         windows = collate(samples)
         start = time.process_time()
-        with torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16(recipe)):
+        with torch.autocast("cpu", torch.bfloat16, enabled=is_rounded):
             raw_terms = model(windows, generator)
         weighted_terms = []
         for name, value in raw_terms.items():
-            weighted_terms.append(model.weights.get(name, 1.0) * value)
+            weight = model.weights.get(name, 1.0)
+            weighted_terms.append(weight * value)
         loss = torch.stack(weighted_terms).sum()
         optimizer.zero_grad()
         loss.backward()
@@ -120,9 +123,10 @@ def main() -> int:
     for split in options.split:
         info = read_dataset_info(split, options.size, root=options.root)
         for name in options.operator:
-            recipe = recipe_for(find(name), split, options.size, variant=options.recipe)
+            entry = find(name)
+            recipe = recipe_for(entry, split, options.size, variant=options.recipe)
             torch.manual_seed(0)
-            model = find(name).model.build(recipe.model, info)
+            model = entry.model.build(recipe.model, info)
             data = WindowDataset(
                 split,
                 size=options.size,
@@ -130,15 +134,15 @@ def main() -> int:
                 history=model.history,
                 future=model.future,
             )
-            terms = mean_terms(recipe, model, data)
-            term_list = ", ".join(
-                f"{term} {value:.2g}" for term, value in terms.items()
-            )
+            terms = []
+            for term, value in mean_terms(recipe, model, data).items():
+                terms.append(f"{term} {value:.2g}")
             cost = step_seconds(recipe, model, data)
             count = recipe.training.steps or 0
+            minutes = count * cost / 60
             print(
-                f"| {split} | {name} | {term_list} | {cost:.3f} | {count} | "
-                f"{count * cost / 60:.1f} |",
+                f"| {split} | {name} | {', '.join(terms)} | {cost:.3f} | {count} | "
+                f"{minutes:.1f} |",
                 flush=True,
             )
     return 0

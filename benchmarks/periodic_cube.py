@@ -46,9 +46,11 @@ class ConventionalCube(ConventionalFluid):
     def __init__(self, parameters: FullBoxParameters, state: InitialState) -> None:
         """Take the memory and load the particles."""
         self.n = parameters.grid
-        nodes = (self.n, self.n, self.n)
         super().__init__(
-            parameters, state, nodes=nodes, mass=1.0 / parameters.particles
+            parameters,
+            state,
+            nodes=(self.n, self.n, self.n),
+            mass=1.0 / parameters.particles,
         )
 
     @ti.func
@@ -103,15 +105,20 @@ class ConventionalCube(ConventionalFluid):
                 neighbour = self.wrapped(node + offset)
                 q = self.q[neighbour]
                 near = ti.static([0.125, 0.75, 0.125])
+                near_x = ti.static(near[i + 1])
+                near_y = ti.static(near[j + 1])
+                near_z = ti.static(near[k + 1])
                 if ti.static(i != 0):
-                    gradient[0] += i * near[j + 1] * near[k + 1] * q
+                    gradient[0] += i * near_y * near_z * q
                 if ti.static(j != 0):
-                    gradient[1] += j * near[i + 1] * near[k + 1] * q
+                    gradient[1] += j * near_x * near_z * q
                 if ti.static(k != 0):
-                    gradient[2] += k * near[i + 1] * near[j + 1] * q
-                if ti.static(i * i + j * j + k * k == 1):
+                    gradient[2] += k * near_x * near_y * q
+                if ti.static(abs(i) + abs(j) + abs(k) == 1):
                     laplacian += self.gv[neighbour]
-            self.ga[node] = self.pressure * gradient + self.diffusion * laplacian
+            push = self.pressure * gradient
+            drag = self.diffusion * laplacian
+            self.ga[node] = push + drag
         for node in ti.grouped(self.m):
             self.gv[node] += self.ga[node]
         for p in self.x:
@@ -133,11 +140,12 @@ class ConventionalCube(ConventionalFluid):
             node = self.wrapped(base + offset)
             weight = w[i][0] * w[j][1] * w[k][2]
             carried = weight * self.gv[node]
+            node_density = weight * self.m[node]
             v += carried
             a += weight * self.ga[node]
             c += carried.outer_product(apart)
-            density += weight * self.m[node]
-            thinner += weight * self.m[node] * apart
+            density += node_density
+            thinner += node_density * apart
             smooth += weight * self.q[node]
         c *= 4.0 * self.n
         density = ti.max(density, 0.5)
@@ -221,9 +229,13 @@ def main() -> int:
     energies = {}
     for _ in range(options.rounds):
         for side in best:
-            command = [sys.executable, __file__, "--side", side]
-            command += ["--grid", str(options.grid)]
-            command += ["--substeps", str(options.substeps)]
+            command = [
+                sys.executable,
+                __file__,
+                f"--side={side}",
+                f"--grid={options.grid}",
+                f"--substeps={options.substeps}",
+            ]
             output = subprocess.run(command, check=True, capture_output=True, text=True)
             last_line = output.stdout.splitlines()[-1]
             result = json.loads(last_line)

@@ -58,14 +58,18 @@ def read_methods(split: str) -> dict[str, Floats]:
 
     The shape is [seed, scenario].
     """
-    metric = ranking_metric(load().size(split, "mini"))
+    size = load().size(split, "mini")
+    metric = ranking_metric(size)
     folder = ROOT / "leaderboard" / "scores" / split / "mini"
     seeds_by_method = defaultdict(list)
     for path in sorted(folder.glob("*.nc")):
         method = re.sub(r"_\d+$", "", path.stem)
-        score = read_statistics(path).scores()[metric]
-        seeds_by_method[method].append(score.values)
-    return {method: np.array(seeds) for method, seeds in seeds_by_method.items()}
+        scores = read_statistics(path).scores()
+        seeds_by_method[method].append(scores[metric].values)
+    methods = {}
+    for method, seeds in seeds_by_method.items():
+        methods[method] = np.array(seeds)
+    return methods
 
 
 def measure_scatter(methods: dict[str, Floats]) -> Scatter:
@@ -86,7 +90,8 @@ def measure_scatter(methods: dict[str, Floats]) -> Scatter:
         seed_deviation = deviation.mean(axis=1, keepdims=True)
         rest = deviation - seed_deviation
         freedom = (seed_count - 1) * (scenario_count - 1)
-        rest_variance = float(np.sum(rest**2)) / freedom
+        square_sum = float(np.sum(rest**2))
+        rest_variance = square_sum / freedom
         rest_variances.append(rest_variance)
         variance = float(np.var(seed_deviation, ddof=1))
         seed_variance = variance - rest_variance / scenario_count
@@ -97,13 +102,13 @@ def measure_scatter(methods: dict[str, Floats]) -> Scatter:
         noise = float(np.mean(rest_variances))
     method_variances = []
     for first, second in _near_pairs(methods):
-        first_mean = relative[first].mean(axis=0)
-        second_mean = relative[second].mean(axis=0)
-        difference = first_mean - second_mean
+        first_seeds = relative[first]
+        second_seeds = relative[second]
+        difference = first_seeds.mean(axis=0) - second_seeds.mean(axis=0)
         variance = float(np.var(difference, ddof=1))
-        seed_share = 1 / len(methods[first]) + 1 / len(methods[second])
-        method_variance = variance - noise * seed_share
-        method_variances.append(max(0.0, method_variance) / 2)
+        seed_share = 1 / len(first_seeds) + 1 / len(second_seeds)
+        variance_of_both = max(0.0, variance - noise * seed_share)
+        method_variances.append(variance_of_both / 2)
     return Scatter(
         seed=_root_mean(seed_variances),
         rest=_root_mean(rest_variances),
@@ -113,18 +118,22 @@ def measure_scatter(methods: dict[str, Floats]) -> Scatter:
 
 def _near_pairs(methods: dict[str, Floats]) -> list[tuple[str, str]]:
     """Return pairs whose means differ by less than a factor 2, one with two seeds."""
-    pairs = set()
-    for first, second in itertools.permutations(methods, 2):
-        ratio = methods[first].mean() / methods[second].mean()
-        if len(methods[first]) > 1 and 0.5 < ratio < 2.0:
-            pairs.add((min(first, second), max(first, second)))
-    return sorted(pairs)
+    pairs = []
+    for first, second in itertools.combinations(sorted(methods), 2):
+        first_seeds = methods[first]
+        second_seeds = methods[second]
+        ratio = first_seeds.mean() / second_seeds.mean()
+        most_seeds = max(len(first_seeds), len(second_seeds))
+        if most_seeds > 1 and 0.5 < ratio < 2.0:
+            pairs.append((first, second))
+    return pairs
 
 
 def _root_mean(variances: list[float]) -> float:
     if not variances:
         return np.nan
-    return float(np.sqrt(np.mean(variances)))
+    variance = np.mean(variances)
+    return float(np.sqrt(variance))
 
 
 def share_told_apart(
@@ -142,7 +151,8 @@ def share_told_apart(
     """
     rng = np.random.Generator(np.random.PCG64(0))
     method_scatter = scatter.method if difference else 0.0
-    level_and_seeds = [(1.0, seeds), (1.0 - difference, other_seeds or seeds)]
+    other_level = 1.0 - difference
+    level_and_seeds = [(1.0, seeds), (other_level, other_seeds or seeds)]
     significant_count = 0
     for _ in range(DRAWS):
         sides = []
@@ -150,8 +160,10 @@ def share_told_apart(
             by_scenario = rng.normal(0.0, method_scatter, scenarios)
             by_seed = rng.normal(0.0, scatter.seed, (count, 1))
             rest = rng.normal(0.0, scatter.rest, (count, scenarios))
-            sides.append(level * (1.0 + by_scenario + by_seed + rest))
-        significant_count += differ(*sides) < SIGNIFICANCE
+            relative = 1.0 + by_scenario + by_seed + rest
+            sides.append(level * relative)
+        significance = differ(*sides)
+        significant_count += significance < SIGNIFICANCE
     return significant_count / DRAWS
 
 
@@ -217,24 +229,36 @@ def render_page() -> str:
     for name, scatter in ASSUMED.items():
         cases.append((f"assumed: {name}", 16, scatter))
     for split, scenarios in TEST.items():
-        scatter = measure_scatter(read_methods(split))
-        if np.isfinite(astuple(scatter)).all():
+        methods = read_methods(split)
+        scatter = measure_scatter(methods)
+        is_known = np.isfinite(astuple(scatter))
+        if is_known.all():
             cases.append((split, scenarios, scatter))
 
     rows = []
     false_rows = []
     for name, scenarios, scatter in cases:
         cells = [name, str(scenarios)]
-        cells += [f"{100 * value:.1f} %" for value in astuple(scatter)]
+        for deviation in astuple(scatter):
+            cells.append(f"{100 * deviation:.1f} %")
         for difference in DIFFERENCES:
-            share = share_told_apart(scatter, scenarios, difference, seeds=SEEDS)
+            share = share_told_apart(
+                scatter,
+                scenarios,
+                difference,
+                seeds=SEEDS,
+            )
             cells.append(f"{share:.2f}")
         rows.append(f"| {' | '.join(cells)} |")
 
         false_cells = [name]
         for seeds, other_seeds in SIDES:
             share = share_told_apart(
-                scatter, scenarios, 0.0, seeds=seeds, other_seeds=other_seeds
+                scatter,
+                scenarios,
+                0.0,
+                seeds=seeds,
+                other_seeds=other_seeds,
             )
             false_cells.append(f"{100 * share:.1f} %")
         false_rows.append(f"| {' | '.join(false_cells)} |")
@@ -259,7 +283,8 @@ def main() -> int:
     page = render_page()
     print(page)
     if write:
-        (ROOT / "docs" / "power.md").write_text(page, encoding="utf-8")
+        path = ROOT / "docs" / "power.md"
+        path.write_text(page, encoding="utf-8")
     return 0
 
 

@@ -52,10 +52,10 @@ def flow(position: Floats, *, largest: int = 99, shift: float = 0.0) -> Floats:
         phase_y = np.pi * n * y
         wave_number = np.hypot(m, n)
         scale = SPEED * amplitude / wave_number
-        u = scale * n * np.sin(phase_x) * np.cos(phase_y)
-        v = scale * m * np.cos(phase_x) * np.sin(phase_y)
-        velocity[:, 0] += u
-        velocity[:, 1] -= v
+        scale_x = scale * n
+        scale_y = scale * m
+        velocity[:, 0] += scale_x * np.sin(phase_x) * np.cos(phase_y)
+        velocity[:, 1] -= scale_y * np.cos(phase_x) * np.sin(phase_y)
     return velocity
 
 
@@ -88,22 +88,26 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
         particle_mass=1.0 / particles,
         area=area,
     )
-    true_snapshot = scenario.snapshot(position, before)
     predicted_before = predicted_position - predicted_velocity
-    predicted_snapshot = scenario.snapshot(predicted_position, predicted_before)
-    return FramePair(scenario, 2, true_snapshot, predicted_snapshot)
+    return FramePair(
+        scenario,
+        2,
+        scenario.snapshot(position, before),
+        scenario.snapshot(predicted_position, predicted_before),
+    )
 
 
 def format_scores(pair: FramePair) -> str:
     """Return the shown scores of a pair, one line each."""
-    placement = Placement(pair.scenario.config.grid.placement)
-    names = SHOWN[placement]
+    grid = pair.scenario.config.grid
+    names = SHOWN[Placement(grid.placement)]
     metrics = select(names)
     statistics = tally([pair], metrics, (2,))
     scores = aggregate(metrics, {0: statistics})
     lines = []
     for name in names:
-        value = round(scores[name].mean, 12)
+        score = scores[name]
+        value = round(score.mean, 12)
         words = name.replace("_", " ")
         lines.append(f"{words} {value:.2g}")
     return "\n".join(lines)
@@ -133,7 +137,8 @@ def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
         predicted_position = np.clip(moved, 0.0, 1.0)
         predicted_velocity = predicted_flow(predicted_position)
         predictions[name] = (predicted_position, predicted_velocity)
-    predictions["particles permuted"] = (position[order], velocity[order])
+    permuted = (position[order], velocity[order])
+    predictions["particles permuted"] = permuted
 
     truth = (position, velocity)
     pairs = {}
@@ -148,7 +153,9 @@ DROP = 300  # particles of the pool and of the drop
 
 def splash(rng: np.random.Generator) -> dict[str, FramePair]:
     """Return predictions of a splash: a pool and a drop."""
-    pool = rng.uniform((0.05, 0.05), (0.95, 0.17), (POOL, 2))
+    pool_low = (0.05, 0.05)
+    pool_high = (0.95, 0.17)
+    pool = rng.uniform(pool_low, pool_high, (POOL, 2))
     area_share = rng.random(DROP)
     radius = 0.08 * np.sqrt(area_share)
     angle = rng.uniform(0, 2 * np.pi, DROP)
@@ -159,14 +166,16 @@ def splash(rng: np.random.Generator) -> dict[str, FramePair]:
     velocity = np.zeros_like(position)
     order = rng.permutation(len(position))
     smear = rng.normal(0.0, 0.05, position.shape)
-    # 1 for particles of the drop, shape [particle, 1]
-    is_drop = np.zeros((POOL + DROP, 1))
-    is_drop[POOL:] = 1.0
+    low_drop = position.copy()
+    low_drop[POOL:, 1] -= 0.02
+    shifted_drop = position.copy()
+    shifted_drop[POOL:, 0] += 0.25
+    smeared = position + smear
     predictions: dict[str, Floats] = {
         "truth": position,
-        "good: drop 2 % low": position - is_drop * [0.0, 0.02],
-        "drop shifted by 25 %": position + is_drop * [0.25, 0.0],
-        "smeared": np.clip(position + smear, 0.0, 1.0),
+        "good: drop 2 % low": low_drop,
+        "drop shifted by 25 %": shifted_drop,
+        "smeared": np.clip(smeared, 0.0, 1.0),
         "particles permuted": position[order],
     }
     truth = (position, velocity)
@@ -181,7 +190,13 @@ def draw_prediction(axes: Axes, pair: FramePair, limit: float) -> None:
     """Draw the vorticity of a full box, or the particles on a free surface."""
     if pair.scenario.config.is_full_box:
         vorticity = pair.predicted_fields.vorticity
-        axes.imshow(vorticity.T, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit)
+        axes.imshow(
+            vorticity.T,
+            origin="lower",
+            cmap="RdBu_r",
+            vmin=-limit,
+            vmax=limit,
+        )
     else:
         x, y = pair.prediction.position.T
         axes.scatter(x, y, s=1.2, c="#20639b", linewidths=0)
@@ -194,17 +209,20 @@ def main() -> int:
     full_box_pairs = full_box(rng)
     splash_pairs = splash(rng)
     true_vorticity = full_box_pairs["truth"].true_vorticity
-    limit = float(np.max(np.abs(true_vorticity)))
+    magnitude = np.abs(true_vorticity)
+    limit = float(magnitude.max())
 
     figure, all_axes = plt.subplots(2, 5, figsize=(11, 5.9), layout="constrained")
     rows = (full_box_pairs, splash_pairs)
-    for row_axes, pairs in zip(all_axes, rows, strict=True):
-        for axes, (name, pair) in zip(row_axes, pairs.items(), strict=True):
+    for row, pairs in enumerate(rows):
+        for column, (name, pair) in enumerate(pairs.items()):
+            axes = all_axes[row, column]
             draw_prediction(axes, pair, limit)
             axes.set(xticks=[], yticks=[])
             axes.set_title(name, fontsize=9)
             if name != "truth":
-                axes.set_xlabel(format_scores(pair), fontsize=8)
+                text = format_scores(pair)
+                axes.set_xlabel(text, fontsize=8)
     all_axes[0, 0].set_ylabel("full box: vorticity", fontsize=9)
     all_axes[1, 0].set_ylabel("free surface: particles", fontsize=9)
     PATH.parent.mkdir(exist_ok=True)

@@ -103,7 +103,8 @@ def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> 
         interval = "too few"
         if np.isfinite(low):
             interval = f"{low:.3g} to {high:.3g}"
-        defined = reference.correlation[np.isfinite(reference.correlation)]
+        is_defined = np.isfinite(reference.correlation)
+        defined = reference.correlation[is_defined]
         correlation = "undefined"
         if defined.size:
             correlation = f"{np.mean(defined):.3f}"
@@ -136,15 +137,18 @@ def _is_hard_enough(
         return True
     frozen = references["frozen-field"]
     correlation = frozen.correlation
-    error = float(np.median(frozen.scores["vorticity_nrmse"].values))
-    below = float(np.mean(~(correlation >= FALLEN)))
+    errors = frozen.scores["vorticity_nrmse"].values
+    error = float(np.median(errors))
+    is_below = ~(correlation >= FALLEN)
+    below = float(np.mean(is_below))
     middle = float(np.nanmedian(correlation))
     print(
         f"| {size.split} {size.name} | {below:.0%} of {correlation.size} | "
         f"{middle:.3f} | {error:.3g} |"
     )
     if each:
-        print(f"| | {' '.join(f'{value:.2f}' for value in correlation)} | | |")
+        cells = [f"{value:.2f}" for value in correlation]
+        print(f"| | {' '.join(cells)} | | |")
     strong = size.split != "cavity" or error >= ERROR
     return size.name not in ACCEPTED or (below >= SHARE and strong)
 

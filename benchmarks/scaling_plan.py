@@ -83,7 +83,8 @@ def registry_of(row: ThesisRow, frames: int) -> Registry:
     """Return our splits with a size ``q`` of fluid that has the numbers of a row."""
     registry = load()
     fluid = registry.split("fluid")
-    interval = row.substeps * _COURANT / (row.grid * _MODULUS**0.5)
+    sound_speed = _MODULUS**0.5
+    interval = row.substeps * _COURANT / (row.grid * sound_speed)
     full = fluid.sizes["full"]
     size_parameters = {
         **full.parameters,
@@ -92,9 +93,16 @@ def registry_of(row: ThesisRow, frames: int) -> Registry:
         "substeps_per_frame": row.substeps,
     }
     task = full.task.model_copy(
-        update={"horizon": frames - 2, "frames_of_interest": (frames - 1,)}
+        update={
+            "horizon": frames - 2,
+            "frames_of_interest": (frames - 1,),
+        }
     )
-    subsets = {"train": (0,), "valid": (1,), "test": (2,)}
+    subsets = {
+        "train": (0,),
+        "valid": (1,),
+        "test": (2,),
+    }
     size = full.model_copy(
         update={
             "parameters": size_parameters,
@@ -103,13 +111,23 @@ def registry_of(row: ThesisRow, frames: int) -> Registry:
             "task": task,
         }
     )
-    values = {"area_min": _AREA, "area_max": _AREA, "frame_rate": 1.0 / interval}
+    values = {
+        "area_min": _AREA,
+        "area_max": _AREA,
+        "frame_rate": 1.0 / interval,
+    }
     parameters = {}
     for name, parameter in fluid.parameters.items():
         value = values.get(name, parameter.value)
         parameters[name] = parameter.model_copy(update={"value": value})
-    split = fluid.model_copy(update={"parameters": parameters, "sizes": {"q": size}})
-    return Registry({**registry.splits, "fluid": split}, {})
+    split = fluid.model_copy(
+        update={
+            "parameters": parameters,
+            "sizes": {"q": size},
+        }
+    )
+    splits = {**registry.splits, "fluid": split}
+    return Registry(splits, {})
 
 
 def timed(function: Callable[[], object]) -> float:
@@ -121,7 +139,8 @@ def timed(function: Callable[[], object]) -> float:
 
 def best_of_three(function: Callable[[], object]) -> float:
     """Return the shortest processor time of three calls [s]."""
-    return min(timed(function), timed(function), timed(function))
+    seconds = [timed(function) for _ in range(3)]
+    return min(seconds)
 
 
 def measure_parts(row: ThesisRow, frames: int, root: Path) -> Parts:
@@ -145,13 +164,16 @@ def measure_parts(row: ThesisRow, frames: int, root: Path) -> Parts:
         write_seconds = timed(write_frames)
 
     path = writer.path
+    check_seconds = timed(lambda: check_scenario(path))
+    statistics_seconds = timed(lambda: file_moments(path))
     rows_written = frames * row.particles
+    particle_substeps = row.particles * row.substeps
     return Parts(
         draw=draw_seconds / row.particles,
-        substep=solver_seconds / row.substeps / row.particles,
+        substep=solver_seconds / particle_substeps,
         write=write_seconds / rows_written,
-        check=timed(lambda: check_scenario(path)) / rows_written,
-        statistics=timed(lambda: file_moments(path)) / rows_written,
+        check=check_seconds / rows_written,
+        statistics=statistics_seconds / rows_written,
         bytes=path.stat().st_size / rows_written,
     )
 
@@ -167,18 +189,22 @@ def measure_whole(row: ThesisRow, frames: int, root: Path) -> Whole:
         workers=1,
         registry=registry_of(row, frames),
     )
+    parent_seconds = time.process_time() - start
+    parent = resource.getrusage(resource.RUSAGE_SELF)
     workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+    worker_seconds = workers.ru_utime + workers.ru_stime
     return Whole(
         frames=frames,
-        seconds=time.process_time() - start + workers.ru_utime + workers.ru_stime,
-        parent=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        seconds=parent_seconds + worker_seconds,
+        parent=parent.ru_maxrss * 1024,
         worker=workers.ru_maxrss * 1024,
     )
 
 
 def apart(row: ThesisRow, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
     """Measure in a process of its own, whose peak memory is nobody else's."""
-    command = [sys.executable, __file__, "--one", f"{row.q},{frames},{what}"]
+    measurement = f"{row.q},{frames},{what}"
+    command = [sys.executable, __file__, "--one", measurement]
     process = subprocess.run(command, capture_output=True, check=True, text=True)
     return json.loads(process.stdout)
 
@@ -245,29 +271,39 @@ def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
 
 def expected(row: ThesisRow, p: Parts, frames: int) -> float:
     """Return what two scenarios and a twin should take by the parts [s]."""
-    simulated = 3 * (frames - 1) * row.substeps * p.substep
-    return row.particles * (3 * p.draw + simulated + 2 * frames * p.write)
+    substeps = (frames - 1) * row.substeps
+    simulation = p.draw + substeps * p.substep
+    writing = frames * p.write
+    return row.particles * (3 * simulation + 2 * writing)
 
 
 def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     """Return bytes, core hours and memory of the planned data set."""
     n = row.particles
     frames = PLANNED
+    raw_file = frames * n * 16  # [bytes]
+    file = frames * n * p.bytes  # [bytes]
+    raw_terabytes = SCENARIOS * raw_file / 1e12
+    terabytes = SCENARIOS * file / 1e12
+
+    # core hours per second of work on one particle
     hours = SCENARIOS * n / 3600.0
-    file = frames * n * p.bytes
-    simulating = hours * (p.draw + (frames - 1) * row.substeps * p.substep)
-    twins = TESTS * hours * (p.draw + HORIZON * row.substeps * p.substep)
-    statistics = 0.8 * hours * frames * p.statistics
+    frame_hours = hours * frames
+    frame_seconds = row.substeps * p.substep  # to simulate a frame, per particle
+    simulating = hours * (p.draw + (frames - 1) * frame_seconds)
+    writing = frame_hours * p.write
+    twins = TESTS * hours * (p.draw + HORIZON * frame_seconds)
+    statistics = 0.8 * frame_hours * p.statistics
+    checking = frame_hours * p.check
     perturbed_runs = f"perturbed runs of the test scenarios ({100 * TESTS:.0f} %)"
     rows = {
-        "bytes before compression": f"{SCENARIOS * frames * n * 16 / 1e12:.2f} TB",
-        "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} "
-        f"GB each)",
+        "bytes before compression": f"{raw_terabytes:.2f} TB",
+        "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB each)",
         "simulating": f"{simulating:,.0f} core hours",
-        "compressing, hashing, writing": f"{hours * frames * p.write:,.0f} core hours",
+        "compressing, hashing, writing": f"{writing:,.0f} core hours",
         perturbed_runs: f"{twins:,.0f} core hours",
         "statistics of the train scenarios (80 %)": f"{statistics:,.0f} core hours",
-        "one `lagbench verify`": f"{hours * frames * p.check:,.0f} core hours",
+        "one `lagbench verify`": f"{checking:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
@@ -292,8 +328,10 @@ def extrapolate_memory(measured: Sequence[MeasuredRow], particles: int) -> int:
     high = large_runs[-1].worker
     if small is large:
         return round(high * particles / large.particles)
-    slope = (high - low) / (large.particles - small.particles)
-    return round(high + slope * (particles - large.particles))
+    measured_particles = large.particles - small.particles
+    slope = (high - low) / measured_particles  # [bytes/particle]
+    more_particles = particles - large.particles
+    return round(high + slope * more_particles)
 
 
 def main() -> int:
@@ -309,13 +347,15 @@ def main() -> int:
         return one(options.one)
 
     measured = []
-    for row in THESIS:
-        if str(row.q) in options.rows.split(","):
-            parts = Parts(**apart(row, FRAMES[0], "parts"))
-            runs = []
-            for frames in FRAMES:
-                runs.append(Whole(**apart(row, frames, "whole")))
-            measured.append((row, parts, runs))
+    for number in options.rows.split(","):
+        row = row_of(int(number))
+        part_costs = apart(row, FRAMES[0], "parts")
+        parts = Parts(**part_costs)
+        runs = []
+        for frames in FRAMES:
+            run_costs = apart(row, frames, "whole")
+            runs.append(Whole(**run_costs))
+        measured.append((row, parts, runs))
 
     million = row_of(8)
     _, largest_parts, _ = measured[-1]
@@ -329,7 +369,8 @@ def main() -> int:
     ]
     text = "\n".join(lines) + "\n"
     options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "scaling_plan.md").write_text(text, encoding="utf-8")
+    path = options.output / "scaling_plan.md"
+    path.write_text(text, encoding="utf-8")
     print(text)
     return 0
 

@@ -25,6 +25,8 @@ __all__ = ["ScoreData", "make_score_data", "write_scenario"]
 SPEED = 0.0022
 """Per-frame speed of the rotating_disc, as in the cavity [length/frame]."""
 
+Floats32 = NDArray[np.float32]
+
 BOX = (0.0625, 0.875)
 """Lower corner and side of the box [length]."""
 
@@ -74,9 +76,15 @@ def make_score_data(
         positions = _flow(scenario, frames, size.particles)
         # Positions take the place of velocities, whose values do not matter here.
         flow = ((position, position) for position in positions)
-        mass = 1e-4 * BOX[1] ** 2 / size.particles
+        _, side = BOX
+        fluid_mass = 1e-4 * side**2
         hashes[scenario] = write_scenario(
-            root, key, flow, particles=size.particles, frames=frames, particle_mass=mass
+            root,
+            key,
+            flow,
+            particles=size.particles,
+            frames=frames,
+            particle_mass=fluid_mass / size.particles,
         )
     registry_path = folder / "datasets.yaml"
     _write_registry(
@@ -89,19 +97,28 @@ def make_score_data(
     registry = load(registry_path)
     path = folder / "predictions.nc"
     writer = PredictionsWriter(
-        path, split="cavity", size="full", method="rotating_disc", registry=registry
+        path,
+        split="cavity",
+        size="full",
+        method="rotating_disc",
+        registry=registry,
     )
     with writer:
         for scenario in scenarios:
-            guess = list(_flow(scenario, frames, size.particles, error=0.02))
-            predicted = guess[size.task.input_frames :]
-            writer.add(scenario, np.stack(predicted))
+            flow = _flow(scenario, frames, size.particles, error=0.02)
+            positions = np.stack(list(flow))
+            predicted = positions[size.task.input_frames :]
+            writer.add(scenario, predicted)
     return ScoreData(root, registry, path)
 
 
 def _flow(
-    scenario: int, frames: int, particles: int, *, error: float = 0.0
-) -> Iterator[NDArray[np.float32]]:
+    scenario: int,
+    frames: int,
+    particles: int,
+    *,
+    error: float = 0.0,
+) -> Iterator[Floats32]:
     """Yield positions frame by frame; an error makes the discs that much faster."""
     rng = np.random.Generator(np.random.PCG64(scenario))
     low, side = BOX
@@ -125,7 +142,7 @@ def _flow(
 def write_scenario(
     root: Path,
     key: ScenarioKey,
-    flow: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+    flow: Iterable[tuple[Floats32, Floats32]],
     *,
     particles: int,
     frames: int,
@@ -163,14 +180,17 @@ def _write_registry(
 ) -> None:
     """Write datasets.yaml with this horizon and the hashes of these scenarios."""
     content = read_yaml(default_path())
-    size = content["splits"]["cavity"]["sizes"]["full"]
+    cavity = content["splits"]["cavity"]
+    size = cavity["sizes"]["full"]
     size["task"]["horizon"] = horizon
     size["frames"] = frames
     size["subsets"]["test"] = f"{min(hashes)}-{max(hashes)}"
     dataset_sha256 = "0" * 64
     if has_shipped_references:
         dataset_sha256 = content["measured"]["cavity"]["full"]["dataset_sha256"]
-    scenario_hashes = {i: digest[:16] for i, digest in hashes.items()}
+    scenario_hashes = {}
+    for scenario, digest in hashes.items():
+        scenario_hashes[scenario] = digest[:16]
     measured = {
         "dataset_sha256": dataset_sha256,
         "subset_sha256": {},

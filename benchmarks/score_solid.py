@@ -70,8 +70,9 @@ def main() -> None:
         root = Path(name)
         paths = []
         for seed in range(3):
-            paths.append(root / f"run{seed}.npy")
-            np.save(paths[-1], carried(seed))
+            path = root / f"run{seed}.npy"
+            np.save(path, carried(seed))
+            paths.append(path)
         adopt(
             paths,
             output=root / "abc",
@@ -84,22 +85,30 @@ def main() -> None:
             input_frames=GIVEN,
             full_box=True,
         )
-        truth = carried(2)[GIVEN:]
-        noise = np.random.default_rng(0).normal(0.0, NOISE, truth.shape)
-        predicted = (truth + noise).astype(np.float32)
+        frames = carried(2)
+        truth = frames[GIVEN:]
+        rng = np.random.default_rng(0)
+        noise = rng.normal(0.0, NOISE, truth.shape)
+        prediction = truth + noise
         path = root / "predictions.nc"
-        lagbench.submission.write(path, {2: predicted}, split=root / "abc", method="m")
+        lagbench.submission.write(
+            path,
+            {2: prediction.astype(np.float32)},
+            split=root / "abc",
+            method="m",
+        )
 
         size = locate(root / "abc").size
         task = load_scored_task(size, root)
         with open_predictions(path) as opened:
             info = opened.info
+        metric_names = [metric.name for metric in _select_metrics(())]
         job = ScenarioJob(
             task=task,
             scenario=2,
             predictions=path,
             info=info,
-            metrics=tuple(metric.name for metric in _select_metrics(())),
+            metrics=tuple(metric_names),
             has_preview=True,
         )
         seconds = []
@@ -107,7 +116,8 @@ def main() -> None:
             started = time.process_time()
             score_scenario(job, lambda _: None)
             seconds.append(time.process_time() - started)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    peak = usage.ru_maxrss / 1024.0  # [MB]
     print(
         f"{SIDE**3} particles, {FRAMES - GIVEN} frames: {min(seconds):.2f} s of one "
         f"core, {peak:.0f} MB with the making of the data"

@@ -16,7 +16,6 @@ import argparse
 import json
 import tempfile
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 from solver_against import HERE, checked_out, on_one_core
@@ -70,9 +69,11 @@ def declare(tree: Path) -> None:
 
     An installation of another tree would hide them.
     """
-    project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
+    settings_path = tree / "pyproject.toml"
+    settings = tomllib.loads(settings_path.read_text())
+    entry_point_groups = settings["project"]["entry-points"]
     lines = []
-    for group, entry_points in project["entry-points"].items():
+    for group, entry_points in entry_point_groups.items():
         lines.append(f"[{group}]")
         for name, target in entry_points.items():
             lines.append(f"{name} = {target}")
@@ -96,7 +97,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, checked_out(options.against) as other:
         declare(other)
         best: dict[Path, dict[str, float]] = {}
-        data_folders = {other: Path(folder) / "theirs", HERE: Path(folder) / "ours"}
+        data_folders = {
+            other: Path(folder, "theirs"),
+            HERE: Path(folder, "ours"),
+        }
         for tree, data in data_folders.items():
             data.mkdir()
             on_one_core(tree, "-c", MAKE, str(data), OMP_NUM_THREADS="1")
@@ -105,27 +109,28 @@ def main() -> int:
         for _ in range(options.rounds):
             for tree, data in data_folders.items():
                 costs = score(tree, data)
-                if tree not in best or costs["cpu"] < best[tree]["cpu"]:
+                best_costs = best.setdefault(tree, costs)
+                if costs["cpu"] < best_costs["cpu"]:
                     best[tree] = costs
     print(f"{hardware()['processor']}, one core, cavity full, all metrics but Sinkhorn")
     print(
         f"| per scenario of 90 frames | {options.against} | this tree | ratio "
         f"|\n|---|---|---|---|"
     )
-    shown: tuple[tuple[str, str, Callable[[float], str]], ...] = (
-        ("processor time", "cpu", lambda seconds: f"{seconds:.2f} s"),
-        ("of it in children", "children", lambda seconds: f"{seconds:.2f} s"),
-        (
-            "memory of the largest process",
-            "memory",
-            lambda size: f"{size / 1e6:.0f} MB",
-        ),
+    print_row("processor time [s]", best[other]["cpu"], best[HERE]["cpu"])
+    print_row("of it in children [s]", best[other]["children"], best[HERE]["children"])
+    print_row(
+        "memory of the largest process [MB]",
+        best[other]["memory"] / 1e6,
+        best[HERE]["memory"] / 1e6,
     )
-    for name, key, text in shown:
-        theirs = best[other][key]
-        ours = best[HERE][key]
-        print(f"| {name} | {text(theirs)} | {text(ours)} | {ours / theirs:.2f} |")
     return 0
+
+
+def print_row(name: str, theirs: float, ours: float) -> None:
+    """Print a cost of both trees and the ratio of ours to theirs."""
+    ratio = ours / theirs
+    print(f"| {name} | {theirs:.2f} | {ours:.2f} | {ratio:.2f} |")
 
 
 if __name__ == "__main__":

@@ -27,15 +27,18 @@ from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE
 from lagbench.scoring.skill import best_reference
 
+Floats = NDArray[np.float64]
+
 REDRAWS = 200_000
 
 
-def expected_best(values: NDArray[np.float64], tries: int) -> float:
+def expected_best(values: Floats, tries: int) -> float:
     """Return the expected maximum of so many independent draws from values."""
     ordered = np.sort(values)
     count = len(ordered)
     # Probability that one draw is no greater than each value; of all draws its power.
-    one_draw = np.arange(1, count + 1) / count
+    ranks = np.arange(1, count + 1)
+    one_draw = ranks / count
     all_draws = one_draw**tries
     distribution = np.concatenate([[0.0], all_draws])
     weights = np.diff(distribution)
@@ -51,7 +54,7 @@ def draw(count: int, scenarios: int) -> NDArray[np.intp]:
     return numbers.astype(np.intp)
 
 
-def leaders(tab: Tab, metric: str) -> list[tuple[str, NDArray[np.float64]]]:
+def leaders(tab: Tab, metric: str) -> list[tuple[str, Floats]]:
     """Return the two best methods that are no variants, with their values."""
     methods = []
     for row in tab.rows:
@@ -65,13 +68,13 @@ def leaders(tab: Tab, metric: str) -> list[tuple[str, NDArray[np.float64]]]:
     return methods[:2]
 
 
-def _mean_score(method: tuple[str, NDArray[np.float64]]) -> float:
+def _mean_score(method: tuple[str, Floats]) -> float:
     """Return the mean score of a method over the scenarios."""
     _, values = method
     return float(np.mean(values))
 
 
-def naive_values(tab: Tab, metric: str) -> NDArray[np.float64] | None:
+def naive_values(tab: Tab, metric: str) -> Floats | None:
     """Return the scores of the best naive predictor by scenario, None without any."""
     references = shipped(tab.size) or {}
     naive = {}
@@ -107,31 +110,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if base is None:
             continue
         chosen = draw(len(base), options.scenarios)
-        base_means = base[chosen].mean(axis=1)
+        base_redraws = base[chosen]
+        base_means = base_redraws.mean(axis=1)
         methods = leaders(tab, metric)
         place = f"{tab.size.split} {tab.size.name}"
 
         method, values = methods[0]
-        means = values[chosen].mean(axis=1)
+        redraws = values[chosen]
+        means = redraws.mean(axis=1)
         skills = 1.0 - means / base_means
         mean_skill = float(np.mean(skills))
         deviation = float(np.std(skills))
         cells = [f"{mean_skill:.3f}", f"{deviation:.3f}"]
         for tries in options.tries[1:]:
-            gain = expected_best(skills, tries) - mean_skill
+            best_skill = expected_best(skills, tries)
+            gain = best_skill - mean_skill
             cells.append(f"{gain:+.3f}")
         gains.append((place, method, *cells))
 
         if len(methods) > 1:
             next_method, next_values = methods[1]
-            next_means = next_values[chosen].mean(axis=1)
+            next_redraws = next_values[chosen]
+            next_means = next_redraws.mean(axis=1)
             next_skills = 1.0 - next_means / base_means
-            lead = float(np.mean(skills - next_skills))
-            is_ahead = next_skills - skills > 0.0
-            share_ahead = float(np.mean(is_ahead))
+            leads = skills - next_skills
+            lead = float(np.mean(leads))
+            share_behind = float(np.mean(leads >= 0.0))
             cells = [f"{lead:.3f}"]
             for tries in options.tries:
-                probability = 1.0 - (1.0 - share_ahead) ** tries
+                always_behind = share_behind**tries
+                probability = 1.0 - always_behind
                 cells.append(f"{probability:.3f}")
             swaps.append((place, method, next_method, *cells))
 

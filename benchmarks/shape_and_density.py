@@ -35,18 +35,24 @@ MATERIALS = ("liquid", "jelly", "snow", "rope")
 FRAME_STEP = 10
 """Frames between those that are measured."""
 
-ReadFrame = Callable[[int, int], NDArray[np.float32]]
-"""Return the positions of a scenario in a frame, shape [particle, 2]."""
+Positions = NDArray[np.float32]
+"""Positions of particles in a frame [length], shape [particle, 2]."""
+
+ReadFrame = Callable[[int, int], Positions]
+"""Return the positions of a scenario in a frame."""
 
 
-def read_predicted(file: Predictions, scenario: int, frame: int) -> NDArray[np.float32]:
+def read_predicted(file: Predictions, scenario: int, frame: int) -> Positions:
     """Return the predicted positions in one frame."""
     (position,) = file.frames(scenario, frame, 1)
     return np.asarray(position)
 
 
 def measure(
-    size: Size, root: Path, read_frame: ReadFrame | None, cells: tuple[int, int]
+    size: Size,
+    root: Path,
+    read_frame: ReadFrame | None,
+    cells: tuple[int, int],
 ) -> dict[int, Tensor]:
     """Return (deviation, density) of each material, shape [scenario and frame, 2].
 
@@ -63,13 +69,15 @@ def measure(
         truth = {}
         path = size.path(root, scenario)
         with read_scenario(path) as file:
-            material_numbers = file.read("material").astype(np.int64)
-            material = torch.from_numpy(material_numbers)
-            first = torch.from_numpy(file.read("position", 0))
-            for frame in range(size.task.input_frames, file.header.frames, FRAME_STEP):
+            stored_material = file.read("material")
+            first_position = file.read("position", 0)
+            first_measured = size.task.input_frames
+            for frame in range(first_measured, file.header.frames, FRAME_STEP):
                 truth[frame] = file.read("position", frame)
 
+        material = torch.from_numpy(stored_material.astype(np.int64))
         single_material = torch.zeros_like(material)
+        first = torch.from_numpy(first_position)
         shape = ShapeMatching.build(cluster_grid, first, material, material_count)
         density = DensityProjection.build(density_grid, first, single_material, 1)
         kinds = sorted(set(material.tolist()))
@@ -84,8 +92,10 @@ def measure(
             relative_density, _ = density.relative_density(stencil)
             for kind in kinds:
                 is_kind = material == kind
-                mean_deviation = float(deviation[is_kind].mean())
-                high_density = float(relative_density[is_kind].quantile(0.95))
+                kind_deviation = deviation[is_kind]
+                kind_density = relative_density[is_kind]
+                mean_deviation = float(kind_deviation.mean())
+                high_density = float(kind_density.quantile(0.95))
                 rows[kind].append([mean_deviation, high_density])
 
     by_material = {}
@@ -110,8 +120,8 @@ def main() -> int:
         help="cells across the box: of clusters, of densities",
     )
     options = parser.parse_args()
-    cluster_cells, density_cells = map(int, options.cells.split(","))
-    cells = (cluster_cells, density_cells)
+    cluster_cells, density_cells = options.cells.split(",")
+    cells = (int(cluster_cells), int(density_cells))
     size = load().size(SPLIT, options.size)
     root = resolve_root(options.root)
     lines = []

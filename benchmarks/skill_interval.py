@@ -81,7 +81,8 @@ def main() -> int:
                     method_factor, baseline = np.exp(log_factors).T
                     seed_factor = np.ones(1)
                     if seeds > 1:
-                        log_seeds = rng.normal(0.0, SEED, seeds) - SEED**2 / 2
+                        seed_normal = rng.normal(0.0, SEED, seeds)
+                        log_seeds = seed_normal - SEED**2 / 2
                         seed_factor = np.exp(log_seeds)
                     # shape [seed, scenario]
                     method = ratio * seed_factor[:, None] * method_factor
@@ -91,10 +92,13 @@ def main() -> int:
                     )
                     if estimate is None:
                         raise ValueError("persistence does not count for skill")
-                    excess = method - (1.0 - estimate.value) * baseline
-                    low, high = bootstrap_interval(excess / np.mean(baseline))
+                    estimated_ratio = 1.0 - estimate.value
+                    excess = method - estimated_ratio * baseline
+                    relative_excess = excess / np.mean(baseline)
+                    low, high = bootstrap_interval(relative_excess)
                     of_ratio = (estimate.value - high, estimate.value - low)
-                    lower, upper = np.array([estimate.interval, of_ratio]).T
+                    intervals = np.array([estimate.interval, of_ratio])
+                    lower, upper = intervals.T
                     hit_counts += (lower <= true_skill) & (true_skill <= upper)
                     least = np.minimum(least, lower)
                     greatest = np.maximum(greatest, upper)

@@ -49,16 +49,16 @@ def on_one_core(tree: Path, *arguments: str, **variables: str) -> str:
 @contextmanager
 def checked_out(revision: str) -> Iterator[Path]:
     """Yield a folder with another commit, which is gone afterwards."""
-    git = ["git", "-C", str(HERE), "worktree"]
+    worktree = ["git", "-C", str(HERE), "worktree"]
     with tempfile.TemporaryDirectory() as folder:
         other = Path(folder) / "other"
-        subprocess.run(
-            [*git, "add", "--quiet", "--detach", str(other), revision], check=True
-        )
+        add = [*worktree, "add", "--quiet", "--detach", str(other), revision]
+        remove = [*worktree, "remove", "--force", str(other)]
+        subprocess.run(add, check=True)
         try:
             yield other
         finally:
-            subprocess.run([*git, "remove", "--force", str(other)], check=True)
+            subprocess.run(remove, check=True)
 
 
 def rate(tree: Path, case: str, size: str) -> float:
@@ -68,7 +68,8 @@ def rate(tree: Path, case: str, size: str) -> float:
         command = ["-m", "lagbench", "bench", "solver", "--json"]
         command += ["--split", case, "--size", size]
     printed = on_one_core(tree, *command)
-    speed: dict[str, Any] = json.loads(printed[printed.index("{") :])
+    start = printed.index("{")
+    speed: dict[str, Any] = json.loads(printed[start:])
     if case == "kernels":
         return float(speed["per_processor_second"])
     particle_substeps = speed["particles"] * speed["substeps"]  # of one frame
@@ -94,8 +95,9 @@ def main() -> int:
         for case in options.cases:
             best = dict.fromkeys((other, HERE), 0.0)
             for _ in range(options.rounds):
-                for tree, so_far in best.items():
-                    best[tree] = max(so_far, rate(tree, case, options.size))
+                for tree, best_rate in best.items():
+                    new_rate = rate(tree, case, options.size)
+                    best[tree] = max(best_rate, new_rate)
             theirs = best[other] / 1e6
             ours = best[HERE] / 1e6
             print(

@@ -36,7 +36,8 @@ def serve(split: str, size: str) -> None:
     """Advance the solver once per line of stdin; print the rate of each turn."""
     tier = load().size(split, size)
     parameters = solver_constants(tier)
-    state = draw_initial_state(tier, tier.subsets["test"][0])
+    first_test = tier.subsets["test"][0]
+    state = draw_initial_state(tier, first_test)
     solver = build(parameters)
     substeps = max(1, PARTICLE_SUBSTEPS // parameters.particles)
     for _ in sys.stdin:
@@ -45,7 +46,8 @@ def serve(split: str, size: str) -> None:
         start = time.process_time()
         solver.advance(substeps)
         seconds = time.process_time() - start
-        print(parameters.particles * substeps / seconds, flush=True)
+        rate = parameters.particles * substeps / seconds
+        print(rate, flush=True)
 
 
 class Side:
@@ -118,7 +120,9 @@ def main() -> int:
         for case in options.cases:
             rates = compare(other, case, options.size, options.turns)
             theirs, ours = np.median(rates, axis=0) / 1e6
-            low, ratio, high = np.quantile(rates[:, 1] / rates[:, 0], (0.25, 0.5, 0.75))
+            their_rates, our_rates = rates.T
+            ratios = our_rates / their_rates
+            low, ratio, high = np.quantile(ratios, (0.25, 0.5, 0.75))
             print(
                 f"| {case} | {theirs:.1f} | {ours:.1f} | {ratio:.2f} "
                 f"| {low:.2f} to {high:.2f} |",

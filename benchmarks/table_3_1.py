@@ -99,11 +99,13 @@ def block(row: ThesisRow) -> tuple[FreeSurfaceParameters, InitialState]:
     )
     columns = math.ceil(math.sqrt(row.particles))
     index = np.arange(row.particles)
-    side = (row.particles / _PER_CELL) ** 0.5 / row.grid
+    cell = np.stack([index // columns, index % columns], axis=-1)
+    side_cells = (row.particles / _PER_CELL) ** 0.5
+    side = side_cells / row.grid
     corner = np.array([0.5 - side / 2.0, 0.2])
-    cell = np.stack([index // columns, index % columns], axis=-1) + 0.5
+    position = corner + side * (cell + 0.5) / columns
     state = InitialState(
-        position=np.rint((corner + side * cell / columns) * 2.0**20) / 2.0**20,
+        position=np.rint(position * 2.0**20) / 2.0**20,
         velocity=np.zeros((row.particles, 2)),
         affine=np.zeros((row.particles, 2, 2)),
         material=np.full(row.particles, Material.LIQUID, dtype=np.int8),
@@ -115,9 +117,10 @@ def block(row: ThesisRow) -> tuple[FreeSurfaceParameters, InitialState]:
 def start(row: ThesisRow, device: Device) -> solver.Solver:
     """Build the solver of a row, load the block and compile."""
     parameters, state = block(row)
-    running = solver.build(
-        parameters, device=device, threads=1 if device is Device.CPU else None
-    )
+    threads = None
+    if device is Device.CPU:
+        threads = 1
+    running = solver.build(parameters, device=device, threads=threads)
     running.load([state])
     running.advance(2)
     return running
@@ -158,7 +161,9 @@ def measure(row: ThesisRow, *, device: Device, repeats: int) -> TimedRow:
 
 
 def exponents(
-    sizes: Sequence[ThesisRow], substep_ms: Sequence[float], frame_ms: Sequence[float]
+    sizes: Sequence[ThesisRow],
+    substep_ms: Sequence[float],
+    frame_ms: Sequence[float],
 ) -> Exponents:
     """Fit straight lines to the logarithms (Eq. 3.1)."""
     squares = []
@@ -174,9 +179,10 @@ def exponents(
 
 
 def _slope(x: Sequence[float], y: Sequence[float]) -> float:
-    if len(x) > 1:
-        return float(np.polyfit(np.log10(x), np.log10(y), 1)[0])
-    return float("nan")
+    if len(x) < 2:
+        return float("nan")
+    slope, _ = np.polyfit(np.log10(x), np.log10(y), 1)
+    return float(slope)
 
 
 def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
@@ -293,18 +299,20 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
     options = parser.parse_args()
     first, _, last = options.rows.partition("-")
+    first_q = int(first)
+    last_q = int(last or first)
     measurements = []
     for row in THESIS:
-        if int(first) <= row.q <= int(last or first):
+        if first_q <= row.q <= last_q:
             measurement = measure(row, device=options.device, repeats=options.repeats)
             measurements.append(measurement)
 
     device = options.device.value
     table = markdown(measurements, device)
     options.output.mkdir(parents=True, exist_ok=True)
-    name = f"table_3_1_{device}"
-    (options.output / f"{name}.md").write_text(table, encoding="utf-8")
-    draw(measurements, device, options.output / f"{name}.png")
+    table_path = options.output / f"table_3_1_{device}.md"
+    table_path.write_text(table, encoding="utf-8")
+    draw(measurements, device, table_path.with_suffix(".png"))
     print(table)
     return 0
 

@@ -29,14 +29,22 @@ SCENARIOS = "0-23"
 
 def generate(root: Path, workers: int) -> None:
     """Generate the train subset of cavity mini."""
-    lagbench.generate("cavity", "mini", scenarios=SCENARIOS, root=root, workers=workers)
+    lagbench.generate(
+        "cavity",
+        "mini",
+        scenarios=SCENARIOS,
+        root=root,
+        workers=workers,
+    )
 
 
 def hashes(root: Path) -> dict[str, str]:
     """Return the content hash of every scenario file below a root, recomputed."""
-    return {
-        str(path.relative_to(root)): rehash(path) for path in sorted(root.rglob("*.nc"))
-    }
+    hash_by_name = {}
+    for path in sorted(root.rglob("*.nc")):
+        name = str(path.relative_to(root))
+        hash_by_name[name] = rehash(path)
+    return hash_by_name
 
 
 def processor_seconds() -> float:
@@ -48,7 +56,10 @@ def processor_seconds() -> float:
     return seconds
 
 
-@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+CORES = os.sched_getaffinity(0)
+
+
+@pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_two_workers(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
     """Two workers write the same bits as one, and take hardly more processor time.
 

@@ -27,15 +27,15 @@ Frames = NDArray[np.float32]
 @pytest.fixture(scope="module")
 def frames() -> Frames:
     """Return positions of a whole scenario, shape [frame, particle, 2]."""
-    return np.random.default_rng(0).random((FRAMES, PARTICLES, 2), dtype=np.float32)
+    rng = np.random.default_rng(0)
+    return rng.random((FRAMES, PARTICLES, 2), dtype=np.float32)
 
 
 def stream(frames: Frames) -> str:
     """Hash frame by frame, as the writer does."""
     hasher = checksums.ContentHasher({"split": "cavity"})
-    hasher.declare(
-        "position", frames.dtype, ("frame", "particle", "space"), frames.shape
-    )
+    axes = ("frame", "particle", "space")
+    hasher.declare("position", frames.dtype, axes, frames.shape)
     for frame in frames:
         hasher.update("position", frame)
     return hasher.hexdigest()
@@ -48,7 +48,10 @@ def test_content_hash(benchmark: BenchmarkFixture, frames: Frames) -> None:
     are printed beside the target for one with SHA instructions.
     """
     wall_seconds = best_seconds(
-        benchmark, lambda: stream(frames), rounds=5, warmup_rounds=1
+        benchmark,
+        lambda: stream(frames),
+        rounds=5,
+        warmup_rounds=1,
     )
     ours = best_processor_seconds(lambda: stream(frames), rounds=5)
     bare = best_processor_seconds(

@@ -10,6 +10,7 @@ once; SciPy's cKDTree and scikit-learn, where it is installed, get float64.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 
@@ -37,7 +38,8 @@ RADIUS = 0.015
 def position() -> Tensor:
     """Particles of the cavity [length], shape [particle, 2]."""
     rng = np.random.Generator(np.random.PCG64(0))
-    side = int(np.ceil(np.sqrt(PARTICLES)))
+    even_side = math.sqrt(PARTICLES)
+    side = math.ceil(even_side)
     axis = np.arange(side) + 0.5
     grid_lines = np.meshgrid(axis, axis)
     lattice = np.stack(grid_lines, axis=-1)
@@ -63,7 +65,8 @@ def tree(position: Tensor) -> Tensor:
     exact = position.numpy().astype(np.float64)
     search_tree = cKDTree(exact, compact_nodes=False, balanced_tree=False)
     pairs = search_tree.query_pairs(RADIUS, output_type="ndarray")
-    edges = np.concatenate([pairs, pairs[:, ::-1]])
+    reversed_pairs = pairs[:, ::-1]
+    edges = np.concatenate([pairs, reversed_pairs])
     return torch.from_numpy(edges.T)
 
 
@@ -72,9 +75,13 @@ def scikit_learn(position: Tensor) -> Tensor:
     neighbours = pytest.importorskip("sklearn.neighbors")
     x = position.numpy().astype(np.float64)
     graph = neighbours.radius_neighbors_graph(
-        x, RADIUS, algorithm="kd_tree", include_self=False
+        x,
+        RADIUS,
+        algorithm="kd_tree",
+        include_self=False,
     )
-    return torch.from_numpy(np.stack(graph.nonzero()))
+    edges = np.stack(graph.nonzero())
+    return torch.from_numpy(edges)
 
 
 def test_radius_graph(benchmark: BenchmarkFixture, position: Tensor) -> None:
@@ -82,14 +89,18 @@ def test_radius_graph(benchmark: BenchmarkFixture, position: Tensor) -> None:
 
     Milliseconds depend on the machine: they are printed beside the target.
     """
-    seconds = best_seconds(
-        benchmark, lambda: radius_graph(position, RADIUS), rounds=50, warmup_rounds=3
-    )
-    edges = radius_graph(position, RADIUS).shape[1]
+
+    def search() -> Tensor:
+        edges: Tensor = radius_graph(position, RADIUS)
+        return edges
+
+    seconds = best_seconds(benchmark, search, rounds=50, warmup_rounds=3)
+    _, edge_count = search().shape
     print(
-        f"\nours: {seconds * 1e3:.2f} ms, {edges} edges (target {TARGET * 1e3:.0f} ms)"
+        f"\nours: {seconds * 1e3:.2f} ms, {edge_count} edges "
+        f"(target {TARGET * 1e3:.0f} ms)"
     )
-    ours = best_processor_seconds(lambda: radius_graph(position, RADIUS), rounds=20)
+    ours = best_processor_seconds(search, rounds=20)
     all_distances = best_processor_seconds(lambda: brute_force(position), rounds=2)
     benchmark.extra_info["times_faster"] = all_distances / ours
     print(f"all distances take {all_distances / ours:.0f} times the processor time")
@@ -97,7 +108,12 @@ def test_radius_graph(benchmark: BenchmarkFixture, position: Tensor) -> None:
 
 
 @pytest.mark.parametrize(
-    ("search", "rounds"), [(tree, 20), (scikit_learn, 5), (brute_force, 3)]
+    ("search", "rounds"),
+    [
+        (tree, 20),
+        (scikit_learn, 5),
+        (brute_force, 3),
+    ],
 )
 def test_others(
     benchmark: BenchmarkFixture,
@@ -107,10 +123,15 @@ def test_others(
 ) -> None:
     """The others find as many edges."""
     seconds = best_seconds(
-        benchmark, lambda: search(position), rounds=rounds, warmup_rounds=1
+        benchmark,
+        lambda: search(position),
+        rounds=rounds,
+        warmup_rounds=1,
     )
     print(f"\n{search.__name__}: {seconds * 1e3:.2f} ms")
-    assert search(position).shape == radius_graph(position, RADIUS).shape
+    edges = search(position)
+    our_edges = radius_graph(position, RADIUS)
+    assert edges.shape == our_edges.shape
 
 
 @pytest.mark.skipif(
@@ -129,4 +150,5 @@ def test_on_device(benchmark: BenchmarkFixture, position: Tensor) -> None:
 
     seconds = best_seconds(benchmark, search, rounds=50, warmup_rounds=5)
     print(f"\nours on {device}: {seconds * 1e3:.2f} ms")
-    assert torch.equal(search().cpu(), radius_graph(position, RADIUS))
+    edges = search().cpu()
+    assert torch.equal(edges, radius_graph(position, RADIUS))

@@ -77,11 +77,17 @@ print(json.dumps({
 
 def run_ours(folder: Path, workers: int) -> dict[str, float]:
     """Score in a fresh process; return its time, processor time and memory."""
-    return dict(measured_apart("-c", CHILD, str(folder), str(workers)))
+    costs: dict[str, float] = measured_apart("-c", CHILD, str(folder), str(workers))
+    return costs
 
 
 def naive_scores(
-    truth: Path, predictions: Path, *, row: int, first: int, frames: int
+    truth: Path,
+    predictions: Path,
+    *,
+    row: int,
+    first: int,
+    frames: int,
 ) -> dict[str, float]:
     """Return five metrics of one scenario, means over frames.
 
@@ -92,13 +98,14 @@ def naive_scores(
         first: absolute number of the first predicted frame.
         frames: frames to score.
     """
+    last_given = first - 1
+    end = first + frames
     with h5py.File(truth) as file:
-        given_and_true = file["position"][first - 1 : first + frames]
-        true = np.asarray(given_and_true, np.float64)
+        stored_truth = file["position"][last_given:end]
     with h5py.File(predictions) as file:
-        predicted = np.asarray(file["position"][row, :frames], np.float64)
-    last_given = true[:1]
-    predicted = np.concatenate([last_given, predicted])
+        stored_prediction = file["position"][row, :frames]
+    true = stored_truth.astype(np.float64)
+    predicted = np.concatenate([true[:1], stored_prediction])
     frame_scores = []
     for frame in range(1, frames + 1):
         both_frames = slice(frame - 1, frame + 1)
@@ -124,13 +131,15 @@ def _score_frame(true: Floats, predicted: Floats) -> dict[str, float]:
     true_vorticity = true_field[has_both]
     vorticity = predicted_field[has_both]
     residual = vorticity - true_vorticity
+    position_error = predicted[1] - true[1]
     true_magnitude = np.abs(true_vorticity) + 1e-10
     magnitude = np.abs(vorticity) + 1e-10
+    correlation = pearsonr(true_vorticity, vorticity)
     return {
-        "position_mse": float(np.mean((predicted[1] - true[1]) ** 2)),
+        "position_mse": float(np.mean(position_error**2)),
         "vorticity_mse": float(np.mean(residual**2)),
-        "vorticity_mae": float(np.mean(np.abs(residual))),
-        "vorticity_pearson": float(pearsonr(true_vorticity, vorticity).statistic),
+        "vorticity_mae": float(np.abs(residual).mean()),
+        "vorticity_pearson": float(correlation.statistic),
         "vorticity_kl": float(entropy(true_magnitude, magnitude)),
     }
 
@@ -138,18 +147,22 @@ def _score_frame(true: Floats, predicted: Floats) -> dict[str, float]:
 def _vorticity(positions: Floats) -> Floats:
     """Return the vorticity of the second of two frames at the nodes [1/frame]."""
     before, position = positions
+    spacing = 1 / CELLS
     axis = (np.arange(CELLS) + 0.5) / CELLS
-    nodes = tuple(np.meshgrid(axis, axis, indexing="ij"))
-    velocity = griddata(position, position - before, nodes, method="cubic")
-    dv_dx = np.gradient(velocity[..., 1], 1 / CELLS, axis=0)
-    du_dy = np.gradient(velocity[..., 0], 1 / CELLS, axis=1)
+    nodes = np.meshgrid(axis, axis, indexing="ij")
+    velocity = griddata(position, position - before, tuple(nodes), method="cubic")
+    u = velocity[..., 0]
+    v = velocity[..., 1]
+    dv_dx = np.gradient(v, spacing, axis=0)
+    du_dy = np.gradient(u, spacing, axis=1)
     return dv_dx - du_dy
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> ScoreData:
     """Twenty scenarios of 90 frames."""
-    return make_score_data(tmp_path_factory.mktemp("short"))
+    folder = tmp_path_factory.mktemp("short")
+    return make_score_data(folder)
 
 
 def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
@@ -157,7 +170,8 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     folder = data.predictions.parent
     one = run_ours(folder, 1)
     two = run_ours(folder, 2)
-    task = load_scored_task(data.registry.size("cavity", "full"), data.root)
+    size = data.registry.size("cavity", "full")
+    task = load_scored_task(size, data.root)
     wall_start = time.perf_counter()
     cpu_start = time.process_time()
     for row, scenario in enumerate(task.scenarios[:2]):
@@ -168,11 +182,14 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
             first=6,
             frames=NAIVE_FRAMES,
         )
+    wall = time.perf_counter() - wall_start
+    cpu = time.process_time() - cpu_start
     frame_count = len(task.scenarios) * 90
     scale = frame_count / (2 * NAIVE_FRAMES)
-    naive_wall = scale * (time.perf_counter() - wall_start)
-    naive_cpu = scale * (time.process_time() - cpu_start)
-    for name, ours in (("one worker", one), ("two workers", two)):
+    naive_wall = scale * wall
+    naive_cpu = scale * cpu
+    costs = {"one worker": one, "two workers": two}
+    for name, ours in costs.items():
         print(
             f"\n{name}: {ours['wall']:.2f} s, {ours['cpu']:.2f} CPU-s, "
             f"{ours['memory'] / 1e6:.0f} MB, {ours['metrics']} metrics, "
@@ -197,7 +214,7 @@ def test_memory_does_not_grow_with_the_horizon(tmp_path: Path) -> None:
     Both have two scenarios, whose reference predictors are measured too: none are
     shipped for 594 frames.
     """
-    measured = {}
+    memory = {}  # by predicted frames [bytes]
     for horizon in (90, 594):
         folder = tmp_path / str(horizon)
         folder.mkdir()
@@ -207,10 +224,8 @@ def test_memory_does_not_grow_with_the_horizon(tmp_path: Path) -> None:
             scenario_count=2,
             has_shipped_references=False,
         )
-        measured[horizon] = run_ours(folder, 1)
-        memory = measured[horizon]["memory"] / 1e6
-        print(f"\n{horizon} frames: {memory:.0f} MB")
-        print(
-            f"{measured[horizon]['cpu']:.1f} CPU-s, {measured[horizon]['wall']:.1f} s"
-        )
-    assert measured[594]["memory"] <= 1.15 * measured[90]["memory"]
+        costs = run_ours(folder, 1)
+        memory[horizon] = costs["memory"]
+        print(f"\n{horizon} frames: {costs['memory'] / 1e6:.0f} MB")
+        print(f"{costs['cpu']:.1f} CPU-s, {costs['wall']:.1f} s")
+    assert memory[594] <= 1.15 * memory[90]

@@ -32,7 +32,7 @@ Where a busy machine doubles the time of one row, it is 0.25 more.
 
 
 @pytest.fixture(scope="module")
-def found() -> list[table_3_1.TimedRow]:
+def timed_rows() -> list[table_3_1.TimedRow]:
     """Collect the measurements of all rows."""
     return []
 
@@ -41,34 +41,36 @@ def found() -> list[table_3_1.TimedRow]:
 def test_row(
     benchmark: BenchmarkFixture,
     row: table_3_1.ThesisRow,
-    found: list[table_3_1.TimedRow],
+    timed_rows: list[table_3_1.TimedRow],
 ) -> None:
     """Time frames of the row's own substeps, and substeps in runs of 20."""
-    rounds: list[table_3_1.TimedRow] = []
-    best_seconds(
-        benchmark,
-        lambda: rounds.append(table_3_1.measure(row, device=DEVICE, repeats=3)),
-        rounds=1,
-    )
-    measured = rounds[0]
-    found.append(measured)
+
+    def one_round() -> None:
+        timed_row = table_3_1.measure(row, device=DEVICE, repeats=3)
+        timed_rows.append(timed_row)
+
+    best_seconds(benchmark, one_round, rounds=1)
+    measured = timed_rows[-1]
+    substep_ns = 1e6 * measured.substep_ms
     benchmark.extra_info.update(
         particles=row.particles,
         substep_ms=measured.substep_ms,
         frame_ms=measured.frame_ms,
-        nanoseconds_per_particle_substep=1e6 * measured.substep_ms / row.particles,
+        nanoseconds_per_particle_substep=substep_ns / row.particles,
         thesis_over_ours=row.frame_ms / measured.frame_ms,
     )
 
 
-def test_exponents(found: list[table_3_1.TimedRow], tmp_path: Path) -> None:
+def test_exponents(timed_rows: list[table_3_1.TimedRow], tmp_path: Path) -> None:
     """A substep's time grows with the particles, and far less than their square."""
-    if len(found) < 2:
+    if len(timed_rows) < 2:
         pytest.skip("needs the rows of this module in the same run")
-    print("\n" + table_3_1.markdown(found, DEVICE.value))
-    table_3_1.draw(found, DEVICE.value, tmp_path / "figure_3_1.png")
-    print(f"Fig. 3.1: {tmp_path / 'figure_3_1.png'}")
-    exponent = table_3_1.of_measured(found).substep_particles
+    table = table_3_1.markdown(timed_rows, DEVICE.value)
+    print(f"\n{table}")
+    figure = tmp_path / "figure_3_1.png"
+    table_3_1.draw(timed_rows, DEVICE.value, figure)
+    print(f"Fig. 3.1: {figure}")
+    exponent = table_3_1.of_measured(timed_rows).substep_particles
     print(f"exponent of a substep: {exponent:.2f} (goal {GOAL}, limit {MOST_EXPONENT})")
     assert exponent <= MOST_EXPONENT
 

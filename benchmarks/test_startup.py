@@ -22,7 +22,8 @@ LIMITS = {"lagbench --help": 0.5, "import lagbench": 0.15}
 
 def _processor_seconds(arguments: list[str]) -> float:
     """Return the processor time of a fresh interpreter [s]."""
-    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    command = [sys.executable, *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     assert process.returncode == 0
@@ -36,7 +37,8 @@ def test_startup() -> None:
     for _ in range(REPEATS):
         for name, arguments in ARGUMENTS.items():
             seconds = _processor_seconds(arguments)
-            best[name] = min(seconds, best.get(name, seconds))
+            least = best.setdefault(name, seconds)
+            best[name] = min(seconds, least)
 
     for name, seconds in best.items():
         ratio = seconds / best[YARDSTICK]

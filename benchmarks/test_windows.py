@@ -99,7 +99,8 @@ def _rotation(scenario: int) -> Iterator[Frames]:
 def write_ours(root: Path, scenarios: int) -> None:
     """Write the train subset as lagbench does, and the registry that describes it."""
     registry_content = read_yaml(default_path())
-    size = registry_content["splits"]["cavity"]["sizes"]["full"]
+    cavity = registry_content["splits"]["cavity"]
+    size = cavity["sizes"]["full"]
     size["subsets"] = {
         "train": f"0-{scenarios - 1}",
         "valid": f"{scenarios}",
@@ -113,7 +114,11 @@ def write_ours(root: Path, scenarios: int) -> None:
     still = np.zeros((PARTICLES, 2), np.float32)
     for i in range(scenarios):
         key = ScenarioKey(
-            split="cavity", size="full", version=version, scenario=i, subset="train"
+            split="cavity",
+            size="full",
+            version=version,
+            scenario=i,
+            subset="train",
         )
         flow = ((position, still) for position in _rotation(i))
         write_scenario(
@@ -138,14 +143,12 @@ def write_lagrangebench_h5(path: Path, scenarios: int) -> None:
     """Write what LagrangeBench reads: a group per trajectory, gzip in the chunks that
     h5py guesses.
     """
+    particle_type = np.zeros(PARTICLES, np.int64)
     with h5py.File(path, "w") as file:
         for i in range(scenarios):
-            file.create_dataset(
-                f"{i:05d}/particle_type", data=np.zeros(PARTICLES, np.int64)
-            )
-            file.create_dataset(
-                f"{i:05d}/position", data=trajectory(i), compression="gzip"
-            )
+            group = file.create_group(f"{i:05d}")
+            group.create_dataset("particle_type", data=particle_type)
+            group.create_dataset("position", data=trajectory(i), compression="gzip")
 
 
 @pytest.fixture(scope="module")
@@ -158,9 +161,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def dataset(root: Path) -> WindowDataset:
     """Open the train subset with an empty cache."""
-    return WindowDataset(
-        "cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml")
-    )
+    registry = load(root / "datasets.yaml")
+    return WindowDataset("cavity", root=root, history=HISTORY, registry=registry)
 
 
 def rate(
@@ -175,7 +177,8 @@ def rate(
     start = time.process_time()
     for _ in range(count):
         read(int(next(drawn)))
-    return count / (time.process_time() - start)
+    seconds = time.process_time() - start
+    return count / seconds
 
 
 def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
@@ -188,27 +191,21 @@ def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
     rates: list[float] = []
 
     def epoch() -> None:
-        rates.append(
-            rate(
-                data.__getitem__,
-                iter(WindowSampler(data, seed=SEED + len(rates))),
-                len(data),
-            )
-        )
+        sampler = WindowSampler(data, seed=SEED + len(rates))
+        epoch_rate = rate(data.__getitem__, iter(sampler), len(data))
+        rates.append(epoch_rate)
 
     benchmark.pedantic(epoch, rounds=2)  # type: ignore[no-untyped-call]
     fresh = dataset(root)
-    loader = DataLoader(
-        fresh, 2, sampler=WindowSampler(fresh, seed=SEED), collate_fn=collate
-    )
+    sampler = WindowSampler(fresh, seed=SEED)
+    loader = DataLoader(fresh, 2, sampler=sampler, collate_fn=collate)
     start = time.process_time()
     batches = sum(1 for _ in loader)
-    loaded = 2 * batches / (time.process_time() - start)
-    plain = rate(
-        dataset(root).__getitem__,
-        np.random.default_rng(SEED).integers(len(data), size=500),
-        500,
-    )
+    seconds = time.process_time() - start
+    loaded = 2 * batches / seconds
+    rng = np.random.default_rng(SEED)
+    any_order = rng.integers(len(data), size=500)
+    plain = rate(dataset(root).__getitem__, any_order, 500)
     print(f"\nours, sampler's order: {min(rates):.0f} windows/s (target {TARGET:.0f})")
     print(
         f"ours through DataLoader and collate, batch 2: {loaded:.0f}; any order, cold "
@@ -220,16 +217,17 @@ def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
 def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The public arrays are read within 10 % of the rate of the trainer's tensors."""
     tensors = dataset(root)
-    arrays = lagbench.windows(
-        "cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml")
-    )
+    registry = load(root / "datasets.yaml")
+    arrays = lagbench.windows("cavity", root=root, history=HISTORY, registry=registry)
+    routes = {"tensors": tensors, "arrays": arrays}
     order = list(WindowSampler(tensors, seed=SEED))
-    spent: dict[str, float] = {"tensors": 0.0, "arrays": 0.0}
+    spent = dict.fromkeys(routes, 0.0)
     # In turns over the same windows, so that a machine that slows down slows both.
     for first in range(0, len(order), RUN):
-        for name, data in (("tensors", tensors), ("arrays", arrays)):
+        indices = order[first : first + RUN]
+        for name, data in routes.items():
             start = time.process_time()
-            for index in order[first : first + RUN]:
+            for index in indices:
                 data[index]
             spent[name] += time.process_time() - start
     monkeypatch.setenv(REGISTRY_VARIABLE, str(root / "datasets.yaml"))
@@ -237,11 +235,10 @@ def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def read(index: int) -> NDArray[np.float32]:
         scenario, frame = tensors.place(index)
-        part = lazy.position.sel(scenario=scenario).isel(
-            frame=slice(frame, frame + tensors.length)
-        )
-        values: NDArray[np.float32] = part.values
-        return values
+        frames = slice(frame, frame + tensors.length)
+        positions = lazy.position.sel(scenario=scenario)
+        window: NDArray[np.float32] = positions.isel(frame=frames).values
+        return window
 
     ratio = spent["tensors"] / spent["arrays"]
     print(
@@ -260,14 +257,13 @@ def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     write_ours(few, FEW)
-    peaks = []
-    for folder, count in ((few, 4100), (root, 7000)):
-        peaks.append(float(measured_apart("-c", CHILD, str(folder), str(count))))
+    peak_of_few = measured_apart("-c", CHILD, str(few), "4100")  # [bytes]
+    peak_of_all = measured_apart("-c", CHILD, str(root), "7000")
     print(
-        f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: "
-        f"{peaks[1] / 1e6:.0f} MB"
+        f"\npeak memory, {FEW} scenarios: {peak_of_few / 1e6:.0f} MB; {SCENARIOS}: "
+        f"{peak_of_all / 1e6:.0f} MB"
     )
-    assert peaks[1] <= 1.05 * peaks[0]
+    assert peak_of_all <= 1.05 * peak_of_few
 
 
 def test_npz_in_memory(tmp_path: Path) -> None:
@@ -282,9 +278,10 @@ def test_npz_in_memory(tmp_path: Path) -> None:
     windows_in_each = FRAMES - HISTORY
 
     def read(index: int) -> tuple[NDArray[np.float32], ...]:
-        frames = trajectories[index // windows_in_each]
-        stop = index % windows_in_each + HISTORY
-        position = np.transpose(frames[stop - HISTORY : stop], (1, 0, 2))
+        number, first = divmod(index, windows_in_each)
+        frames = trajectories[number]
+        stop = first + HISTORY
+        position = np.transpose(frames[first:stop], (1, 0, 2))
         # Their collate stacks the windows: that copy is where the bytes are touched.
         return (
             np.ascontiguousarray(position),
@@ -292,11 +289,9 @@ def test_npz_in_memory(tmp_path: Path) -> None:
             frames[stop].copy(),
         )
 
-    windows_per_second = rate(
-        read,
-        np.random.default_rng(SEED).integers(TRAJECTORIES * windows_in_each, size=1000),
-        1000,
-    )
+    rng = np.random.default_rng(SEED)
+    indices = rng.integers(TRAJECTORIES * windows_in_each, size=1000)
+    windows_per_second = rate(read, indices, 1000)
     size = sum(frames.nbytes for frames in trajectories)
     print(
         f"\nNPZ in memory: {windows_per_second:.0f} windows/s, after {loading:.1f} s "
@@ -311,18 +306,14 @@ def test_hdf5_of_trajectories(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "train.h5") as file:
 
         def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-            group = file[f"{index // windows_in_each:05d}"]
-            first = index % windows_in_each
-            position = group["position"][first : first + HISTORY + 1].transpose(
-                (1, 0, 2)
-            )
+            number, first = divmod(index, windows_in_each)
+            group = file[f"{number:05d}"]
+            stop = first + HISTORY + 1
+            frames = group["position"][first:stop]
+            position = frames.transpose((1, 0, 2))
             return position, group["particle_type"][:]
 
-        windows_per_second = rate(
-            read,
-            np.random.default_rng(SEED).integers(
-                TRAJECTORIES * windows_in_each, size=200
-            ),
-            200,
-        )
+        rng = np.random.default_rng(SEED)
+        indices = rng.integers(TRAJECTORIES * windows_in_each, size=200)
+        windows_per_second = rate(read, indices, 200)
     print(f"\nHDF5 of trajectories: {windows_per_second:.0f} windows/s")
