@@ -1,7 +1,7 @@
 """A training step of the graph network: ours against the conventional one, in one run.
 
 Every side runs once, in a process of its own with one thread; its fastest step counts.
-Both tests together take about eight minutes of processor time, most of it to compile
+Both tests together take about seven minutes of processor time, most of it to compile
 layers and to import torch.
 """
 
