@@ -368,8 +368,8 @@ def recipe_for(
     if seed is not None:
         layers["training"]["seed"] = seed
 
-    model = _check_options(entry.model.Options, layers["model"], "model", where)
-    training = _check_options(TrainingOptions, layers["training"], "training", where)
+    model = validate_options(entry.model.Options, layers["model"], "model", where)
+    training = validate_options(TrainingOptions, layers["training"], "training", where)
     return Recipe(
         baseline=entry.name,
         name=name,
@@ -505,8 +505,8 @@ def change_options(
                 fix="set options of the model: --set model.KEY=VALUE",
             )
     model_options = entry.model.Options
-    before = _check_options(model_options, dict(options), "model", "--set")
-    after = _check_options(model_options, layers["model"], "model", "--set")
+    before = validate_options(model_options, dict(options), "model", "--set")
+    after = validate_options(model_options, layers["model"], "model", "--set")
     before_values = before.model_dump(mode="json")
     after_values = after.model_dump(mode="json")
     _check_unchanged("training", model_options.in_training, before_values, after_values)
@@ -535,7 +535,7 @@ def _check_unchanged(
 
 
 def _read_file(path: Path) -> _RecipeFile:
-    return _check_options(
+    return validate_options(
         _RecipeFile,
         read_yaml(path),
         "",
@@ -598,7 +598,7 @@ def _parse_setting(text: str) -> Layer:
     return dict(layer)
 
 
-def _check_options(
+def validate_options(
     options: type[OptionsT],
     values: object,
     group: str,

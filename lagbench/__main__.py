@@ -485,6 +485,15 @@ def _output_errors() -> Iterator[None]:
                 fix="see that they are there and can be written to, then repeat the "
                 "command",
             ) from error
+        if error.errno == errno.ENAMETOOLONG:
+            name = str(error.filename)
+            raise UsageError(
+                "no file can have that name",
+                where="an argument or an option",
+                expected="a name of at most 255 bytes",
+                got=f"{name[:60]!r}..., {len(os.fsencode(name))} bytes",
+                fix="use a shorter name",
+            ) from error
         if error.errno not in DISK_FULL_ERRORS:
             raise
         raise WorkFailedError(

@@ -44,6 +44,12 @@ _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?")
 MAX_TYPED = 80
 """The most characters of a value that an advice repeats."""
 
+MOST_NAME_BYTES = 255
+"""The longest name of a file or folder on common disks [bytes]."""
+
+MOST_PATH_BYTES = 4095
+"""The longest path that Linux takes [bytes]."""
+
 UNCHECKED = frozenset({"Any", "ArrayLike", "OwnMetrics", "object"})
 """Annotations that take any value, or whose values the function itself checks."""
 
@@ -198,6 +204,11 @@ def check_argument(
             fix=_suggest_value(name, value, kinds),
         )
     kind = accepting[0]
+    if PLAIN_KINDS["Path"] in kinds:
+        _check_path(name, value, where=where)
+    if isinstance(value, range):
+        # all whole numbers, and perhaps more than there is time for
+        return
     if kind.items and isinstance(value, Collection) and not isinstance(value, Mapping):
         for item in value:
             if not any(item_kind.accepts(item) for item_kind in kind.items):
@@ -208,6 +219,33 @@ def check_argument(
                     got=f"{_shorten(item)} in it",
                     fix="leave that value out, or correct it",
                 )
+            if PLAIN_KINDS["Path"] in kind.items:
+                _check_path(name, item, where=where)
+
+
+def _check_path(name: str, value: object, *, where: str) -> None:
+    """Refuse the path of a file that no disk can hold; addresses have other limits.
+
+    Raises:
+        UsageError: the path is too long, or has a zero character.
+    """
+    if not isinstance(value, str | os.PathLike):
+        return
+    path = os.fspath(value)
+    if not isinstance(path, str) or "://" in path:
+        return
+    encoded = path.encode("utf-8", "surrogateescape")
+    longest_name = max(len(part) for part in encoded.split(b"/"))
+    is_too_long = longest_name > MOST_NAME_BYTES or len(encoded) > MOST_PATH_BYTES
+    if is_too_long or b"\0" in encoded:
+        raise UsageError(
+            "no file can have that name",
+            where=f"{where}, {name}",
+            expected=f"names of at most {MOST_NAME_BYTES} bytes in a path of at most "
+            f"{MOST_PATH_BYTES}, without zero characters",
+            got=f"{_shorten(path)}, {len(encoded)} bytes",
+            fix="use another name",
+        )
 
 
 def find_kinds(annotation: str) -> tuple[ArgumentKind, ...]:

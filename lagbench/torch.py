@@ -340,6 +340,46 @@ def _check_step_result(position: object, shape: torch.Size) -> None:
         )
 
 
+def check_history(history: int | None, given_frames: int, *, where: str) -> int:
+    """Return how many of the given frames a model sees: all of them by default.
+
+    Raises:
+        UsageError: it is not 1 to all of them.
+    """
+    if history is None:
+        return given_frames
+    if not 1 <= history <= given_frames:
+        raise UsageError(
+            "a model cannot see that many of the given frames",
+            where=where,
+            expected=f"history from 1 to {given_frames}",
+            got=history,
+            fix="leave history out, or give fewer frames",
+        )
+    return history
+
+
+def _check_device(device: torch.device | str | int) -> torch.device:
+    """Return a device on which tensors can be made here and read again.
+
+    Raises:
+        UsageError: torch has no such device here.
+    """
+    try:
+        tensor = torch.zeros(1, device=device)
+        tensor.cpu()
+    except (RuntimeError, AssertionError, ValueError, NotImplementedError) as error:
+        reason = str(error).split("\n")[0][:200]
+        raise UsageError(
+            "torch has no such device here",
+            where="predict, device",
+            expected="a device of this machine, as in cpu, cuda or cuda:1",
+            got=f"{str(device)[:80]!r}: {reason}",
+            fix="leave device out: the model then runs on the processor",
+        ) from error
+    return tensor.device
+
+
 @check_arguments
 def predict(
     step: Step,
@@ -374,8 +414,8 @@ def predict(
         [frame, particle, axis].
 
     Raises:
-        UsageError: unknown split, size or subset, history beyond the given frames, a
-            scenario with fewer frames than the task, or a model that returns positions
+        UsageError: unknown split, size, subset or device, history beyond the given
+            frames, a scenario with fewer frames than the task, or a model that returns positions
             that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
@@ -383,16 +423,8 @@ def predict(
         split, subset=subset, size=size, root=root, future=0, registry=registry
     )
     task = data.size.task
-    if history is None:
-        history = task.input_frames
-    if not 1 <= history <= task.input_frames:
-        raise UsageError(
-            "a model cannot see that many of the given frames",
-            where="predict",
-            expected=f"history from 1 to {task.input_frames}",
-            got=history,
-            fix="leave history out, or give fewer frames",
-        )
+    history = check_history(history, task.input_frames, where="predict")
+    device = _check_device(device)
     visible_frames = slice(task.input_frames - history, None)
     needed_frames = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):

@@ -289,6 +289,32 @@ def test_advised_values_are_accepted(value: object, annotation: str) -> None:
     check_argument("name", ast.literal_eval(advice[1]), kinds, where="function")
 
 
+@pytest.mark.parametrize("annotation", ["str | Path | None", "Sequence[str | Path]"])
+@pytest.mark.parametrize(
+    "path", ["a" * 300, "a/" * 3000, "a\0b", Path("b" * 300), "\udcff" * 300]
+)
+def test_a_path_that_no_disk_can_hold_is_told(
+    path: str | Path, annotation: str
+) -> None:
+    """Paths are looked at before any work, those in lists too."""
+    value = [path] if annotation.startswith("Sequence") else path
+    with pytest.raises(UsageError, match="no file can have that name") as caught:
+        check_argument("name", value, find_kinds(annotation), where="function")
+    assert caught.value.where == "function, name"
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("path", ["a" * 255, "s3://bucket/" + "a" * 300, "\udcff"])
+def test_a_path_that_a_disk_or_store_can_hold_is_accepted(path: str) -> None:
+    """Keys of stores may be longer, and names need not be UTF-8."""
+    check_argument("name", path, find_kinds("str | Path"), where="function")
+
+
+def test_a_range_is_not_counted() -> None:
+    """Its numbers are whole, however many there are."""
+    check_argument("name", range(10**15), find_kinds("Scenarios"), where="function")
+
+
 def test_advice_repeats_no_part_of_a_long_text() -> None:
     """Half a name cannot be typed."""
     with pytest.raises(UsageError) as caught:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lagbench.data.local import locate
+from lagbench.errors import UsageError
 from lagbench.figures.pictures import (
     SCENARIO_ENDING,
     animate,
@@ -121,6 +122,14 @@ def animate_command(
     quiet: QuietFlag = False,
 ) -> None:
     """Make an MP4 or GIF film of a scenario, or of two side by side."""
+    if second is not None and beside is not None:
+        raise UsageError(
+            "a film shows two scenarios at most",
+            where="the second FILE and --beside",
+            expected="one of the two",
+            got=f"{second} and --beside {beside}",
+            fix="leave one of them out",
+        )
     path = animate(
         _choose_source(source, split),
         size=size,

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from lagbench.errors import UsageError
+
 from . import MATERIALS
 
 if TYPE_CHECKING:
@@ -75,10 +77,22 @@ def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
     Every use of the library goes through here, because it takes a tenth of a second to
     load: help and plans of work do without it. It stands here because a process that
     only writes does without h5py.
+
+    Raises:
+        UsageError: the path is no UTF-8, which the library needs.
     """
     import netCDF4
 
-    return netCDF4.Dataset(path, mode, format="NETCDF4")
+    try:
+        return netCDF4.Dataset(path, mode, format="NETCDF4")
+    except UnicodeEncodeError as error:
+        raise UsageError(
+            "no netCDF file can have that name",
+            where=str(path),
+            expected="a path in UTF-8",
+            got="bytes that are no UTF-8",
+            fix="use another name",
+        ) from error
 
 
 def expected_attributes(name: str, dims: Sequence[str]) -> dict[str, object]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,7 +45,8 @@ def plot(
     Args:
         source: name of the split, path of a local split's folder, or a scenario file.
         size: name of the size; as :func:`lagbench.open_split` picks it when None.
-        scenario: scenario id; the first one of test when None.
+        scenario: scenario id, where the source is a split; the first one of test when
+            None.
         frame: absolute frame number; negative ones count from the end.
         kind: all (three panels), speed, material, vorticity or streamlines; in three
             dimensions also front or above. Of a free surface kind ``all`` shows these
@@ -92,7 +94,8 @@ def animate(
     Args:
         source: name of the split, path of a local split's folder, or a scenario file.
         size: name of the size; as :func:`lagbench.open_split` picks it when None.
-        scenario: scenario id; the first one of test when None.
+        scenario: scenario id, where the source is a split; the first one of test when
+            None.
         beside: id of a second scenario of the split, or another scenario file.
         kind: speed, material or vorticity; material where there are several, else
             speed, when None.
@@ -117,18 +120,21 @@ def animate(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     second: Path | None = None
-    if isinstance(beside, int):
-        second = find_scenario(
-            source, size=size, scenario=beside, root=root, registry=registry
-        )
-    elif beside is not None:
+    named_files = [source]
+    if isinstance(beside, str | Path):
         second = Path(beside)
+        named_files.append(second)
+    elif beside is not None:
+        second = find_scenario(
+            source,
+            size=size,
+            scenario=operator.index(beside),
+            root=root,
+            registry=registry,
+        )
     if output is None:
         output = f"{_data_name(file)}.mp4"
     require_folder_of(Path(output))
-    named_files = [source]
-    if second is not None and not isinstance(beside, int):
-        named_files.append(second)
     with _blame_named_files(*named_files):
         return films.animate(
             file,
@@ -136,7 +142,7 @@ def animate(
             beside=second,
             kind=kind,
             frames_per_second=frames_per_second,
-            every=every,
+            every=operator.index(every),
             quiet=quiet,
             registry=registry,
         )
@@ -153,10 +159,18 @@ def find_scenario(
     """Return the scenario file that a user names by its path, or by split and id.
 
     Raises:
-        UsageError: no such split, size or scenario.
+        UsageError: no such split, size or scenario, or an id beside a file.
         DataError: the scenario is not on this machine.
     """
     if str(source).endswith(SCENARIO_ENDING):
+        if scenario is not None:
+            raise UsageError(
+                "a file holds one scenario, and an id names another",
+                where="SPLIT|FILE and --scenario or --beside",
+                expected="a file alone, or a split and an id",
+                got=f"{source} and {scenario}",
+                fix="leave the id out, or name the split instead of the file",
+            )
         return Path(source)
     tier, folder, _ = locate(source, size, root=root, registry=registry)
     if scenario is None:

@@ -8,6 +8,7 @@ nothing.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import operator
@@ -21,7 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.atomic import write_atomically
-from lagbench.data.layout import CACHE_VARIABLE, cache_folder, format_ids, parse_ids
+from lagbench.data.layout import (
+    CACHE_VARIABLE,
+    MAX_ID,
+    cache_folder,
+    format_ids,
+    parse_ids,
+)
 from lagbench.data.limits import NEEDED, Limit
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError, WorkFailedError, suggest_name
@@ -114,7 +121,17 @@ def select(
 def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
     if isinstance(subset, str):
         subset = subset.replace(" ", "").split(",")
-    names = tuple(subset or size.subsets)
+    names = tuple(size.subsets)
+    if subset is not None:
+        names = tuple(subset)
+    if not names:
+        raise UsageError(
+            "no subset is named",
+            where="--subset",
+            expected=", ".join(size.subsets),
+            got="an empty list",
+            fix="name one of these, or leave it out to take all",
+        )
     for name in names:
         if name not in size.subsets:
             raise UsageError(
@@ -131,7 +148,9 @@ def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
     try:
         if isinstance(scenarios, str):
             return parse_ids(scenarios)
-        return tuple(map(operator.index, scenarios))
+        # one more than there can be: a range or an iterator may go on for ever
+        first_numbers = itertools.islice(scenarios, MAX_ID + 2)
+        ids = tuple(map(operator.index, first_numbers))
     except TypeError:
         raise UsageError(
             "no ids",
@@ -140,6 +159,15 @@ def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
             got=repr(scenarios)[:80],
             fix="give a text, or whole numbers in a list",
         ) from None
+    if len(ids) > MAX_ID + 1:
+        raise UsageError(
+            "more ids than scenarios can have",
+            where="--scenarios",
+            expected=f"at most {MAX_ID + 1} ids, from 0 to {MAX_ID}",
+            got=repr(scenarios)[:80],
+            fix="name fewer",
+        )
+    return ids
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,13 +18,15 @@ from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, check_installed
 from lagbench.tensors import Batch
-from lagbench.torch import WindowDataset, collate
+from lagbench.torch import WindowDataset, check_history, collate
 
 from .onnx_checks import LEAST_OPSET, OUTPUT
 from .onnx_model import check_onnx
 from .onnx_rollout import open_session
 
 __all__ = ["export_onnx"]
+
+SUFFIX = ".onnx"
 
 MOST_DIFFERENCE = 1e-5
 """Distance between a predicted frame of the model and of its file [length]."""
@@ -68,16 +70,36 @@ def export_onnx(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: torch, onnx or onnxruntime is missing, the model cannot be traced,
-            or its file predicts something else.
+        UsageError: torch, onnx or onnxruntime is missing, the file has another suffix,
+            history is beyond the given frames, the model cannot be traced, or its file
+            predicts something else.
         UnreadableFileError: the file holds what an entry may not carry.
     """
+    target = Path(path)
+    if target.suffix != SUFFIX:
+        raise UsageError(
+            "an ONNX file needs its suffix",
+            where="export_onnx, path",
+            expected=f"a name that ends with {SUFFIX}",
+            got=target.name,
+            fix=f"name it {target.stem or 'model'}{SUFFIX}",
+        )
+    for module in modules:
+        if not isinstance(module, nn.Module):
+            raise UsageError(
+                "modules holds a value that is no network",
+                where="export_onnx, modules",
+                expected="a list of torch.nn.Module",
+                got=f"{type(module).__name__} in it",
+                fix="name the networks whose weights the step uses: modules=[net]",
+            )
     check_installed("onnx", extra="onnx")
     data = WindowDataset(
         split, subset="test", size=size, root=root, future=0, registry=registry
     )
     window = collate([data[data.starts[0]]])
     frames = window.frames
+    history = check_history(history, frames, where="export_onnx")
     inputs: dict[str, Tensor] = {
         "position": window.position.transpose(0, 1).contiguous(),
         "material": window.material,
@@ -90,11 +112,8 @@ def export_onnx(
         inputs["body_force"] = _one_frame_more(window.body_force[0], frames)
     if window.obstacle is not None:
         inputs["obstacle"] = window.obstacle[0]
-    wrapped = _Exported(
-        step, modules, history=history or frames, input_names=tuple(inputs)
-    )
+    wrapped = _Exported(step, modules, history=history, input_names=tuple(inputs))
 
-    target = Path(path)
     temporary = target.with_name(f".{target.stem}.exporting.onnx")
     try:
         _write(wrapped, inputs, temporary)

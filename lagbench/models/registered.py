@@ -11,6 +11,7 @@ from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
 from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.recipe import validate_options
 from lagbench.baselines.safetensors_file import SUFFIX
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -42,11 +43,15 @@ def build_registered(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: no such architecture, or it cannot be built for this data set.
+        UsageError: no such architecture, an option that does not fit, or it cannot be
+            built for this data set.
         DataError: the data set is not generated.
     """
     info = read_dataset_info(split, size, root=root, registry=registry)
-    return find(baseline).model.build(options or {}, info)
+    model = find(baseline).model
+    stated = dict(options or {})
+    validate_options(model.Options, stated, "options", "build_registered")
+    return model.build(stated, info)
 
 
 @check_arguments

@@ -35,7 +35,7 @@ from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import require_split, validate
-from lagbench.work.machine import available_cores
+from lagbench.work.machine import available_cores, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
@@ -472,13 +472,16 @@ def score_scenarios(
         )
 
     frame_count = len(scenarios) * task.config.horizon
-    if workers is None:
-        workers = 1
-        if frame_count * task.size.particles >= WORTH_WORKERS:
-            workers = available_cores()
+    default = 1
+    if frame_count * task.size.particles >= WORTH_WORKERS:
+        default = available_cores()
     meter.begin("scoring", total=frame_count, scenarios=len(scenarios))
     return run_all(
-        score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count
+        score_scenario,
+        jobs,
+        workers=worker_count(workers, default=default),
+        scheduler=scheduler,
+        report=meter.count,
     )
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
 from typer.testing import Result
@@ -115,3 +116,40 @@ def test_a_misspelt_folder_is_refused_and_not_made(
     assert result.exit_code == 2, result.output
     assert str(folder) in result.stderr
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("command", ["plot", "animate"])
+def test_a_file_beside_an_id_is_refused(
+    command: str, run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Nobody gets the picture of another scenario than the one that was named."""
+    file = generated.folder / "test" / "0003.nc"
+    result = run(command, file, "--scenario", 4, "-o", tmp_path / "a.gif")
+    assert result.exit_code == 2, result.output
+    assert "--scenario" in result.stderr
+
+
+def test_a_third_scenario_of_a_film_is_refused(
+    run: Run, generated: GenerationResult
+) -> None:
+    """One of the second file and --beside would be left out in silence."""
+    file = generated.folder / "test" / "0003.nc"
+    result = run("animate", file, file, "--beside", 4)
+    assert result.exit_code == 2, result.output
+    assert "--beside" in result.stderr
+
+
+def test_whole_numbers_of_numpy_name_scenarios_and_steps(
+    generated: GenerationResult, tmp_path: Path
+) -> None:
+    """A film takes every whole number for what it is."""
+    film = lagbench.animate(
+        SPLIT,
+        size=SIZE,
+        root=generated.root,
+        beside=np.int64(4),
+        every=np.array(13),
+        output=tmp_path / "film.gif",
+        quiet=True,
+    )
+    assert film.is_file()

@@ -241,6 +241,30 @@ def test_a_vanished_disk_and_full_memory_are_no_faults_of_lagbench(
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        ("list", "{long}"),
+        ("info", "{long}"),
+        ("plot", "{long}.nc"),
+        ("score", "{long}.nc"),
+        ("adopt", "{long}", "--radius", "0.1", "--frame-interval", "1", "-o", "own"),
+        ("compare", "p.nc", "persistence", "--board", "{long}"),
+        ("leaderboard", "show", "--board", "{long}"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_name_that_is_too_long_is_no_fault_of_lagbench(
+    words: tuple[str, ...], run: Run
+) -> None:
+    """No disk has such a file, and the message does not repeat all of the name."""
+    result = run(*(word.format(long="x" * 400) for word in words))
+    assert result.exit_code in (2, 3), result.output
+    assert "fix:" in result.stderr
+    assert "unexpected" not in result.stderr
+    assert len(result.stderr) < 1500
+
+
+@pytest.mark.parametrize(
     "line",
     [
         "generate cavity --size tiny --scenarios 0 --workers 1",

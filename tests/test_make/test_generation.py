@@ -5,11 +5,12 @@ trace.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -461,6 +462,23 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
             select(size, scenarios=no_ids)  # type: ignore[arg-type]
     everything = set().union(*size.subsets.values())
     assert set(select(size)) == everything
+
+
+@pytest.mark.parametrize("scenarios", [range(10**15), itertools.count()])
+def test_a_selection_without_end_is_refused(
+    scenarios: Iterable[int], unmeasured: Registry
+) -> None:
+    """A selection takes no more time and memory than there can be scenarios."""
+    with pytest.raises(UsageError, match="more ids than") as caught:
+        select(unmeasured.size("fluid", "full"), scenarios=scenarios)
+    assert caught.value.where == "--scenarios"
+
+
+def test_an_empty_list_of_subsets_is_not_all_of_them(unmeasured: Registry) -> None:
+    """A list that a program left empty does not start hours of work."""
+    with pytest.raises(UsageError) as caught:
+        select(unmeasured.size("fluid", "full"), subset=[])
+    assert caught.value.where == "--subset"
 
 
 @pytest.mark.slow

@@ -261,6 +261,50 @@ def test_what_an_onnx_model_is_not_given_is_told(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"path": "predictions.nc"}, "export_onnx, path"),
+        ({"path": ""}, "export_onnx, path"),
+        ({"history": 0}, "export_onnx"),
+        ({"history": -1}, "export_onnx"),
+        ({"history": 1000}, "export_onnx"),
+        ({"modules": [3]}, "export_onnx, modules"),
+    ],
+)
+def test_arguments_that_do_not_fit_an_export_are_told(
+    changes: dict[str, Any],
+    where: str,
+    tmp_path: Path,
+    generated: GenerationResult,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No file of another kind is written over, and no model sees other frames."""
+    monkeypatch.chdir(tmp_path)
+    options = {"path": "model.onnx", "split": SIZE.split, "size": SIZE.name, **changes}
+    with pytest.raises(UsageError) as caught:
+        export_onnx(lambda window: window.position[:, -1], root=generated.root, **options)
+    assert caught.value.where == where
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("device", ["", "gpu", "cuda:999", "meta", -1, 10**30, "a\0b"])
+def test_a_device_that_is_not_there_is_told(
+    device: str | int, generated: GenerationResult
+) -> None:
+    """Torch has five kinds of errors for that."""
+    rollouts = predict(
+        lambda window: window.position[:, -1],
+        SIZE.split,
+        size=SIZE.name,
+        root=generated.root,
+        device=device,
+    )
+    with pytest.raises(UsageError) as caught:
+        next(rollouts)
+    assert caught.value.where == "predict, device"
+
+
 def without_kernel(window: Batch) -> torch.Tensor:
     """Return the last positions; onnxruntime has no erf of float64."""
     now = window.position[:, -1]

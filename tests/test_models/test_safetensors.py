@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from conftest import SIZE, SPLIT
 from hostile_safetensors import (
     HOSTILE,
     not_a_number,
@@ -25,7 +27,7 @@ from lagbench.board.reproduce import reproduce
 from lagbench.board.submit import submit
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
-from lagbench.models.registered import export_safetensors
+from lagbench.models.registered import build_registered, export_safetensors
 
 MOST_SECONDS = 5.0  # until a hostile file is refused [s]
 
@@ -79,6 +81,23 @@ def test_the_checks_run_in_a_child(sound: Path) -> None:
     with pytest.raises(UnreadableFileError) as caught:
         check_in_child(sound)
     assert caught.value.where == str(sound)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"latent": None}, {"latent": 0}, {"lattent": 8}, {3: 8}, {"noise_std": "much"}],
+)
+def test_options_that_do_not_fit_are_told(
+    options: dict[Any, Any], generated: GenerationResult
+) -> None:
+    """With all parts of a message, as those of a recipe."""
+    with pytest.raises(UsageError) as caught:
+        build_registered(
+            "gns", split=SPLIT, size=SIZE, options=options, root=generated.root
+        )
+    error = caught.value
+    assert error.where == "build_registered"
+    assert None not in (error.expected, error.got, error.fix)
 
 
 def test_what_cannot_be_exported_is_refused(

@@ -20,6 +20,7 @@ from typer.testing import Result
 import lagbench
 from lagbench import submission
 from lagbench.__main__ import app
+from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.submission import validation
@@ -451,3 +452,13 @@ def test_foreign_text_does_not_reach_the_terminal(
     assert "method" in result.stderr
     assert "\x1b" not in result.output
     assert "\a" not in result.output
+
+
+def test_a_template_whose_name_is_no_utf_8_is_told(
+    generated: GenerationResult, tmp_path: Path
+) -> None:
+    """The library of netCDF writes no such file."""
+    output = tmp_path / "caf\udce9.nc"
+    with pytest.raises(UsageError, match="no netCDF file"):
+        lagbench.template(SPLIT, SIZE, output=output, root=generated.root)
+    assert not output.exists()

@@ -335,6 +335,16 @@ def test_scoring_reads_every_predicted_frame_once(
     assert reads == Counter(product(bench.size.subsets["test"], frames))
 
 
+@pytest.mark.parametrize("workers", [0, -1])
+def test_no_worker_cannot_score(
+    workers: int, bench: ScoreBench, predictions: Path
+) -> None:
+    """Less than one is a mistake, also where one process does the work."""
+    with pytest.raises(UsageError) as caught:
+        bench.evaluate(predictions, workers=workers)
+    assert caught.value.where == "--workers"
+
+
 def test_progress_reaches_its_total(bench: ScoreBench, predictions: Path) -> None:
     reports: list[Progress] = []
     bench.evaluate(predictions, workers=1, progress=reports.append)
