@@ -415,8 +415,8 @@ def predict(
 
     Raises:
         UsageError: unknown split, size, subset or device, history beyond the given
-            frames, a scenario with fewer frames than the task, or a model that returns positions
-            that are not finite.
+            frames, a scenario with fewer frames than the task, or a model that returns
+            positions that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
     data = WindowDataset(

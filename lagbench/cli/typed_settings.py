@@ -39,6 +39,7 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
     >>> advise_on_settings(["train", "--set", "training.steps", "=", "10"])
     'write settings with = and without blanks: --set training.steps=10'
     """
+    words = _separate_options(words)
     settings: list[str] = []
     has_mistake = False
     is_setting = False
@@ -62,9 +63,23 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
             is_setting = False
     if not has_mistake:
         return None
-    quoted_settings = [shlex.quote(shorten_word(setting)) for setting in settings]
-    options = " ".join(f"--set {setting}" for setting in quoted_settings)
+    if any(len(setting) > MOST_LETTERS for setting in settings):
+        # half a setting cannot be typed
+        return "write settings with = and without blanks: --set KEY=VALUE"
+    options = " ".join(f"--set {shlex.quote(setting)}" for setting in settings)
     return f"write settings with = and without blanks: {options}"
+
+
+def _separate_options(words: Sequence[str]) -> list[str]:
+    """Return words in which a setting stands behind its option: --set=a is --set a."""
+    separate = []
+    for word in words:
+        option, equals, setting = word.partition("=")
+        if option == "--set" and equals:
+            separate += [option, setting]
+        else:
+            separate.append(word)
+    return separate
 
 
 def advise_on_lists(words: Sequence[str]) -> str | None:
@@ -110,11 +125,16 @@ def check_typed_settings(words: Sequence[str]) -> None:
         is_setting = words[number - 1] == "--set"
         if is_setting and "=" not in word and not word.startswith("-"):
             following = " ".join(words[number + 1 : number + 2])
+            advice = f"write its value behind a =: --set {shorten_word(word)}=VALUE"
+            key, colon, value = word.partition(":")
+            if colon and value and len(word) <= MOST_LETTERS:
+                advice = f"write = for the colon: --set {shlex.quote(f'{key}={value}')}"
+            elif len(word) > MOST_LETTERS:
+                advice = "write its value behind a =: --set KEY=VALUE"
             raise UsageError(
                 "a setting has no =",
                 where="--set",
                 expected="--set KEY=VALUE",
                 got=f"--set {shorten_word(word)} {shorten_word(following)}".rstrip(),
-                fix=advise_on_settings(words)
-                or f"write its value behind a =: --set {shorten_word(word)}=VALUE",
+                fix=advise_on_settings(words) or advice,
             )

@@ -17,6 +17,8 @@ from .box import AXES
 
 __all__ = ["keep_outside", "parse_obstacle"]
 
+LARGEST = float(np.finfo(np.float32).max)
+
 
 def parse_obstacle(
     attributes: Mapping[str, object], dimension: int, *, where: str
@@ -46,7 +48,8 @@ def parse_obstacle(
     for name in names:
         stated = np.asarray(attributes.get(name))
         is_number = stated.size == 1 and stated.dtype.kind in "iuf"
-        if not is_number or not np.isfinite(stated).all():
+        # float32 has no larger numbers; not a number is no less
+        if not is_number or not (abs(stated) <= LARGEST).all():
             raise DataError(
                 "the obstacle has no place or no size",
                 where=f"{where}, attribute {name}",

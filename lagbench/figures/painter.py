@@ -19,7 +19,7 @@ from .canvas import (
     pixels_of,
 )
 from .colours import MATERIAL_COLOURS, PAPER, parse_rgb
-from .panels import Panel, box_of, draw_cube, draw_walls
+from .panels import Panel, box_of, draw_cube, draw_walls, place_of_slice
 from .particles import DOT_DIAMETER, DOT_DIAMETER_SOLID, paint_particles
 from .recording import Recording, Scene
 from .solid import View, shade
@@ -181,10 +181,13 @@ class Painter:
             side = self._side / DPI  # [inch]
             with figure(side, side) as drawn:
                 axes = drawn.add_axes((0, 0, 1, 1))
-                if self._view is None:
-                    draw_walls(axes, scene.recording, scene.frame)
-                else:
+                if self._view is not None:
                     draw_cube(axes, scene.recording, scene.frame)
+                elif scene.recording.is_solid:
+                    cut = place_of_slice(scene)
+                    draw_walls(axes, scene.recording, scene.frame, cut=cut)
+                else:
+                    draw_walls(axes, scene.recording, scene.frame)
                 walls = pack(pixels_of(drawn))
             self._walls_by_direction[directions] = walls
         return walls

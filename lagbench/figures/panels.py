@@ -85,8 +85,15 @@ def name_slice(scene: Scene) -> str:
     """Return where the plane lies that is drawn of a box of three dimensions."""
     if scene.recording.size.is_full_box:
         return SLICE
-    place = scene.recording.size.field_grid.places(2)[scene.layer]
-    return f"across z at {place:.2f}"
+    return f"across z at {place_of_slice(scene):.2f}"
+
+
+def place_of_slice(scene: Scene) -> float:
+    """Return where the plane that is drawn cuts the third axis [length]."""
+    size = scene.recording.size
+    if size.is_full_box:
+        return float(size.box.centre[2])
+    return float(size.field_grid.places(2)[scene.layer])
 
 
 # particles drawn at the most; more would take memory and no eye would tell
@@ -131,6 +138,9 @@ def draw(
         draw_walls(axes, recording, scene.frame, plane=(0, 2))
     elif recording.is_solid and panel in (Panel.MATERIAL, Panel.SPEED):
         draw_cube(axes, recording, scene.frame)
+    elif recording.is_solid and panel not in OF_PARTICLES:
+        cut = place_of_slice(scene)
+        draw_walls(axes, recording, scene.frame, cut=cut)
     else:
         draw_walls(axes, recording, scene.frame)
     scale = colour_scale(panel, limit, is_solid=recording.is_solid)
@@ -200,11 +210,18 @@ def draw_walls(
     frame: int,
     *,
     plane: tuple[int, int] = (0, 1),
+    cut: float | None = None,
 ) -> None:
-    """Draw the walls as bands around the box.
+    """Draw the walls as bands around the box, and an obstacle in it.
 
-    Arrowheads on a moving wall show which way it slides. The plane names the axes to
-    the right and upwards.
+    Arrowheads on a moving wall show which way it slides.
+
+    Args:
+        axes: where to draw.
+        recording: the scenario.
+        frame: number of the frame.
+        plane: axes to the right and upwards.
+        cut: where a plane cuts the third axis, if it shows less than the whole box.
     """
     axes.set(
         xlim=(0, 1),
@@ -220,7 +237,11 @@ def draw_walls(
     _fill_rectangle(axes, (0.0, 0.0, 1.0, 1.0), WALL, order=0)
     _fill_rectangle(axes, (left, bottom, width, height), PAPER, order=0.5)
     if recording.obstacle is not None:
-        _draw_disc(axes, recording.obstacle)
+        centre = recording.obstacle[:-1].astype(np.float64)
+        radius = float(recording.obstacle[-1])
+        if cut is not None:
+            radius = math.sqrt(max(0.0, radius**2 - (cut - centre[2]) ** 2))
+        _draw_disc(axes, centre[list(plane)], radius)
 
     # x, y, width and height of the walls at both ends of both axes
     horizontal, vertical = plane
@@ -236,9 +257,11 @@ def draw_walls(
             _draw_moving_wall(axes, bands[wall], along_plane)
 
 
-def _draw_disc(axes: Axes, obstacle: NDArray[np.float32]) -> None:
-    """Draw a fixed disc, given its centre and radius, over fields and under dots."""
-    x, y, radius = obstacle.tolist()
+def _draw_disc(axes: Axes, centre: Floats, radius: float) -> None:
+    """Draw a disc over fields and under dots; one without a radius is not there."""
+    if radius == 0.0:
+        return
+    x, y = centre
     angle = np.linspace(0.0, 2.0 * math.pi, CORNERS)
     edge_x = x + radius * np.cos(angle)
     edge_y = y + radius * np.sin(angle)
@@ -246,7 +269,10 @@ def _draw_disc(axes: Axes, obstacle: NDArray[np.float32]) -> None:
 
 
 def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
-    """Draw the edges of a box of three dimensions, and fill the walls that move."""
+    """Draw the edges of a box of three dimensions, and an obstacle in it.
+
+    Walls that move are filled.
+    """
     axes.set(
         xlim=(0, 1),
         ylim=(0, 1),
@@ -256,6 +282,9 @@ def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
         frame_on=False,
     )
     view = View(recording.size.box)
+    if recording.obstacle is not None:
+        centre = view.place(recording.obstacle[:-1])
+        _draw_disc(axes, centre, view.scale * float(recording.obstacle[-1]))
     for wall, _ in moving_walls(recording, frame):
         corners = view.wall(wall)
         axes.fill(

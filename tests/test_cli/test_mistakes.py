@@ -206,6 +206,9 @@ HINTS = {
     f"{TRAIN} gns --set training.steps=1 training.batch=2": (
         "--set training.steps=1 --set training.batch=2"
     ),
+    f"{TRAIN} gns --set=training.steps 10": "blanks: --set training.steps=10",
+    f"{TRAIN} gns --set training.steps:10": "colon: --set training.steps=10",
+    f"{TRAIN} gns --set training.{'k' * 60} 10": "blanks: --set KEY=VALUE",
     f"{TRAIN} gns --set training.steps = 10": "blanks: --set training.steps=10",
     f"{TRAIN} gns --set training.steps= 10": "blanks: --set training.steps=10",
     f"{TRAIN} gns --set training.steps =10": "blanks: --set training.steps=10",

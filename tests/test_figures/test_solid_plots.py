@@ -8,16 +8,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.collections import PathCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from rotating_disc import write_swirl
 
 from lagbench.errors import UsageError
 from lagbench.figures.animate import Film
-from lagbench.figures.panels import FEW_NODES, Panel, limit_of
+from lagbench.figures.colours import MUTED
+from lagbench.figures.panels import FEW_NODES, Panel, draw, limit_of, place_of_slice
 from lagbench.figures.plot import KINDS, choose_moments, plot_frame
 from lagbench.figures.recording import Recording, open_recording
+from lagbench.figures.solid import View
 
 FRAMES = 3
 BOTTOM = 0.125  # of the box of fluid-3d tiny
@@ -207,3 +211,57 @@ def test_moments_of_a_row_lie_apart(frames: int, steps: int) -> None:
     assert moments[0] == 0
     assert moments[-1] == frames - 1
     assert min(np.diff(moments)) == steps
+
+
+BALL = BLOCK.assign_attrs(
+    obstacle_x=0.7, obstacle_y=0.4, obstacle_z=0.3, obstacle_diameter=0.2
+)
+"""An obstacle away from the particles, in front of the plane that cuts them."""
+
+
+def draw_ball(kind: Panel, scenario: xr.Dataset) -> NDArray[np.float64]:
+    """Return the corners of the discs in a panel, shape [corner, 2]."""
+    axes = Figure().add_subplot()
+    with open_recording(scenario) as recording:
+        draw(axes, kind, recording.scene(0), limit=1.0)
+    corners = [np.empty((0, 2))]
+    for patch in axes.patches:
+        if isinstance(patch, Polygon) and to_hex(patch.get_facecolor()) == MUTED:
+            corners.append(np.asarray(patch.get_xy()))
+    return np.concatenate(corners)
+
+
+@pytest.mark.parametrize(
+    ("kind", "centre"), [(Panel.FRONT, (0.7, 0.4)), (Panel.ABOVE, (0.7, 0.3))]
+)
+def test_a_view_shows_the_outline_of_an_obstacle(
+    kind: Panel, centre: tuple[float, float]
+) -> None:
+    """Where its centre lies in the plane, and as large as it is."""
+    from_centre = draw_ball(kind, BALL) - centre
+    assert len(from_centre) > 0
+    np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 0.1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
+def test_a_slice_shows_the_cut_of_an_obstacle(kind: Panel) -> None:
+    """A circle where the plane cuts it, and nothing where it passes by."""
+    assert len(draw_ball(kind, BALL)) == 0
+    with open_recording(BLOCK) as recording:
+        cut = place_of_slice(recording.scene(0))
+    met = BALL.assign_attrs(obstacle_z=cut + 0.06)
+    from_centre = draw_ball(kind, met) - [0.7, 0.4]
+    assert len(from_centre) > 0
+    np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 0.08, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [Panel.SPEED, Panel.MATERIAL])
+def test_a_cube_holds_its_obstacle(kind: Panel) -> None:
+    """It stands where the view puts its centre, in the scale of the view."""
+    with open_recording(BALL) as recording:
+        view = View(recording.size.box)
+    from_centre = draw_ball(kind, BALL) - view.place(np.array([0.7, 0.4, 0.3]))
+    assert len(from_centre) > 0
+    np.testing.assert_allclose(
+        np.linalg.norm(from_centre, axis=1), 0.1 * view.scale, rtol=1e-5
+    )

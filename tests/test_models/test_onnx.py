@@ -281,9 +281,14 @@ def test_arguments_that_do_not_fit_an_export_are_told(
 ) -> None:
     """No file of another kind is written over, and no model sees other frames."""
     monkeypatch.chdir(tmp_path)
-    options = {"path": "model.onnx", "split": SIZE.split, "size": SIZE.name, **changes}
+    options: dict[str, Any] = {
+        "path": "model.onnx",
+        "split": SIZE.split,
+        "size": SIZE.name,
+        "root": generated.root,
+    }
     with pytest.raises(UsageError) as caught:
-        export_onnx(lambda window: window.position[:, -1], root=generated.root, **options)
+        export_onnx(lambda window: window.position[:, -1], **options | changes)
     assert caught.value.where == where
     assert not list(tmp_path.iterdir())
 
