@@ -39,6 +39,7 @@ EXPECTATIONS = {
     "set_type": "a list in brackets",
     "frozen_set_type": "a list in brackets",
     "iterable_type": "a list in brackets",
+    "sequence_str": "a list in brackets",
     "too_short": "at least {min_values}",
     "too_long": "at most {max_values}",
     "dict_type": "keys with values",
@@ -106,6 +107,10 @@ PATTERN_WORDS = {
 """Our patterns in words: people do not read regular expressions."""
 
 
+CLASS_WORDS = {"Sequence": "a list in brackets", "Mapping": "keys with values"}
+"""What an object of a class is called in a file."""
+
+
 def describe_expectation(detail: ErrorDetails) -> str:
     """Return what was expected where pydantic found something else.
 
@@ -119,6 +124,8 @@ def describe_expectation(detail: ErrorDetails) -> str:
     context = detail.get("ctx", {})
     if detail["type"] == "string_pattern_mismatch":
         return PATTERN_WORDS.get(context["pattern"], OTHER)
+    if detail["type"] == "is_instance_of":
+        return CLASS_WORDS.get(context.get("class", ""), OTHER)
     words = dict(context)
     for end in ("min", "max"):
         count = context.get(f"{end}_length")

@@ -12,7 +12,14 @@ from typing import IO, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    with_config,
+)
 from pydantic_core import ErrorDetails
 
 # pydantic reads the TypedDict of Python 3.12 and later only
@@ -149,21 +156,34 @@ Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
 """A number that a message can print."""
 
 
+def _refuse_truth(value: object) -> object:
+    """Refuse True and False, which pydantic takes for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("a number, not true or false")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_refuse_truth)]
+
+Text = Annotated[str, Field(max_length=100_000)]
+"""A text that a file in UTF-8 can hold, which pydantic checks with its length."""
+
+
 @with_config(ConfigDict(extra="forbid"))
 class DataOptions(TypedDict, total=False):
     """What a user may say of data from elsewhere; see :class:`Description`."""
 
-    title: str
-    text: str
-    citation: str
-    licence: str
-    radius: float
-    frame_interval: float
+    title: Text
+    text: Text
+    citation: Text
+    licence: Text
+    radius: Number
+    frame_interval: Number
     bounds: Annotated[Bounds, Field(min_length=2, max_length=3)]
     periodic: Sequence[str]
     rescale: bool
-    density: float
-    spacing: float
+    density: Number
+    spacing: Number
     axes: Sequence[str]
     input_frames: Count
     horizon: Count

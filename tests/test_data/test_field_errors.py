@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -56,6 +57,9 @@ class Inner(BaseModel):
         (int, [], "a whole number"),
         (int, "9" * 5000, "a whole number with fewer digits"),
         (float, "many", "a number"),
+        (Sequence[str], "x,y", "a list in brackets"),
+        (Sequence[str], 3, "a list in brackets"),
+        (Mapping[str, int], [], "keys with values"),
         (float, None, "a number"),
         (Annotated[float, Field(allow_inf_nan=False)], "nan", "a finite number"),
         (Annotated[int, Field(gt=0)], 0, "a number greater than 0"),

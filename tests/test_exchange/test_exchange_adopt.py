@@ -1218,3 +1218,26 @@ def test_a_periodic_axis_needs_a_name_and_bounds(
         with pytest.raises(UsageError) as caught:
             adopt_here(paths, **options)
         assert caught.value.where == "--periodic"
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("radius", True, "a number"),
+        ("frame_interval", False, "a number"),
+        ("periodic", "x,y", "a list in brackets"),
+        ("axes", 3, "a list in brackets"),
+        ("title", "caf\udce9", "UTF-8"),
+        ("licence", "\udcff", "UTF-8"),
+    ],
+)
+def test_options_of_a_wrong_kind_are_told_before_any_work(
+    tmp_path: Path, option: str, value: object, expected: str
+) -> None:
+    """True is no number, a text no list, and a file in UTF-8 holds no other text."""
+    save_runs(tmp_path / "in", straight_runs(3))
+    options: dict[str, Any] = {**BASIC, option: value}
+    with pytest.raises(UsageError) as caught:
+        adopt(tmp_path / "in", output=tmp_path / "mine", **options)
+    assert caught.value.where == option
+    assert expected in str(caught.value.expected)
