@@ -368,7 +368,7 @@ def _check_device(device: torch.device | str | int) -> torch.device:
     try:
         tensor = torch.zeros(1, device=device)
         tensor.cpu()
-    except (RuntimeError, AssertionError, ValueError, NotImplementedError) as error:
+    except (RuntimeError, AssertionError, TypeError, ValueError) as error:
         reason = str(error).split("\n")[0][:200]
         raise UsageError(
             "torch has no such device here",

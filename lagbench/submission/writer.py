@@ -292,12 +292,13 @@ class PredictionsWriter:
         """Refuse a rollout that moves after the frame from which it is frozen."""
         frames = frames_to_predict(self.size)
         where = f"diverged_at of scenario {scenario}"
-        if diverged_at not in frames:
+        is_whole = isinstance(diverged_at, int | np.integer)
+        if not is_whole or diverged_at not in frames:
             raise UsageError(
                 "no such frame is predicted",
                 where=where,
-                expected=format_ids(frames),
-                got=repr(diverged_at),
+                expected=f"a whole number, {format_ids(frames)}",
+                got=repr(diverged_at)[:80],
                 fix="give the absolute number of the first frozen frame; frame 0 is "
                 "the first given one",
             )

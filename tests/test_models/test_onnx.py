@@ -293,11 +293,13 @@ def test_arguments_that_do_not_fit_an_export_are_told(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("device", ["", "gpu", "cuda:999", "meta", -1, 10**30, "a\0b"])
+@pytest.mark.parametrize(
+    "device", ["", "gpu", "cuda:999", "meta", -1, 10**30, "a\0b", np.array(2)]
+)
 def test_a_device_that_is_not_there_is_told(
-    device: str | int, generated: GenerationResult
+    device: Any, generated: GenerationResult
 ) -> None:
-    """Torch has five kinds of errors for that."""
+    """Torch has several kinds of errors for that."""
     rollouts = predict(
         lambda window: window.position[:, -1],
         SIZE.split,

@@ -254,6 +254,8 @@ WRONG_COMPANIONS: list[tuple[Labels, str]] = [
     ({"diverged_at": {4: 100_000}}, "diverged_at of scenario 4"),
     ({"diverged_at": {4: GIVEN - 1}}, "diverged_at of scenario 4"),
     ({"diverged_at": {4: -5}}, "diverged_at of scenario 4"),
+    ({"diverged_at": {4: 7.0}}, "diverged_at of scenario 4"),
+    ({"diverged_at": {4: np.zeros(3)}}, "diverged_at of scenario 4"),
 ]
 
 

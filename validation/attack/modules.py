@@ -113,6 +113,34 @@ def other_form(path: Path, rng: np.random.Generator) -> None:
 SETTINGS: tuple[Mutation, ...] = (other_value, other_value, other_key, other_form)
 
 
+GRAPH_KEYS = (
+    "model.compression",
+    "model.compresion",
+    "model.noise_spread",
+    "model.noise_std",
+    "model.recovery",
+    "model.radius",
+    "model.pushforward",
+    "training.compression",
+    "noise_spread",
+)
+"""Names of settings of graph networks, some of them misspelt."""
+
+GRAPH_VALUES = ("0.5", "1", "2", "8", "yes", "50%", "0,5", "5e-4m", *VALUES)
+
+
+def other_graph_setting(path: Path, rng: np.random.Generator) -> None:
+    """Change one or two settings of a small graph network."""
+    words = ["--set", "training.steps=1"]
+    for _ in range(int(rng.integers(1, 3))):
+        key = _choose(rng, GRAPH_KEYS)
+        words += ["--set", f"{key}={_choose(rng, GRAPH_VALUES)}"]
+    path.write_text("\n".join(words))
+
+
+GRAPH_SETTINGS: tuple[Mutation, ...] = (other_graph_setting,)
+
+
 # --- modules --------------------------------------------------------------------------
 
 NUMBER = re.compile(r"\b\d+(?:\.\d+)?\b")

@@ -38,8 +38,9 @@ from .arrays import (
 )
 from .models import ONNX, write_straight_on
 from .models import WEIGHTS as WEIGHT_MUTATIONS
-from .modules import MODULES, SETTINGS
+from .modules import GRAPH_SETTINGS, MODULES, SETTINGS
 from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
+from .obstacles import OBSTACLES, write_scenario
 from .running import run_command
 from .safetensors_files import SAFETENSORS, write_small_network
 
@@ -51,6 +52,11 @@ COMMITTED_ENTRIES = ("gns", "hybrid-projection")
 
 EXAMPLE = Path(__file__).parents[2] / "docs/examples/dam_break"
 """A split of a user's own."""
+
+KINDS = ("all", "speed", "vorticity", "streamlines", "front", "above")
+"""Pictures of a cube."""
+
+GRAPH_WORDS = ("--set", "training.steps=1", "--set", "model.noise_spread=true")
 
 SETTING_WORDS = ("--set", "training.seed=1", "--set", "model.evaluations=5")
 
@@ -228,7 +234,12 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
     (folder / "arrays-2/describe.yaml").write_text(DESCRIPTION)
     _make_falling_split(folder, run)
     _install_own_split(folder / "own-split")
+    (folder / "obstacle").mkdir()
+    size = load().size("curl-noise-3d", "tiny")
+    scenario = size.path(root, size.subsets["test"][0])
+    write_scenario(scenario, folder / "obstacle/ball.nc")
     (folder / "models/settings.txt").write_text("\n".join(SETTING_WORDS))
+    (folder / "models/graph.txt").write_text("\n".join(GRAPH_WORDS))
     for path in folder.glob("scored-*"):
         shutil.rmtree(path)
     (folder / "complete").touch()
@@ -611,6 +622,31 @@ def _typed_targets() -> list[Target]:
             commands=[train],
             weight=12,
             has_words=True,
+        ),
+        Target(
+            name="settings of a graph network",
+            source="models",
+            victim="graph.txt",
+            mutations=GRAPH_SETTINGS,
+            commands=[
+                (
+                    *("train", "--baseline", "gns", "--split", "curl-noise"),
+                    *("--size", "tiny", "--device", "cpu", "-o", "r", "-q"),
+                )
+            ],
+            weight=8,
+            has_words=True,
+        ),
+        Target(
+            name="pictures of an obstacle in a cube",
+            source="obstacle",
+            victim="ball.nc",
+            mutations=(*OBSTACLES, *OBSTACLES, *BYTES, *PLACES),
+            commands=[
+                *[("plot", "ball.nc", "--kind", kind, "-o", "a.png") for kind in KINDS],
+                ("animate", "ball.nc", "--every", "12", "-o", "a.gif"),
+            ],
+            weight=8,
         ),
         Target(
             name="module of a split",
