@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,7 +22,7 @@ OBSTACLE = {
 HASHED = "hashed_parameters"
 """The attribute that names the parameters of a scenario."""
 
-STATED = (
+STATED: tuple[Any, ...] = (
     0.0,
     -1.0,
     7.0,
