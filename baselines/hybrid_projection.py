@@ -1,13 +1,13 @@
 """Hybrid: the projection solver, with a viscous closure whose coefficients are learned.
 
     du/dt + div(u u) = -grad p + nu' lap u - mu lap lap u,    div u = 0
-    nu' = (1 + a) nu + b h^2 / T,    mu = c h^4 / T
+    nu' = max(0, (1 + a) nu + b h^2 / T),    mu = max(0, c) h^4 / T
 
 with the viscosity nu that is given, the spacing h of the grid and the frame interval T.
 The solver that made the data carries momentum through particles and a grid of its own:
 it damps what its grid hardly sees. The textbook solver of
 :mod:`lagbench.references.projection` does not; a, b and c say by how much it should.
-With all three 0 the model is that solver, digit by digit.
+With all three 0 the model is that solver, up to the rounding of float32.
 
 The coefficients are fitted to rollouts of the solver over many frames of ``train``: a
 solver with a learned part that is trained through its own steps (Um et al. 2020,
@@ -43,7 +43,7 @@ STABLE_DECAY = 1.6
 """Time step times the fastest rate of decay, at most; Heun's scheme allows 2."""
 
 FIRST_STEP = 0.02  # of the simplex method, in each coefficient
-LARGEST = 2.0  # magnitude of a coefficient in the search
+LARGEST = 2.0  # magnitude of a coefficient; more would need very many time steps
 WORST_ERROR = 10.0  # error of coefficients with which the solver breaks down
 
 
@@ -172,15 +172,26 @@ class FlowState:
     position: Floats  # particle positions [length], shape [particle, axis]
     frame: int  # number of the frame that was reached, counted from the window's first
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all velocities are numbers; else the solver has broken down."""
+        return all(np.isfinite(values).all() for values in self.field)
+
     def later_field(self, *, frame: int, duration: float) -> Velocity:
-        """Return the face velocities after some time on the way to a frame."""
-        return self.grid.advance(
-            self.field,
-            duration=duration,
-            viscosity=self.viscosity,
-            wall_velocity=self.drive.wall_velocity(frame),
-            force=self.drive.force(frame),
-        )
+        """Return the face velocities after some time on the way to a frame.
+
+        Velocities that are not finite stay as they are.
+        """
+        if not self.is_finite:
+            return self.field
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.grid.advance(
+                self.field,
+                duration=duration,
+                viscosity=self.viscosity,
+                wall_velocity=self.drive.wall_velocity(frame),
+                force=self.drive.force(frame),
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +255,7 @@ class Sample:
 class HybridOptions(Options):
     """Options of the hybrid."""
 
-    in_training = frozenset({"scenarios", "frames", "evaluations"})
+    in_training = frozenset({"numerical", "scenarios", "frames", "evaluations"})
     of_weights = frozenset({"resolution"})
 
     # cells over those of the score grid, along each axis
@@ -302,9 +313,17 @@ class HybridProjection(Baseline):
         """Return the flows that the last two given frames show.
 
         Raises:
-            DataError: the viscosity is not known.
+            DataError: the viscosity is not known, or a coefficient is out of range.
         """
         values = self.coefficients.double().cpu().numpy()
+        if not np.abs(values).max() <= LARGEST:
+            raise DataError(
+                "the damping of the hybrid is out of range",
+                where="coefficients of the weights",
+                expected=f"numbers from -{LARGEST:g} to {LARGEST:g}",
+                got=values.tolist(),
+                fix="train the model with `lagbench train`",
+            )
         flows = []
         for window in range(given.windows):
             is_inside = given.sample == window
@@ -363,7 +382,7 @@ class HybridProjection(Baseline):
                 got="none",
                 fix="train neuralmpm, or a graph network such as gns",
             )
-        # A file states it in float64; the solver's steps may hang on the last digit.
+        # In float64, as the solver computes: its steps may hang on the last digit.
         stated = float(given.viscosity[window])
         relative, added, hyper = coefficients.tolist()  # a, b, c
         cell_counts = np.asarray(self._cell_counts(self.options.resolution))
@@ -401,6 +420,9 @@ class HybridProjection(Baseline):
         interval = self.info.frame_interval
         next_frame = flow.frame + 1
         field = flow.later_field(frame=next_frame, duration=interval)
+        later = replace(flow, field=field, frame=next_frame)
+        if not later.is_finite:
+            return replace(later, position=np.full_like(flow.position, np.nan))
         position = flow.grid.carry(
             flow.position,
             before=flow.field,
@@ -408,7 +430,7 @@ class HybridProjection(Baseline):
             duration=interval,
             wall_velocity=flow.drive.wall_velocity(next_frame),
         )
-        return replace(flow, field=field, position=position, frame=next_frame)
+        return replace(later, position=position)
 
     # --- the fit ------------------------------------------------------------------
 
@@ -420,11 +442,23 @@ class HybridProjection(Baseline):
 
         Args:
             scenarios: whole scenarios, one a batch.
+
+        Raises:
+            UsageError: no scenario is longer than the given frames.
         """
         samples: list[Sample] = []
         for scenario in itertools.islice(scenarios, self.options.scenarios):
             sample = self._prepare(scenario)
-            samples.append(sample)
+            if sample.observations:
+                samples.append(sample)
+        if not samples:
+            raise UsageError(
+                "no scenario has frames to fit the damping to",
+                where="HybridProjection.fit",
+                expected=f"more than {self.info.input_frames} frames in a scenario",
+                got="none",
+                fix="train on a data set with longer scenarios",
+            )
         size = 1
         if self.options.numerical:
             size = 3
@@ -500,17 +534,20 @@ class HybridProjection(Baseline):
         squared_truth = 0.0
         for observation in sample.observations:
             next_frame = flow.frame + 1
-            later = flow.later_field(frame=next_frame, duration=interval)
+            field = flow.later_field(frame=next_frame, duration=interval)
+            later = replace(flow, field=field, frame=next_frame)
+            if not later.is_finite:
+                return WORST_ERROR
             # The mean of both ends stands for the step between two frames.
             middle = []
-            for start, end in zip(flow.field, later, strict=True):
+            for start, end in zip(flow.field, field, strict=True):
                 middle.append((start + end) / 2)
             vorticity = observation.vorticity_of(middle, flow.grid)
             difference = vorticity - observation.true_vorticity
             squared_error += float(np.square(difference).sum())
             squared_truth += float(np.square(observation.true_vorticity).sum())
-            flow = replace(flow, field=later, frame=next_frame)
-        if not np.isfinite(squared_error) or squared_truth == 0.0:
+            flow = later
+        if squared_truth == 0.0:
             return WORST_ERROR
         relative_error = float(np.sqrt(squared_error / squared_truth))
         return min(WORST_ERROR, relative_error)

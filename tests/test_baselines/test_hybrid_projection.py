@@ -20,7 +20,7 @@ from lagbench.baselines.hybrid_projection import (
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.box import Box
 from lagbench.data.registry import Size, load
-from lagbench.errors import DataError
+from lagbench.errors import DataError, UsageError
 from lagbench.references import projection
 from lagbench.references.predictor import Given
 from lagbench.references.staggered import StaggeredGrid
@@ -287,6 +287,56 @@ def test_a_fit_finds_a_damping_that_the_data_show() -> None:
     numbers = model.fit([window])
     assert numbers["relative"] > 0.0
     assert numbers["error"] < numbers["error_without"]
+
+
+def test_a_fit_finds_the_damping_of_flows_that_it_made_itself() -> None:
+    """The lid's speed changes each frame: a fit that is a frame off has 0.4."""
+    true_model = HybridProjection.build({}, cavity_info())
+    true_model.coefficients.copy_(torch.tensor([0.0, 0.04, 0.06]))
+    given_frames = cavity().task.input_frames
+    fitted_frames = 12
+    walls = moving_lid(given_frames + fitted_frames)
+    walls[:, 3, 0] *= np.cos(2.5 * np.arange(len(walls)))
+    path = turning(given_frames)
+    (rollout,) = roll_out(true_model, batch_of(path, walls, VISCOSITY), fitted_frames)
+    predicted = rollout.position.double().numpy()
+    whole_path = np.concatenate([path, predicted])
+
+    model = HybridProjection.build({"evaluations": 60}, cavity_info())
+    numbers = model.fit([batch_of(whole_path, walls, VISCOSITY)])
+
+    assert numbers["error_without"] > 0.1
+    assert numbers["error"] < 0.02
+
+
+def test_a_flow_that_breaks_down_ends_in_no_number() -> None:
+    """Positions are NaN from then on, without an error or a warning."""
+    model = HybridProjection.build({}, cavity_info())
+    walls = moving_lid(8)
+    state = model.start(batch_of(turning(6), walls, VISCOSITY))
+    (flow,) = state.flows
+    flow.field[0][:] = np.inf
+    for _ in range(2):
+        state, position = model.advance(state)
+    assert position.isnan().all()
+
+
+@pytest.mark.parametrize("coefficient", [1e6, -3e38, float("nan")])
+def test_damping_out_of_range_is_refused(coefficient: float) -> None:
+    """A weights file could ask for more time steps than any machine can take."""
+    model = HybridProjection.build({}, cavity_info())
+    model.coefficients[2] = coefficient
+    with pytest.raises(DataError) as raised:
+        model.start(batch_of(turning(6), moving_lid(6), VISCOSITY))
+    assert raised.value.where == "coefficients of the weights"
+
+
+def test_scenarios_without_frames_to_fit_are_refused() -> None:
+    model = HybridProjection.build({}, cavity_info())
+    given_frames = cavity().task.input_frames
+    too_short = batch_of(turning(given_frames), moving_lid(given_frames), VISCOSITY)
+    with pytest.raises(UsageError):
+        model.fit([too_short])
 
 
 def test_a_viscosity_that_is_not_known_is_refused() -> None:
