@@ -234,7 +234,11 @@ def _check_path(name: str, value: object, *, where: str) -> None:
     path = os.fspath(value)
     if not isinstance(path, str) or "://" in path:
         return
-    encoded = path.encode("utf-8", "surrogateescape")
+    try:
+        encoded = path.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:
+        # half of a character: no name of a file, like the zero character
+        encoded = b"\0"
     longest_name = max(len(part) for part in encoded.split(b"/"))
     is_too_long = longest_name > MOST_NAME_BYTES or len(encoded) > MOST_PATH_BYTES
     if is_too_long or b"\0" in encoded:
@@ -243,7 +247,7 @@ def _check_path(name: str, value: object, *, where: str) -> None:
             where=f"{where}, {name}",
             expected=f"names of at most {MOST_NAME_BYTES} bytes in a path of at most "
             f"{MOST_PATH_BYTES}, without zero characters",
-            got=f"{_shorten(path)}, {len(encoded)} bytes",
+            got=f"{_shorten(path)}, {len(path)} characters",
             fix="use another name",
         )
 

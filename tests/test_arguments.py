@@ -291,7 +291,7 @@ def test_advised_values_are_accepted(value: object, annotation: str) -> None:
 
 @pytest.mark.parametrize("annotation", ["str | Path | None", "Sequence[str | Path]"])
 @pytest.mark.parametrize(
-    "path", ["a" * 300, "a/" * 3000, "a\0b", Path("b" * 300), "\udcff" * 300]
+    "path", ["a" * 300, "a/" * 3000, "a\0b", "\ud800", Path("b" * 300), "\udcff" * 300]
 )
 def test_a_path_that_no_disk_can_hold_is_told(
     path: str | Path, annotation: str

@@ -980,9 +980,12 @@ def test_a_file_that_is_too_long_is_refused_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["", ".json"])
-def test_a_name_that_is_too_long_is_unreadable(tmp_path: Path, suffix: str) -> None:
+def test_a_name_that_is_too_long_is_told(tmp_path: Path, suffix: str) -> None:
+    """No disk has such a file, so it is a mistake of the call."""
     name = "x" * 300 + suffix
-    assert_unreadable(tmp_path / name)
+    with pytest.raises(UsageError) as caught:
+        compare(tmp_path / name, "persistence")
+    assert caught.value.where == "compare, first"
 
 
 @pytest.mark.parametrize(
