@@ -153,7 +153,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "verified": BoardCheck(
         "a line of verified.yaml about an entry that is not there, or has other score "
-        "files by now; a level that the records of the line do not show",
+        "files by now; a level that the records of the line do not prove",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
