@@ -123,7 +123,7 @@ class ClosedGrid(StaggeredGrid):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drive:
+class WindowForcing:
     """What drives the flow of one scenario towards each frame that is known."""
 
     walls: Floats  # wall velocities [length/s], shape [frame, 2 axis, axis]
@@ -132,7 +132,7 @@ class Drive:
     forces: Floats | None
 
     @classmethod
-    def of(cls, batch: Batch, window: int) -> Drive:
+    def of(cls, batch: Batch, window: int) -> WindowForcing:
         """Return what drives a window of a batch; walls at rest where none moves."""
         dimension = batch.position.shape[2]
         walls = np.zeros((1, 2 * dimension, dimension))
@@ -144,7 +144,7 @@ class Drive:
         return cls(walls=walls, forces=forces)
 
     @property
-    def moves_walls(self) -> bool:
+    def has_moving_walls(self) -> bool:
         """Whether a wall ever moves."""
         return bool(self.walls.any())
 
@@ -166,7 +166,7 @@ class FlowState:
     """One scenario on the way: its solver and where its fluid is."""
 
     grid: ClosedGrid
-    drive: Drive
+    forcing: WindowForcing
     viscosity: float  # nu' [length^2/s]
     field: Velocity  # face velocities [length/s]
     position: Floats  # particle positions [length], shape [particle, axis]
@@ -189,8 +189,8 @@ class FlowState:
                 self.field,
                 duration=duration,
                 viscosity=self.viscosity,
-                wall_velocity=self.drive.wall_velocity(frame),
-                force=self.drive.force(frame),
+                wall_velocity=self.forcing.wall_velocity(frame),
+                force=self.forcing.force(frame),
             )
 
 
@@ -337,12 +337,12 @@ class HybridProjection(Baseline):
         """Return the flow of one window, brought to its last given frame."""
         interval = self.info.frame_interval
         box = self.info.box
-        drive = Drive.of(given, window)
+        forcing = WindowForcing.of(given, window)
         viscosity, hyperviscosity = self._closure(given, window, coefficients)
         grid = ClosedGrid(
             box,
             cells=self._cell_counts(self.options.resolution),
-            no_slip=drive.moves_walls,
+            no_slip=forcing.has_moving_walls,
             hyperviscosity=hyperviscosity,
         )
         frames = given.position[is_inside].double().cpu().numpy()
@@ -356,11 +356,11 @@ class HybridProjection(Baseline):
         else:
             middle = (position + before) / 2
         field = grid.from_particles(
-            middle, step / interval, wall_velocity=drive.wall_velocity(last_frame)
+            middle, step / interval, wall_velocity=forcing.wall_velocity(last_frame)
         )
         flow = FlowState(
             grid=grid,
-            drive=drive,
+            forcing=forcing,
             viscosity=viscosity,
             field=field,
             position=position,
@@ -428,7 +428,7 @@ class HybridProjection(Baseline):
             before=flow.field,
             after=field,
             duration=interval,
-            wall_velocity=flow.drive.wall_velocity(next_frame),
+            wall_velocity=flow.forcing.wall_velocity(next_frame),
         )
         return replace(later, position=position)
 
@@ -504,9 +504,9 @@ class HybridProjection(Baseline):
         box = self.info.box
         given_frames = self.info.input_frames
         frame_count = min(scenario.frames, given_frames + self.options.frames)
-        drive = Drive.of(scenario, 0)
+        forcing = WindowForcing.of(scenario, 0)
         score_grid = StaggeredGrid(
-            box, cells=self._cell_counts(1.0), no_slip=drive.moves_walls
+            box, cells=self._cell_counts(1.0), no_slip=forcing.has_moving_walls
         )
         positions = scenario.position.double().numpy()
         observations = []
@@ -517,7 +517,7 @@ class HybridProjection(Baseline):
                 score_grid,
                 position=box.inside(before + step / 2.0),
                 velocity=step / self.info.frame_interval,
-                wall_velocity=drive.wall_velocity(frame),
+                wall_velocity=forcing.wall_velocity(frame),
             )
             observations.append(observation)
         given = scenario.part(slice(given_frames))
@@ -527,8 +527,8 @@ class HybridProjection(Baseline):
         """Return the error of a rollout with some coefficients [1]."""
         given = sample.given
         particle_count = len(given.position)
-        everybody = torch.ones(particle_count, dtype=torch.bool)
-        flow = self._begin(given, 0, everybody, coefficients)
+        all_particles = torch.ones(particle_count, dtype=torch.bool)
+        flow = self._begin(given, 0, all_particles, coefficients)
         interval = self.info.frame_interval
         squared_error = 0.0
         squared_truth = 0.0
