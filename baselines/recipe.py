@@ -224,6 +224,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "obstacle": False,
         "noise_spread": False,
         "compression": 0.0,
+        "free_flight": None,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

@@ -19,7 +19,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -40,6 +40,7 @@ from .baseline import (
     last_velocities,
 )
 from .forcing import ForcingFeatures, root_mean_square, skip_frames
+from .free_flight import FreeFlight
 from .graph import (
     NodeFeatures,
     Standardisation,
@@ -315,6 +316,9 @@ class GraphNetworkOptions(Options):
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     # neighbours of a particle at most, the nearest; all within the radius when None
     neighbours: int | None = Field(default=None, ge=1)
+    # how far matter acts on matter; walls act half as far [radius]. A body that nothing
+    # reaches gets one learned mean acceleration. None leaves it to the network.
+    free_flight: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     # keep particles in the box, and their velocities true to that, in training and in
     # rollouts
     clamp: bool = True
@@ -351,6 +355,14 @@ class GraphNetwork(Baseline):
                 expected="model.recovery, a number of frames",
                 got="model.recovery=null",
                 fix="--set model.recovery=8, or leave model.compression out",
+            )
+        if options.free_flight is not None and (options.body_force or options.obstacle):
+            raise UsageError(
+                "a body in free flight meets no force but gravity",
+                where="model.free_flight",
+                expected="null, beside model.body_force or model.obstacle",
+                got=options.free_flight,
+                fix="leave the option out",
             )
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
@@ -396,9 +408,26 @@ class GraphNetwork(Baseline):
             layers=options.layers,
             sum_messages=options.sum_messages,
         )
+        self.free_flight: FreeFlight | None = None
+        if options.free_flight is not None:
+            self.free_flight = FreeFlight(
+                info,
+                reach=options.free_flight * self.radius,
+                unit=self.acceleration_std,
+            )
         last_layer = self.network.decoder[-1]
         for parameter in last_layer.parameters():
             nn.init.zeros_(parameter)
+
+    def adapt_weights(
+        self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
+    ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
+        """Return the weights, with a fall of 0 if they have none and this model has."""
+        name = "free_flight.fall"
+        if self.free_flight is None or name in weights:
+            return weights, options
+        no_fall = torch.zeros_like(self.free_flight.fall)
+        return {**weights, name: no_fall}, options
 
     @property
     def forcing_seen(self) -> frozenset[str]:
@@ -663,11 +692,17 @@ class GraphNetwork(Baseline):
         """Return the state one frame on and the operator's own losses."""
         edge_index = self.find_edges(state)
         output, losses = self.predict(state, edge_index, generator)
+        last_velocity = state.velocity[:, -1]
         if self.options.target is GraphTarget.VELOCITY:
             velocity = self.velocity.inverse(output)
         else:
             acceleration = self.acceleration.inverse(output)
-            velocity = state.velocity[:, -1] + acceleration
+            velocity = last_velocity + acceleration
+        if self.free_flight is not None:
+            acceleration = self.free_flight(
+                velocity - last_velocity, state.position, last_velocity, state.sample
+            )
+            velocity = last_velocity + acceleration
 
         position = state.position + velocity
         inside = self._keep_inside(position)
