@@ -1,0 +1,114 @@
+"""Do bodies in free flight have the mean acceleration of gravity?
+
+    python benchmarks/free_flight.py --root FOLDER [--split NAME ...]
+
+Prints how much of the particles belongs to such bodies in the true data, and how far
+the mean acceleration of these bodies is from gravity, for several reaches of forces
+(``model.free_flight`` of graph networks).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from lagbench.baselines.free_flight import find_bodies
+from lagbench.baselines.rollout import scenario_batch, scenario_paths
+from lagbench.data.registry import Size
+from lagbench.data.registry import load as load_registry
+from lagbench.tensors import TensorBox
+
+REACHES = (2.0, 2.8, 3.4, 4.0)  # reaches of forces [radius]
+FRAME_STEP = 5  # frames between those that are measured
+SCENARIOS = 12  # of train, at most
+
+
+class FlyingBody(NamedTuple):
+    """A body in free flight in one frame."""
+
+    particles: int
+    error: float  # largest component of mean acceleration less gravity [g]
+
+
+def find_flying(size: Size, path: Path, reach: float) -> Iterator[FlyingBody]:
+    """Yield the flying bodies of a scenario's frames.
+
+    Args:
+        size: split and size of the data.
+        path: file of the scenario.
+        reach: distance up to which particles act on each other [radius].
+    """
+    gravity = float(size.value("gravity")) * size.frame_interval**2
+    fall = torch.zeros(size.dimension, dtype=torch.float64)
+    fall[1] = -gravity
+    box = TensorBox(size.box)
+    length = reach * size.task.radius
+
+    position = scenario_batch(path).position.double()
+    sample = torch.zeros(len(position), dtype=torch.int64)
+    for frame in range(2, position.shape[1] - 1, FRAME_STEP):
+        before, now, after = position[:, frame - 1 : frame + 2].unbind(1)
+        velocity = now - before
+        acceleration = after - now - velocity
+        body, flies = find_bodies(now, velocity, sample, reach=length, box=box)
+        for number in flies.nonzero().flatten():
+            members = acceleration[body == number]
+            error = (members.mean(dim=0) - fall).abs().max()
+            yield FlyingBody(len(members), float(error) / gravity)
+
+
+def count_measured(paths: Sequence[Path]) -> int:
+    """Return how many particle frames are looked at."""
+    count = 0
+    for path in paths:
+        position = scenario_batch(path).position
+        frames = len(range(2, position.shape[1] - 1, FRAME_STEP))
+        count += frames * len(position)
+    return count
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/free_flight.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--root", type=Path, default=os.environ.get("LAGBENCH_ROOT"))
+    parser.add_argument("--split", nargs="+", default=["fluid"])
+    parser.add_argument("--size", default="mini")
+    options = parser.parse_args(arguments)
+    if options.root is None:
+        parser.error("name the folder of all data sets: --root FOLDER")
+
+    registry = load_registry()
+    print("| data set | reach [radius] | share of particles | mean error [g] |")
+    print("| --- | ---: | ---: | ---: |")
+    for split in options.split:
+        size = registry.size(split, options.size)
+        found = scenario_paths(
+            split, subset="train", size=options.size, root=Path(options.root)
+        )
+        paths = list(found.values())[:SCENARIOS]
+        measured = count_measured(paths)
+        for reach in REACHES:
+            flying = 0
+            error_sum = 0.0
+            for path in paths:
+                for body in find_flying(size, path, reach):
+                    flying += body.particles
+                    error_sum += body.particles * body.error
+            error = error_sum / max(flying, 1)
+            share = flying / measured
+            print(f"| {split} {options.size} | {reach:g} | {share:.3f} | {error:.1e} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
