@@ -114,6 +114,12 @@ def select_window(batch: Batch, window: int) -> Batch:
     obstacle = batch.obstacle
     if obstacle is not None:
         obstacle = obstacle[row]
+    particle_mass = batch.particle_mass
+    if particle_mass is not None:
+        particle_mass = particle_mass[row]
+    friction = batch.friction
+    if friction is not None:
+        friction = friction[row]
     sample = batch.sample[is_inside]
     return Batch(
         position=batch.position[is_inside],
@@ -126,6 +132,8 @@ def select_window(batch: Batch, window: int) -> Batch:
         viscosity=viscosity,
         body_force=force,
         obstacle=obstacle,
+        particle_mass=particle_mass,
+        friction=friction,
     )
 
 
@@ -258,6 +266,9 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
         force = None
         if "body_force" in file.variables:
             force = file.read("body_force", later_frames)
+        particle_mass = None
+        if "particle_mass" in file.variables:
+            particle_mass = float(file.read("particle_mass"))
         scenario = file.header.key.scenario
         header = file.header
         stated = header.viscosity
@@ -268,7 +279,9 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
         viscosity = stated
     window = copy_window(list(position), material, walls, scenario, first)
     window = window._replace(viscosity=viscosity, body_force=force, obstacle=obstacle)
-    return tensors(window)
+    return tensors(window)._replace(
+        particle_mass=particle_mass, friction=header.friction
+    )
 
 
 def scenario_paths(

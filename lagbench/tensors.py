@@ -109,6 +109,10 @@ class TensorWindow(NamedTuple):
     # centre and radius of a fixed obstacle [length], float32, shape [axis + 1]; None
     # without one
     obstacle: Tensor | None = None
+    # mass of one particle [mass]; None where it is not known
+    particle_mass: float | None = None
+    # Coulomb friction of the walls [1]; None where the file states none
+    friction: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +142,12 @@ class Batch:
     # centre and radius of each window's fixed obstacle [length], shape [window, axis +
     # 1]; None without one
     obstacle: Tensor | None = None
+    # mass of one particle of each window [mass], float64, shape [window]; None where it
+    # is not known
+    particle_mass: Tensor | None = None
+    # Coulomb friction of the walls in each window [1], float64, shape [window]; None
+    # where the files state none
+    friction: Tensor | None = None
 
     @property
     def windows(self) -> int:
@@ -226,6 +236,8 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
     origins = []
     viscosities = []
     obstacles = []
+    masses = []
+    frictions = []
     lengths = set()
     for window in windows:
         lengths.add(window.position.shape[1])
@@ -239,9 +251,21 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             viscosities.append(window.viscosity)
         if window.obstacle is not None:
             obstacles.append(window.obstacle)
+        if window.particle_mass is not None:
+            masses.append(window.particle_mass)
+        if window.friction is not None:
+            frictions.append(window.friction)
 
     all_or_none = {0, len(windows)}
-    given = (wall_velocities, body_forces, origins, viscosities, obstacles)
+    given = (
+        wall_velocities,
+        body_forces,
+        origins,
+        viscosities,
+        obstacles,
+        masses,
+        frictions,
+    )
     is_uniform = {len(values) for values in given} <= all_or_none
     if len(lengths) != 1 or not is_uniform:
         raise UsageError(
@@ -251,7 +275,8 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
             f"with moving walls, {len(body_forces)} with a body force, "
             f"{len(origins)} with their first frame, "
-            f"{len(viscosities)} with a viscosity, {len(obstacles)} with an obstacle",
+            f"{len(viscosities)} with a viscosity, {len(obstacles)} with an obstacle, "
+            f"{len(masses)} with a mass, {len(frictions)} with a friction",
             fix="collate windows of one WindowDataset",
         )
 
@@ -267,7 +292,16 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         viscosity=torch.tensor(viscosities) if viscosities else None,
         body_force=_stack_forcing(body_forces),
         obstacle=torch.stack(obstacles) if obstacles else None,
+        particle_mass=_in_double(masses),
+        friction=_in_double(frictions),
     )
+
+
+def _in_double(values: Sequence[float]) -> Tensor | None:
+    """Return a number for each window in float64; None without any."""
+    if not values:
+        return None
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _stack_forcing(forcings: Sequence[Tensor]) -> Tensor | None:

@@ -75,6 +75,12 @@ class ScenarioHeader:
         stated = self.parameters.get("viscosity")
         return parse_viscosity(stated, where=f"{self.key}")
 
+    @property
+    def friction(self) -> float | None:
+        """Coulomb friction of the walls that the file states [1]; None without one."""
+        stated = self.parameters.get("friction")
+        return _parse_positive(stated, "friction", unit="1", where=f"{self.key}")
+
 
 def parse_viscosity(stated: object, *, where: str) -> float | None:
     """Return the kinematic viscosity in a file's attribute; None without one.
@@ -86,20 +92,27 @@ def parse_viscosity(stated: object, *, where: str) -> float | None:
     Raises:
         DataError: it is no finite number from 0.
     """
+    return _parse_positive(stated, "viscosity", unit="length^2/s", where=where)
+
+
+def _parse_positive(
+    stated: object, name: str, *, unit: str, where: str
+) -> float | None:
+    """Return a number from 0 in a file's attribute; None without one."""
     if stated is None:
         return None
     values = np.asarray(stated)
     is_number = values.size == 1 and values.dtype.kind in "iuf"
-    viscosity = float(values.item()) if is_number else math.nan
-    if not 0.0 <= viscosity < math.inf:
+    number = float(values.item()) if is_number else math.nan
+    if not 0.0 <= number < math.inf:
         raise DataError(
-            "the viscosity has an impossible value",
-            where=f"{where}, attribute viscosity",
-            expected="a finite number from 0 [length^2/s]",
+            f"the {name} has an impossible value",
+            where=f"{where}, attribute {name}",
+            expected=f"a finite number from 0 [{unit}]",
             got=stated,
             fix="mend the attribute, or make the file again",
         )
-    return viscosity
+    return number
 
 
 class ScenarioFile:

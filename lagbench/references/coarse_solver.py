@@ -15,8 +15,8 @@ frame is extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall 
 
 from __future__ import annotations
 
-import functools
 import math
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -26,11 +26,7 @@ from lagbench.data.registry import Size
 from lagbench.errors import require
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import Solver, build
-from lagbench.generators.split import (
-    ClosedBoxParameters,
-    FreeSurfaceParameters,
-    InitialState,
-)
+from lagbench.generators.split import InitialState, SolverParameters
 
 from .predictor import (
     Floats,
@@ -97,41 +93,88 @@ def predict(given: Given, times: int) -> Prediction:
 
 def predict_with(given: Given, coarse: Size) -> Prediction:
     """Yield positions that the solver finds with the constants of a size."""
-    require("taichi", extra="generate")
-
-    count = min(coarse.particles, len(given.last))
-    position = given.last.copy()
-    carriers = spread_subset(position, given.material, count)
-    others = np.setdiff1d(np.arange(len(position)), carriers)
-    leader = _leaders(given, carriers, others)
-    offset = given.box.displacement(position[carriers][leader], position[others])
-    before = position[carriers]
-    solver = _solver(replace(solver_constants(coarse), particles=count))
-    solver.load([_state(given, carriers)])
-    for frame in given.predicted_frames:
-        solver.advance(coarse.substeps_per_frame)
-        after = solver.position()[0].astype(np.float64)
-        if given.size.is_full_box and others.size:
-            points, velocities = with_wall_images(
-                given,
-                before,
-                given.box.displacement(before, after),
-                given.walls[frame],
-            )
-            field = velocity_field(points, velocities)
-            position[others] += field(position[others])
-        else:
-            position[others] = after[leader] + offset
-        position[carriers] = after
-        before = after
-        position = given.inside(position)
+    rollout = CoarseRollout(given, coarse)
+    for _ in given.predicted_frames:
+        position = rollout.advance()
         yield position.astype("float32")
 
 
-@functools.lru_cache(maxsize=1)
-def _solver(constants: ClosedBoxParameters | FreeSurfaceParameters) -> Solver:
-    """Build a solver, or take the last one again: building compiles."""
-    return build(constants, threads=1)
+class CoarseRollout:
+    """A scenario on its way, on the grid and with the constants of a coarser size.
+
+    Args:
+        given: what is given of the scenario.
+        coarse: grid, constants and number of particles that carry mass.
+    """
+
+    def __init__(self, given: Given, coarse: Size) -> None:
+        require("taichi", extra="generate")
+
+        self.given = given
+        self.substeps = coarse.substeps_per_frame
+        self.frame = given.predicted_frames[0]  # the next one, an absolute number
+        self.position = given.last.copy()
+        count = min(coarse.particles, len(given.last))
+        self.carriers = spread_subset(self.position, given.material, count)
+        self.before = self.position[self.carriers]  # where they were a frame ago
+        all_particles = np.arange(len(self.position))
+        self.others = np.setdiff1d(all_particles, self.carriers)
+        self.leader = _leaders(given, self.carriers, self.others)
+        self.offset = given.box.displacement(
+            self.position[self.carriers][self.leader], self.position[self.others]
+        )
+        constants = replace(solver_constants(coarse), particles=count)
+        self.solver = _borrow_solver(constants)
+        weakref.finalize(self, _give_back, constants, self.solver)
+        self.solver.load([_state(given, self.carriers)])
+
+    def advance(self) -> Floats:
+        """Return the positions in the next frame [length], shape [particle, axis].
+
+        The last wall velocities that are known stay.
+
+        Raises:
+            WorkFailedError: the solver left the bounds within which it is valid.
+        """
+        given = self.given
+        self.solver.advance(self.substeps)
+        after = self.solver.position()[0].astype(np.float64)
+        position = self.position.copy()
+        if given.size.is_full_box and self.others.size:
+            last_known = len(given.walls) - 1
+            points, velocities = with_wall_images(
+                given,
+                self.before,
+                given.box.displacement(self.before, after),
+                given.walls[min(self.frame, last_known)],
+            )
+            field = velocity_field(points, velocities)
+            position[self.others] += field(position[self.others])
+        else:
+            position[self.others] = after[self.leader] + self.offset
+        position[self.carriers] = after
+        self.before = after
+        self.position = given.inside(position)
+        self.frame += 1
+        return self.position
+
+
+_idle_solver: dict[SolverParameters, Solver] = {}
+"""The solver that was used last, if it is free: to build one compiles it."""
+
+
+def _borrow_solver(constants: SolverParameters) -> Solver:
+    """Return a solver that no other rollout uses."""
+    solver = _idle_solver.pop(constants, None)
+    if solver is None:
+        solver = build(constants, threads=1)
+    return solver
+
+
+def _give_back(constants: SolverParameters, solver: Solver) -> None:
+    """Keep a solver for the next rollout, instead of the one that was kept."""
+    _idle_solver.clear()
+    _idle_solver[constants] = solver
 
 
 def spread_subset(

@@ -329,7 +329,7 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
 @pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the coarse solver take the solver that is there."""
-    coarse_solver._solver.cache_clear()
+    coarse_solver._idle_solver.clear()
     monkeypatch.setattr("lagbench.generators.solver.build", compiled)
 
 

@@ -1,0 +1,397 @@
+"""Hybrid: the solver on a coarser grid, with constants that are learned.
+
+On a grid with half as many cells the material-point solver damps the flow more: each
+transfer between particles and nodes averages over a larger cell. Softer matter carries
+sound more slowly. It allows longer time steps, so there are fewer transfers, and each
+frame loses less. The hybrid changes the constants of the solver accordingly:
+
+    viscosity     max(0, 1 + a) nu          (liquid; elastic damping of solids likewise)
+    modulus       exp(b) K                  (liquid)
+    relaxation    min(1, exp(c) kappa)      (share of the grid's J in a time step)
+    coupling      min(1, exp(d) theta)      (pull of J towards the density of the grid)
+    moduli        exp(e) E                  (all solids)
+
+The time steps of a frame follow from the fastest sound: the number of sound's cells in
+a time step stays what it is in the classical ``coarse-solver``. With all five 0 the
+model is that solver, to the bit.
+
+The coefficients are fitted to rollouts on ``train``, as those of
+:mod:`.hybrid_projection` are, by the simplex method of Nelder and Mead (1965). The
+error that they minimise is the metric of free surfaces, ``cloud_distance``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.optimize import minimize
+from torch import Tensor
+
+from lagbench.data.registry import Size
+from lagbench.data.registry import load as load_registry
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.references.coarse_solver import SOLVED, CoarseRollout, coarser
+from lagbench.references.predictor import Given
+
+from .baseline import Baseline, Batch, DatasetInfo, Options
+
+Floats = NDArray[np.float64]
+
+COEFFICIENTS = ("viscosity", "modulus", "relaxation", "coupling", "moduli")
+"""Names of the coefficients a to e, in their order."""
+
+OF_LIQUID = 4
+"""The first so many coefficients matter where all matter is liquid."""
+
+FIRST_STEP = (-0.8, -0.6, -0.4, 0.4, -0.3)
+"""Of the simplex method in each coefficient: towards less damping."""
+
+LARGEST = 3.0
+"""Magnitude of a coefficient: a modulus changes by a factor of 20 at most."""
+
+MOST_SUBSTEPS = 2000
+"""Time steps of a frame, at most."""
+
+WORST_ERROR = 1.0
+"""Error of coefficients with which the solver breaks down [length]."""
+
+SOLIDS = ("jelly", "snow", "rope")
+"""Materials with a modulus of their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """A scenario of the fit: what is given of it, and where its particles are later."""
+
+    given: Given
+    true_frames: Mapping[int, Floats]  # positions [length] by absolute frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseFlows:
+    """State of a rollout: one for each window."""
+
+    rollouts: tuple[CoarseRollout, ...]
+    device: torch.device
+
+
+class HybridCoarseOptions(Options):
+    """Options of the hybrid."""
+
+    in_training = frozenset({"scenarios", "frame_step", "evaluations"})
+    of_weights = frozenset({"times"})
+
+    times: int = Field(default=2, ge=2, le=4)  # cells of the data's grid over its own
+    scenarios: int = Field(default=24, ge=1)  # of train, to fit on, at most
+    frame_step: int = Field(default=10, ge=1)  # frames between those compared
+    evaluations: int = Field(default=60, ge=1)  # of the fit, at most
+
+
+class HybridCoarse(Baseline):
+    """The coarse solver with learned constants."""
+
+    method = "hybrid coarse solver"
+    closed_form: ClassVar[bool] = True
+    fits_batches: ClassVar[bool] = True
+    any_box: ClassVar[bool] = True
+
+    Options = HybridCoarseOptions
+    options: HybridCoarseOptions
+    coefficients: Tensor
+
+    def __init__(self, options: HybridCoarseOptions, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        self.size = _described(info)
+        coarse = coarser(self.size, options.times)
+        if coarse is None:
+            raise UsageError(
+                f"{self.method} has no such grid for {info.split} {info.size}",
+                where="model.times",
+                expected="walls on nodes of the coarser grid, and enough cells",
+                got=options.times,
+                fix="train at a larger size, or neuralmpm",
+            )
+        self.coarse = coarse
+        self.register_buffer("coefficients", torch.zeros(len(COEFFICIENTS)))
+
+    @property
+    def history(self) -> int:
+        """Given frames that the solver reads: the last two."""
+        return 2
+
+    def forward(
+        self, batch: Batch, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Refuse: the coefficients are fitted as a whole, without steps.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            f"{self.method} takes no training steps",
+            where="HybridCoarse.forward",
+            fix="train it with `lagbench train`",
+        )
+
+    # --- the solver ---------------------------------------------------------------
+
+    def start(self, given: Batch) -> CoarseFlows:
+        """Return the rollouts from the last two given frames.
+
+        Raises:
+            DataError: the mass is not known, or a coefficient is out of range.
+        """
+        values = self.coefficients.double().cpu().numpy()
+        if not np.abs(values).max() <= LARGEST:
+            raise DataError(
+                "the constants of the hybrid are out of range",
+                where="coefficients of the weights",
+                expected=f"numbers from -{LARGEST:g} to {LARGEST:g}",
+                got=values.tolist(),
+                fix="train the model with `lagbench train`",
+            )
+        changed = change_constants(self.coarse, values)
+        rollouts = []
+        for window in range(given.windows):
+            scenario = self._given(given, window)
+            rollouts.append(CoarseRollout(scenario, changed))
+        return CoarseFlows(rollouts=tuple(rollouts), device=given.position.device)
+
+    def advance(self, state: CoarseFlows) -> tuple[CoarseFlows, Tensor]:
+        """Return the next state and positions [length], shape [particle, axis].
+
+        The solver keeps its state itself, so a state can be advanced once only.
+        """
+        positions = [_next_position(rollout) for rollout in state.rollouts]
+        all_positions = np.concatenate(positions)
+        position = torch.from_numpy(all_positions).float()
+        return state, position.to(state.device)
+
+    def _given(self, batch: Batch, window: int) -> Given:
+        """Return what a batch gives of a scenario."""
+        if batch.particle_mass is None:
+            raise DataError(
+                "the mass of the particles is not known",
+                where=f"{self.info.split} {self.info.size}",
+                expected="particle_mass in each scenario file",
+                got="none",
+                fix="train neuralmpm, or a graph network such as gns",
+            )
+        is_inside = batch.sample == window
+        frames = batch.position[is_inside].double().cpu().numpy()
+        particle_count, _, dimension = frames.shape
+        mass = float(batch.particle_mass[window]) * particle_count
+        parameters: dict[str, object] = {}
+        if batch.friction is not None:
+            parameters["friction"] = float(batch.friction[window])
+        return Given(
+            size=self.size,
+            root=Path(),
+            position=frames.swapaxes(0, 1),
+            material=batch.material[is_inside].cpu().numpy().astype(np.int8),
+            walls=np.zeros((batch.frames + 1, 2 * dimension, dimension)),
+            area=mass / float(self.size.value("density")),
+            parameters=parameters,
+        )
+
+    # --- the fit ------------------------------------------------------------------
+
+    def fit(self, scenarios: Iterable[Batch]) -> Mapping[str, float]:
+        """Fit the coefficients to scenarios of train; return errors to log.
+
+        The error is the mean of ``cloud_distance`` over frames and scenarios [length].
+
+        Args:
+            scenarios: whole scenarios, one a batch.
+
+        Raises:
+            UsageError: no scenario is longer than the given frames.
+        """
+        samples: list[Sample] = []
+        for scenario in itertools.islice(scenarios, self.options.scenarios):
+            sample = self._prepare(scenario)
+            if sample.true_frames:
+                samples.append(sample)
+        if not samples:
+            raise UsageError(
+                "no scenario has frames to fit the constants to",
+                where="HybridCoarse.fit",
+                expected=f"more than {self.info.input_frames} frames in a scenario",
+                got="none",
+                fix="train on a data set with longer scenarios",
+            )
+        count = len(COEFFICIENTS)
+        if not has_solids(self.size):
+            count = OF_LIQUID
+
+        def measure(values: Floats) -> float:
+            coefficients = np.zeros(len(COEFFICIENTS))
+            coefficients[:count] = values
+            if np.abs(coefficients).max() > LARGEST:
+                return WORST_ERROR
+            changed = change_constants(self.coarse, coefficients)
+            errors = [_error(sample, changed) for sample in samples]
+            return float(np.mean(errors))
+
+        start = np.zeros(count)
+        plain_error = measure(start)
+        steps = np.diag(FIRST_STEP[:count])
+        minimum = minimize(
+            measure,
+            start,
+            method="Nelder-Mead",
+            options={
+                "maxfev": self.options.evaluations,
+                "initial_simplex": np.vstack([start, start + steps]),
+                "xatol": 1e-2,
+                "fatol": 1e-5,
+            },
+        )
+        best = torch.zeros(len(COEFFICIENTS))
+        if minimum.fun < plain_error:
+            best[:count] = torch.from_numpy(minimum.x).float()
+        self.coefficients.copy_(best)
+        numbers = dict(zip(COEFFICIENTS, best.tolist(), strict=True))
+        return {"error_without": plain_error, "error": float(minimum.fun), **numbers}
+
+    def _prepare(self, scenario: Batch) -> Sample:
+        """Return what a scenario gives, and the frames in which its truth moves."""
+        given_frames = self.info.input_frames
+        positions = scenario.position.double().numpy().swapaxes(0, 1)
+        last = min(len(positions), given_frames + self.info.horizon)
+        first = given_frames + self.options.frame_step - 1
+        true_frames = {}
+        for frame in range(first, last, self.options.frame_step):
+            step = np.abs(positions[frame] - positions[frame - 1]).max()
+            if step > 0.0:
+                true_frames[frame] = positions[frame]
+        given = self._given(scenario.part(slice(given_frames)), 0)
+        return Sample(given=given, true_frames=true_frames)
+
+
+def _next_position(rollout: CoarseRollout) -> Floats:
+    """Return the positions in the next frame, no numbers if the solver breaks down."""
+    try:
+        return rollout.advance()
+    except WorkFailedError:
+        return np.full_like(rollout.position, np.nan)
+
+
+def _described(info: DatasetInfo) -> Size:
+    """Return the description of the data set in datasets.yaml.
+
+    Raises:
+        UsageError: the solver does not know it.
+    """
+    if info.split not in SOLVED:
+        raise UsageError(
+            "the hybrid coarse solver knows the free surfaces of lagbench only",
+            where=f"{info.split} {info.size}",
+            expected=", ".join(SOLVED),
+            got=info.split,
+            fix="train neuralmpm, or a graph network such as gns",
+        )
+    return load_registry().size(info.split, info.size)
+
+
+def has_solids(size: Size) -> bool:
+    """Return whether the data set has materials other than liquid."""
+    return any(f"{solid}_modulus" in size.parameters for solid in SOLIDS)
+
+
+def change_constants(coarse: Size, coefficients: Sequence[float] | Floats) -> Size:
+    """Return a size with the constants that the coefficients stand for.
+
+    Args:
+        coarse: the size of the classical coarse solver.
+        coefficients: a to e, by the names in :data:`COEFFICIENTS`.
+    """
+    a, b, c, d, e = (float(value) for value in coefficients)
+    damping = max(0.0, 1.0 + a)
+    factors = {
+        "liquid_viscosity": damping,
+        "elastic_damping": damping,
+        "liquid_modulus": math.exp(b),
+        "jacobian_relaxation": math.exp(c),
+        "density_coupling": math.exp(d),
+    }
+    for solid in SOLIDS:
+        factors[f"{solid}_modulus"] = math.exp(e)
+
+    parameters = dict(coarse.parameters)
+    for name, factor in factors.items():
+        if name not in parameters or factor == 1.0:
+            continue
+        value = float(coarse.value(name)) * factor
+        if name in ("jacobian_relaxation", "density_coupling"):
+            value = min(1.0, value)
+        parameters[name] = parameters[name].model_copy(update={"value": value})
+    changed = coarse.model_copy(update={"parameters": parameters})
+
+    speed_ratio = fastest_sound(changed) / fastest_sound(coarse)
+    substeps = math.ceil(coarse.substeps_per_frame * speed_ratio)
+    substeps = min(max(substeps, 1), MOST_SUBSTEPS)
+    parameters["substeps_per_frame"] = parameters["substeps_per_frame"].model_copy(
+        update={"value": substeps}
+    )
+    return coarse.model_copy(update={"parameters": parameters})
+
+
+def fastest_sound(size: Size) -> float:
+    """Return the largest speed of sound over all materials [length/s].
+
+    Its square is K / rho in liquid. In solids it is (1 - p) / ((1 + p)(1 - 2 p)) E /
+    rho with Poisson's ratio p; in snow times its greatest hardening.
+    """
+    density = float(size.value("density"))
+    squares = [float(size.value("liquid_modulus")) / density]
+    for solid in SOLIDS:
+        if f"{solid}_modulus" not in size.parameters:
+            continue
+        modulus = float(size.value(f"{solid}_modulus"))
+        poisson = float(size.value(f"{solid}_poisson"))
+        factor = (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+        square = modulus * factor / density
+        if solid == "snow":
+            square *= float(size.value("snow_hardening_max"))
+        squares.append(square)
+    return math.sqrt(max(squares))
+
+
+def _error(sample: Sample, changed: Size) -> float:
+    """Return the mean distance of the clouds of a rollout from the true ones [length].
+
+    It is that of ``cloud_distance``: of each material, by its share of the particles.
+    """
+    material = sample.given.material
+    last = max(sample.true_frames)
+    distances = []
+    try:
+        rollout = CoarseRollout(sample.given, changed)
+        while rollout.frame <= last:
+            frame = rollout.frame
+            position = rollout.advance()
+            if frame not in sample.true_frames:
+                continue
+            true_position = sample.true_frames[frame]
+            distance = 0.0
+            for kind in np.unique(material):
+                members = material == kind
+                share = float(members.mean())
+                distance += share * sliced_wasserstein2(
+                    true_position[members], position[members]
+                )
+            distances.append(distance)
+    except WorkFailedError:
+        return WORST_ERROR
+    return float(np.mean(distances))
