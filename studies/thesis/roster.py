@@ -188,6 +188,7 @@ _MODELS = (
         recipe="change",
     ),
     RosterModel("hybrid-projection", "hybrid projection solver"),
+    RosterModel("hybrid-coarse", "hybrid coarse solver"),
     RosterModel("var", "VAR(1)", "#7f7f7f"),
     RosterModel("var-stable", "stable VAR", "#b0569a"),
 )

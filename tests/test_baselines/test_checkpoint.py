@@ -418,6 +418,7 @@ SMALL_MODELS: dict[str, Options] = {
     "var": {"lags": 1},
     "var-stable": {"rank": 2},
     "hybrid-projection": {"resolution": 1.0},
+    "hybrid-coarse": {},
 }
 """Options of small models; all others are graph networks."""
 
@@ -425,11 +426,14 @@ SMALL_MODELS: dict[str, Options] = {
 def stored(baseline: str) -> Checkpoint:
     """Return the checkpoint of a small model."""
     options = SMALL_MODELS.get(baseline, GRAPH_NETWORK)
-    model = find(baseline).model.build(options, WHOLE)
+    figures = WHOLE
+    if baseline == "hybrid-coarse":  # knows free surfaces only
+        figures = replace(WHOLE, split="multimaterial", size="tiny")
+    model = find(baseline).model.build(options, figures)
     return Checkpoint(
         baseline=baseline,
         options=options,
-        info=WHOLE,
+        info=figures,
         weights=model.state_dict(),
     )
 

@@ -19,6 +19,8 @@ from lagbench.baselines.hybrid_coarse import (
     HybridCoarse,
     change_constants,
     fastest_sound,
+    minimum_of_surface,
+    spread_points,
 )
 from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
 from lagbench.data.registry import Size, load
@@ -133,6 +135,34 @@ def test_slower_sound_takes_longer_time_steps() -> None:
     assert fastest_sound(changed) == pytest.approx(0.5 * fastest_sound(coarse))
     half = -(-coarse.substeps_per_frame // 2)
     assert changed.substeps_per_frame == half
+
+
+def test_points_of_the_fit_fill_the_ranges() -> None:
+    """Each half of each coefficient has as many, and none is a corner."""
+    ranges = np.array([(-1.0, 0.0), (0.0, 3.0)])
+    points = spread_points(ranges, 36)
+    assert points.shape == (36, 2)
+    assert (points > ranges[:, 0]).all()
+    assert (points < ranges[:, 1]).all()
+    is_low = points < ranges.mean(axis=1)
+    np.testing.assert_allclose(is_low.mean(axis=0), 0.5, atol=0.06)
+
+
+def test_the_surface_finds_the_bottom_of_a_bowl() -> None:
+    """Also under noise, and at the edge where the bottom lies outside."""
+    rng = np.random.default_rng(0)
+    ranges = np.array([(-1.0, 1.0)] * 3)
+    points = spread_points(ranges, 60)
+    bottom = np.array([0.3, -0.5, 0.1])
+    bowl = ((points - bottom) ** 2).sum(axis=1)
+    exact = minimum_of_surface(points, bowl, ranges)
+    np.testing.assert_allclose(exact, bottom, atol=1e-5)
+    noise = rng.normal(0.0, 0.05, len(points))
+    noisy = minimum_of_surface(points, bowl + noise, ranges)
+    np.testing.assert_allclose(noisy, bottom, atol=0.1)
+    outside = ((points - [2.0, 0.0, 0.0]) ** 2).sum(axis=1)
+    edge = minimum_of_surface(points, outside, ranges)
+    np.testing.assert_allclose(edge, [1.0, 0.0, 0.0], atol=1e-5)
 
 
 @pytest.mark.slow

@@ -44,6 +44,7 @@ INTERNAL = {
     "baselines/baseline.py": 1,
     "baselines/frame_model.py": 1,
     "baselines/graph.py": 3,
+    "baselines/hybrid_coarse.py": 1,
     "baselines/hybrid_projection.py": 1,
     "baselines/rollout.py": 1,
     "baselines/torch_grid.py": 1,

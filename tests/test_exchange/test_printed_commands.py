@@ -82,7 +82,8 @@ def test_every_baseline_takes_the_printed_recipe(
 ) -> None:
     """The recipe fitted graph networks only.
 
-    The one baseline that needs a viscosity refuses these data, which have none.
+    The one baseline that needs a viscosity refuses these data, which have none. So does
+    the one that solves our free surfaces.
     """
     monkeypatch.chdir(tmp_path)
     paths = write_runs(tmp_path, "walls")
@@ -103,6 +104,9 @@ def test_every_baseline_takes_the_printed_recipe(
     if baseline == "hybrid-projection":
         assert trained.exit_code == 4
         assert "the viscosity is not known" in trained.stderr
+    elif baseline == "hybrid-coarse":
+        assert trained.exit_code == 2
+        assert "free surfaces of lagbench only" in trained.stderr
     else:
         assert trained.exit_code == 0, trained.stderr
 
