@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -209,13 +209,21 @@ class HybridCoarse(Baseline):
 
     # --- the fit ------------------------------------------------------------------
 
-    def fit(self, scenarios: Iterable[Batch]) -> Mapping[str, float]:
+    @property
+    def evaluations(self) -> int:
+        """Times that the fit measures the error: without changes and at the end too."""
+        return self.options.evaluations + 2
+
+    def fit(
+        self, scenarios: Iterable[Batch], *, count: Callable[[int], None] | None = None
+    ) -> Mapping[str, float]:
         """Fit the coefficients to scenarios of train; return errors to log.
 
         The error is the mean of ``cloud_distance`` over frames and scenarios [length].
 
         Args:
             scenarios: whole scenarios, one a batch.
+            count: is called with 1 after each evaluation.
 
         Raises:
             UsageError: no scenario is longer than the given frames.
@@ -233,29 +241,31 @@ class HybridCoarse(Baseline):
                 got="none",
                 fix="train on a data set with longer scenarios",
             )
-        count = len(COEFFICIENTS)
+        fitted = len(COEFFICIENTS)
         if not has_solids(self.size):
-            count = OF_LIQUID
-        ranges = np.array(RANGES[:count])
+            fitted = OF_LIQUID
+        ranges = np.array(RANGES[:fitted])
 
         def measure(values: Floats) -> float:
             coefficients = np.zeros(len(COEFFICIENTS))
-            coefficients[:count] = values
+            coefficients[:fitted] = values
             changed = change_constants(self.coarse, coefficients)
             errors = [_error(sample, changed) for sample in samples]
+            if count is not None:
+                count(1)
             return float(np.mean(errors))
 
-        plain_error = measure(np.zeros(count))
+        plain_error = measure(np.zeros(fitted))
         points = spread_points(ranges, self.options.evaluations)
         errors = np.array([measure(point) for point in points])
         best_point = points[np.argmin(errors)]
         error = float(errors.min())
-        if len(points) >= 2 * count_terms(count):
+        if len(points) >= 2 * count_terms(fitted):
             best_point = minimum_of_surface(points, np.log(errors), ranges)
             error = measure(best_point)
         best = torch.zeros(len(COEFFICIENTS))
         if error < plain_error:
-            best[:count] = torch.from_numpy(best_point).float()
+            best[:fitted] = torch.from_numpy(best_point).float()
         self.coefficients.copy_(best)
         numbers = dict(zip(COEFFICIENTS, best.tolist(), strict=True))
         return {"error_without": plain_error, "error": error, **numbers}

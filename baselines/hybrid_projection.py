@@ -20,7 +20,7 @@ finer grid has about one particle a cell, and there sampling noise hides the err
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -434,7 +434,14 @@ class HybridProjection(Baseline):
 
     # --- the fit ------------------------------------------------------------------
 
-    def fit(self, scenarios: Iterable[Batch]) -> Mapping[str, float]:
+    @property
+    def evaluations(self) -> int:
+        """Times that the fit measures the error, at most: without damping too."""
+        return self.options.evaluations + 1
+
+    def fit(
+        self, scenarios: Iterable[Batch], *, count: Callable[[int], None] | None = None
+    ) -> Mapping[str, float]:
         """Fit the coefficients to scenarios of train; return errors to log.
 
         The error is that of the vorticity on the score grid over the true one's, the
@@ -442,6 +449,7 @@ class HybridProjection(Baseline):
 
         Args:
             scenarios: whole scenarios, one a batch.
+            count: is called with 1 after each evaluation.
 
         Raises:
             UsageError: no scenario is longer than the given frames.
@@ -469,6 +477,8 @@ class HybridProjection(Baseline):
             if np.abs(coefficients).max() > LARGEST:
                 return WORST_ERROR
             errors = [self._error(sample, coefficients) for sample in samples]
+            if count is not None:
+                count(1)
             return float(np.mean(errors))
 
         start = np.zeros(size)

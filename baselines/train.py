@@ -466,7 +466,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
     A baseline with ``closed_form = True`` has a method ``fit`` beside the contract. It
     sets the coefficients from positions of each scenario, shape [frame, particle, 2],
     and returns numbers to log. With ``fits_batches = True`` it gets each scenario as a
-    batch of one window, with walls and viscosity.
+    batch of one window, with walls and viscosity, and a function to call after each of
+    its ``evaluations``.
     """
     log = job.start_log()
     if job.earlier is not None:
@@ -484,10 +485,13 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
             fix="leave the option out",
         )
 
-    scenarios: Iterator[Batch] | Iterator[NDArray[np.float32]] = _read_scenarios(job)
-    if not getattr(model, "fits_batches", False):
-        scenarios = _positions(_read_scenarios(job))
-    numbers = model.fit(scenarios)  # type: ignore[operator]
+    if getattr(model, "fits_batches", False):
+        evaluations = int(getattr(model, "evaluations", 0))
+        scenarios = _read_scenarios(job, evaluations=evaluations)
+        numbers = model.fit(scenarios, count=job.meter.count)  # type: ignore[operator]
+    else:
+        positions = _positions(_read_scenarios(job))
+        numbers = model.fit(positions)  # type: ignore[operator]
     log.step = FIT_STEPS
     for name, value in numbers.items():
         log.loss[name] = float(value)
@@ -519,8 +523,13 @@ def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
         yield scenario.position.transpose(0, 1).numpy()
 
 
-def _read_scenarios(job: TrainingJob) -> Iterator[Batch]:
-    """Yield each training scenario as a batch of one window."""
+def _read_scenarios(job: TrainingJob, *, evaluations: int = 0) -> Iterator[Batch]:
+    """Yield each training scenario as a batch of one window.
+
+    Args:
+        job: the training.
+        evaluations: units of work that the fit counts after the reading.
+    """
     size = job.registry.size(job.info.split, job.info.size)
     viscosity = size.viscosity()
     paths: list[Path] = []
@@ -534,7 +543,8 @@ def _read_scenarios(job: TrainingJob) -> Iterator[Batch]:
         )
         check_contents(size, job.root, files)
         paths += files.values()
-    job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
+    total = len(paths) + max(evaluations, 1)
+    job.meter.begin("fitting", total=total, scenarios=len(paths))
     for path in paths:
         yield scenario_batch(path, viscosity=viscosity)
         job.meter.count(1, scenarios=1)
