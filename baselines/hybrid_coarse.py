@@ -56,7 +56,7 @@ COEFFICIENTS = ("viscosity", "modulus", "relaxation", "coupling", "moduli")
 OF_LIQUID = 4
 """The first so many coefficients matter where all matter is liquid."""
 
-RANGES = ((-1.0, 0.0), (-1.8, 0.2), (-2.5, 0.5), (-0.7, 1.1), (-1.2, 0.2))
+RANGES = ((-1.0, 0.0), (-1.6, 0.2), (-1.0, 1.0), (-0.7, 1.1), (-1.2, 0.2))
 """Ends of each coefficient in the fit: less damping, softer, and both sides of 0."""
 
 LARGEST = 3.0
