@@ -73,8 +73,8 @@ SOLIDS = ("jelly", "snow", "rope")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sample:
-    """A scenario of the fit: what is given of it, and where its particles are later."""
+class TrueRollout:
+    """A scenario of the fit: what is given of it, and where its particles go."""
 
     given: Given
     true_frames: Mapping[int, Floats]  # positions [length] by absolute frame
@@ -228,12 +228,12 @@ class HybridCoarse(Baseline):
         Raises:
             UsageError: no scenario is longer than the given frames.
         """
-        samples: list[Sample] = []
+        true_rollouts: list[TrueRollout] = []
         for scenario in itertools.islice(scenarios, self.options.scenarios):
-            sample = self._prepare(scenario)
-            if sample.true_frames:
-                samples.append(sample)
-        if not samples:
+            true_rollout = self._prepare(scenario)
+            if true_rollout.true_frames:
+                true_rollouts.append(true_rollout)
+        if not true_rollouts:
             raise UsageError(
                 "no scenario has frames to fit the constants to",
                 where="HybridCoarse.fit",
@@ -250,7 +250,7 @@ class HybridCoarse(Baseline):
             coefficients = np.zeros(len(COEFFICIENTS))
             coefficients[:fitted] = values
             changed = change_constants(self.coarse, coefficients)
-            errors = [_error(sample, changed) for sample in samples]
+            errors = [_error(each, changed) for each in true_rollouts]
             if count is not None:
                 count(1)
             return float(np.mean(errors))
@@ -270,7 +270,7 @@ class HybridCoarse(Baseline):
         numbers = dict(zip(COEFFICIENTS, best.tolist(), strict=True))
         return {"error_without": plain_error, "error": error, **numbers}
 
-    def _prepare(self, scenario: Batch) -> Sample:
+    def _prepare(self, scenario: Batch) -> TrueRollout:
         """Return what a scenario gives, and the frames in which its truth moves."""
         given_frames = self.info.input_frames
         positions = scenario.position.double().numpy().swapaxes(0, 1)
@@ -282,7 +282,7 @@ class HybridCoarse(Baseline):
             if step > 0.0:
                 true_frames[frame] = positions[frame]
         given = self._given(scenario.part(slice(given_frames)), 0)
-        return Sample(given=given, true_frames=true_frames)
+        return TrueRollout(given=given, true_frames=true_frames)
 
 
 def _next_position(rollout: CoarseRollout) -> Floats:
@@ -428,22 +428,22 @@ def _terms(points: Floats) -> Floats:
     return np.column_stack(columns)
 
 
-def _error(sample: Sample, changed: Size) -> float:
+def _error(true: TrueRollout, changed: Size) -> float:
     """Return the mean distance of the clouds of a rollout from the true ones [length].
 
     It is that of ``cloud_distance``: of each material, by its share of the particles.
     """
-    material = sample.given.material
-    last = max(sample.true_frames)
+    material = true.given.material
+    last = max(true.true_frames)
     distances = []
     try:
-        rollout = CoarseRollout(sample.given, changed)
+        rollout = CoarseRollout(true.given, changed)
         while rollout.frame <= last:
             frame = rollout.frame
             position = rollout.advance()
-            if frame not in sample.true_frames:
+            if frame not in true.true_frames:
                 continue
-            true_position = sample.true_frames[frame]
+            true_position = true.true_frames[frame]
             distance = 0.0
             for kind in np.unique(material):
                 members = material == kind
