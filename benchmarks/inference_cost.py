@@ -168,10 +168,11 @@ def main() -> int:
             exponents.append(f"{slope:.2f}")
         lines.append(["", "exponent", *exponents])
     caption = (
-        "Processor time of a predicted frame [ms] on one core. The models are "
-        f"untrained and have the recipes of {SPLIT} {SIZE}. In the row of q the box "
-        "holds 2,000 q^2 particles; q is the factor of resolution along each axis. The "
-        "time grows as a power of their number; the last row has the exponent."
+        "The table shows the processor time of a predicted frame [ms] on one core. "
+        "The models are untrained; their options are those of the recipes for "
+        f"{SPLIT} {SIZE}. The factor q multiplies the resolution along each axis, so "
+        "the box holds 2,000 q^2 particles. The time grows as a power of the number "
+        "of particles. The last row shows the exponent of this power."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)

@@ -210,10 +210,11 @@ def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
 def markdown(measurements: Sequence[TimedRow], device: str) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        f"Times of our solver with `--device {device}`, and of the solver of the "
-        "thesis on the GPU of its author, in milliseconds. q is the quality factor of "
-        "the thesis. The numbers of particles are those of its Table 3.1; they grow "
-        "roughly as q^2.",
+        f"The table compares our solver with `--device {device}` and the solver of "
+        "the thesis on the GPU of its author. The times of a substep and of a frame "
+        "(t/substep, t/frame) are in milliseconds; fps is the number of frames per "
+        "second. The numbers of particles are those of Table 3.1 of the thesis. They "
+        "grow roughly as q^2, where q is the quality factor of the thesis.",
         "",
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",
@@ -230,8 +231,8 @@ def markdown(measurements: Sequence[TimedRow], device: str) -> str:
         )
     lines += [
         "",
-        "The exponent p in the row `A against B` means that A grows as B^p. It is the "
-        "slope of a least-squares line through the logarithms.",
+        "A row `A against B` shows the exponent p with which A grows as B^p. It is "
+        "the slope of a least-squares line through the logarithms of A and B.",
         "",
         "| exponent of | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
