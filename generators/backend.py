@@ -139,9 +139,11 @@ def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)
-    """Give fields their memory: each group (shape, fields) is one array of structs."""
+    """Give fields of the shape of their group memory, each an array of its own."""
+    axes_by_dimension = (ti.i, ti.ij, ti.ijk, ti.ijkl)
     builder = ti.FieldsBuilder()
     for shape, fields in groups:
-        axes = (ti.i, ti.ij, ti.ijk, ti.ijkl)[len(shape) - 1]
-        builder.dense(axes, shape).place(*fields)
+        axes = axes_by_dimension[len(shape) - 1]
+        for field in fields:
+            builder.dense(axes, shape).place(field)
     return builder.finalize()

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
 from lagbench.errors import (
@@ -31,7 +30,7 @@ from lagbench.errors import (
 
 from .constants import blamed_on_parameters, place_of, solver_constants, split_module
 from .draws import generator
-from .solver import Health, Solver, build
+from .solver import Health, Singles, Solver, build
 from .split import Device, FreeSurfaceParameters, InitialState, SolverParameters
 
 if TYPE_CHECKING:
@@ -273,7 +272,7 @@ class ScenarioBatch:
         self._stride = max(1, STRIDE // (size.particles * scenario_count))
         self._substep = 0  # substeps done so far
         # (substep, offset) of every displacement
-        self._displacements: list[tuple[int, NDArray[np.float32]]] = []
+        self._displacements: list[tuple[int, Singles]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
         """Yield (index in the batch, frame) whenever the solver stands at that
@@ -296,20 +295,20 @@ class ScenarioBatch:
             for _, index, frame in due:
                 yield index, frame
 
-    def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def frame(self, index: int) -> tuple[Singles, Singles]:
         """Return position [length] and velocity [length/s], shape [particle, axis],
         at the last recording.
         """
         return self._position[index], self._velocity[index]
 
-    def volume_ratio(self, index: int) -> NDArray[np.float32]:
+    def volume_ratio(self, index: int) -> Singles:
         """Return J of liquid and Jp of snow at the last recording [1], shape
         [particle]; free surfaces only.
         """
-        ratio: NDArray[np.float32] = self._volume_ratio[index]
+        ratio: Singles = self._volume_ratio[index]
         return ratio
 
-    def displace(self, offset: NDArray[np.float32]) -> None:
+    def displace(self, offset: Singles) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, axis]."""
         self.solver.displace(offset)
         self._displacements.append((self._substep, offset.copy()))

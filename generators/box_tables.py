@@ -125,7 +125,8 @@ class BoxTables:
 
         # whether a wall lies between a ghost and its source, shape [ghost, axis]
         is_across = self._is_outside[node] & self._is_walled
-        sign = np.ones((len(node), LANES), np.float32)
+        ghost_count = len(node)
+        sign = np.ones((ghost_count, LANES), np.float32)
         for axis in range(self.dimension):
             is_mirrored = is_across[:, axis, None]
             factor = np.where(is_mirrored, self._reflection(axis), 1)
@@ -134,7 +135,7 @@ class BoxTables:
         # Only one wall moves a ghost; where two meet, none does.
         is_single = is_across.sum(axis=1) == 1
         normal = np.argmax(is_across, axis=1)
-        ghosts = np.arange(len(node))
+        ghosts = np.arange(ghost_count)
         is_upper = index[ghosts, normal] > 1
         wall = np.where(is_single, 2 * normal + is_upper, 0)
         axes = np.arange(self.dimension)
@@ -174,9 +175,10 @@ class BoxTables:
                 subsets.append(np.array(crossed))
         edge_count = len(node)
         image_count = len(subsets)
-        ghost = np.full((edge_count, image_count), -1, np.int32)
+        image_shape = (edge_count, image_count)
+        ghost = np.full(image_shape, -1, np.int32)
         sign = np.ones((image_count, LANES), np.int64)
-        wall = np.full((edge_count, image_count, self.dimension), -1, np.int32)
+        wall = np.full((*image_shape, self.dimension), -1, np.int32)
         for image, subset in enumerate(subsets):
             may_cross = is_low | is_high | ~subset
             exists = may_cross.all(axis=1)
@@ -226,8 +228,10 @@ class BoxTables:
         for normal in range(self.dimension):
             wall = images.wall[..., normal]
             is_crossed = wall >= 0
-            moved = twice_wall_velocity[:, np.maximum(wall, 0)]
-            counts = is_crossed[..., None] & (axes != normal)
-            momentum = np.where(counts, moved, np.float32(0.0))
+            is_tangential = axes != normal
+            some_wall = np.maximum(wall, 0)
+            momentum = twice_wall_velocity[:, some_wall]
+            counts = is_crossed[..., None] & is_tangential
+            momentum = np.where(counts, momentum, np.float32(0.0))
             drag[..., : self.dimension] += momentum
         return drag

@@ -16,7 +16,7 @@ from lagbench.errors import UsageError
 
 from .driver import Driver
 from .nodal_stress import NodalStress, broken_jacobian_bounds
-from .solver import Health
+from .solver import Health, Singles
 from .split import ClosedBoxParameters, InitialState
 
 # left and right face along x, bottom and top along y
@@ -42,13 +42,18 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._move_walls_towards(0)
         # nu dt / dx^2, shape [scenario]
         viscosity = np.array([state.viscosity for state in states])
-        spread = viscosity * p.dt * p.grid**2
-        kernels.spread.from_numpy(spread.astype(np.float32))
-        for field in (kernels.node, kernels.moved, kernels.gain, kernels.total):
+        diffusion_number = viscosity * p.dt * p.grid**2
+        kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
+        for field in (
+            kernels.node_state,
+            kernels.next_state,
+            kernels.node_gain,
+            kernels.velocity_sum,
+        ):
             field.fill(0.0)
         self._averaged = 0  # substeps that the sums of velocities hold
 
-    def move_walls(self, velocity: NDArray[np.float32]) -> None:
+    def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its
         next frame.
         """
@@ -76,24 +81,26 @@ class ClosedBox(Driver[ClosedBoxParameters]):
             self._averaged += substeps
         super().advance(substeps)
 
-    def jacobian(self) -> NDArray[np.float32]:
+    def jacobian(self) -> Singles:
         """Volume ratio J of the particles [1], shape [scenario, particle]."""
-        return np.asarray(self._kernels.carried.to_numpy()[:, :, 3])
+        state = self._kernels.particle_state.to_numpy()
+        return np.asarray(state[:, :, 3])
 
-    def grid_velocity(self) -> NDArray[np.float32]:
+    def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s], shape [scenario, node_x,
         node_y, 2].
 
         Node (i, j) lies at (i, j) / grid; nodes beyond the ghost layer hold 0.
         """
-        moved = self._kernels.moved.to_numpy()
-        return self._on_grid(moved[..., :2])
+        state = self._kernels.next_state.to_numpy()
+        return self._on_grid(state[..., :2])
 
     def mean_grid_velocity(self) -> NDArray[np.float64]:
         """Mean nodal velocity of the substeps advanced with ``average=True``; shape as
         above.
         """
-        total = self._on_grid(self._kernels.total.to_numpy())
+        velocity_sum = self._kernels.velocity_sum.to_numpy()
+        total = self._on_grid(velocity_sum)
         return total / max(self._averaged, 1)
 
     def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -103,16 +110,19 @@ class ClosedBox(Driver[ClosedBoxParameters]):
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
         # largest abs(v_x), abs(v_y), J and -J of any particle, shape [scenario, 4]
-        extremes = self._read(self._kernels.extremes).max(axis=1)
+        particle_extremes = self._read(self._kernels.extremes)
+        extremes = particle_extremes.max(axis=1)
         # largest velocity component of any node, shape [scenario]
-        peaks = self._kernels.peak.to_numpy().max(axis=1)
+        node_peaks = self._kernels.peak_speed.to_numpy()
+        peaks = node_peaks.max(axis=1)
         healths = []
         for extreme, peak in zip(extremes, peaks, strict=True):
             u, v, jacobian, minus_jacobian = extreme
-            is_finite = np.isfinite(extreme).all() and np.isfinite(peak)
+            is_finite = np.isfinite([*extreme, peak])
+            max_speed = np.max([u, v, peak])
             health = Health(
-                finite=bool(is_finite),
-                max_speed=float(np.max([u, v, peak])),
+                finite=bool(is_finite.all()),
+                max_speed=float(max_speed),
                 jacobian_min=float(-minus_jacobian),
                 jacobian_max=float(jacobian),
             )

@@ -24,6 +24,7 @@ from lagbench.errors import (
     find_place_in_extension,
 )
 
+from .draws import RandomSource, uniform
 from .full_box_parameters import FullBoxParameters
 from .shapes import Region
 from .split import (
@@ -41,6 +42,7 @@ __all__ = [
     "check_constants",
     "closed_box_walls",
     "constants",
+    "draw_between",
     "free_surface_walls",
     "interval",
     "ranges",
@@ -256,7 +258,15 @@ def free_surface_walls(size: Size) -> tuple[float, float]:
 
 def interval(size: Size, name: str) -> tuple[float, float]:
     """Return the parameters ``<name>_min`` and ``<name>_max``."""
-    return float(size.value(f"{name}_min")), float(size.value(f"{name}_max"))
+    low = size.value(f"{name}_min")
+    high = size.value(f"{name}_max")
+    return float(low), float(high)
+
+
+def draw_between(rng: RandomSource, size: Size, name: str) -> float:
+    """Draw uniformly between the parameters ``<name>_min`` and ``<name>_max``."""
+    low, high = interval(size, name)
+    return uniform(rng, low, high)
 
 
 def shift_number(size: Size, scenario: int) -> int | None:

@@ -18,6 +18,8 @@ Sources: Hu et al. 2018 (MLS-MPM), Stomakhin et al. 2012 (fixed corotated), 2013
 """
 
 import taichi as ti
+from taichi import f32
+from taichi.math import mat2, vec3
 
 from .transfer import Value, bounded
 
@@ -38,13 +40,14 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
     """
-    mu = young / (2.0 * (1.0 + poisson))
-    la = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    lateral = 1.0 + poisson
+    mu = young / (2.0 * lateral)
+    la = young * poisson / (lateral * (1.0 - 2.0 * poisson))
     return mu, la
 
 
 @ti.func
-def larger(a: ti.f32, b: ti.f32) -> ti.f32:
+def larger(a: f32, b: f32) -> f32:
     """Return the larger of two numbers, b if a is not a number.
 
     This is one instruction, unlike max.
@@ -53,22 +56,31 @@ def larger(a: ti.f32, b: ti.f32) -> ti.f32:
 
 
 @ti.func
-def exponential(z: ti.f32) -> ti.f32:
+def exponential(z: f32) -> f32:
     """Return exp(z): the Taylor polynomial of degree 6 in z/16, squared four times.
 
     Relative error <= 3e-6 for abs(z) <= :data:`EXPONENT_MAX` in float32.
     """
     t = z * 0.0625
     square = t * t
+    # the polynomial in three groups: t^4 to t^6, t^2 and t^3, 1 and t
     high = (1.0 / 24.0 + t * (1.0 / 120.0)) + square * (1.0 / 720.0)
-    e = (1.0 + t) + square * ((0.5 + t * (1.0 / 6.0)) + square * high)
+    mid = 0.5 + t * (1.0 / 6.0)
+    low = 1.0 + t
+    e = low + square * (mid + square * high)
     for _ in ti.static(range(4)):
         e = e * e
     return e
 
 
 @ti.func
-def rotation(f: ti.math.mat2) -> ti.math.vec3:
+def determinant(f: mat2) -> f32:
+    """Return det F."""
+    return f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+
+
+@ti.func
+def rotation(f: mat2) -> vec3:
     """Return (cosine, sine, q): the polar rotation R of F and the mean stretch q.
 
     Where q vanishes (F a reflection, or nothing at all) R is the identity.
@@ -82,11 +94,11 @@ def rotation(f: ti.math.mat2) -> ti.math.vec3:
         inverse = 1.0 / q
         cosine = e * inverse
         sine = g * inverse
-    return ti.Vector([cosine, sine, q])
+    return vec3(cosine, sine, q)
 
 
 @ti.func
-def viscous_stress(c: ti.math.mat2, viscosity: ti.f32) -> ti.math.mat2:
+def viscous_stress(c: mat2, viscosity: f32) -> mat2:
     """Return mu (C + C^T).
 
     C is the velocity gradient [1/s], mu the dynamic viscosity [mass/s].
@@ -94,52 +106,53 @@ def viscous_stress(c: ti.math.mat2, viscosity: ti.f32) -> ti.math.mat2:
     shear = viscosity * (c[0, 1] + c[1, 0])
     normal_x = 2.0 * viscosity * c[0, 0]
     normal_y = 2.0 * viscosity * c[1, 1]
-    return ti.Matrix([[normal_x, shear], [shear, normal_y]])
+    return mat2([normal_x, shear], [shear, normal_y])
 
 
 @ti.func
-def liquid_stress(jacobian: ti.f32, modulus: ti.f32) -> ti.f32:
+def liquid_stress(jacobian: f32, modulus: f32) -> f32:
     """Return K (J - 1), the isotropic stress of a liquid; negative is pressure."""
     return modulus * (jacobian - 1.0)
 
 
 @ti.func
-def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
+def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
     With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
     (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W. Lame's constants mu and lambda are
     in [mass/s^2].
     """
-    turn = rotation(f)
-    cosine = turn[0]
-    sine = turn[1]
-    q = turn[2]
+    cosine, sine, q = rotation(f)
     h = 0.5 * (f[0, 0] - f[1, 1])
     k = 0.5 * (f[1, 0] + f[0, 1])
-    square = h * h + k * k
-    jacobian = q * q - square
+    r_square = h * h + k * k
+    jacobian = q * q - r_square
     volumetric = la * (jacobian - 1.0) * jacobian
-    mean = 2.0 * mu * (q * (q - 1.0) + square) + volumetric
-    stretch = 2.0 * mu * (2.0 * q - 1.0)
-    normal = stretch * (cosine * h - sine * k)
-    shear = stretch * (cosine * k + sine * h)
-    return ti.Matrix([[mean + normal, shear], [shear, mean - normal]])
+    isotropic = q * (q - 1.0) + r_square
+    mean = 2.0 * mu * isotropic + volumetric
+    w_factor = 2.0 * mu * (2.0 * q - 1.0)
+    normal = w_factor * (cosine * h - sine * k)
+    shear = w_factor * (cosine * k + sine * h)
+    normal_x = mean + normal
+    normal_y = mean - normal
+    return mat2([normal_x, shear], [shear, normal_y])
 
 
 @ti.func
-def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> ti.f32:
+def hardening(plastic: f32, exponent: f32, low: f32, high: f32) -> f32:
     """Return exp(xi (1 - Jp)) within [low, high], the factor on the moduli of snow.
 
     Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
     is xi [1]. The caps lie within exp(-+EXPONENT_MAX).
     """
-    z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
+    compaction = exponent * (1.0 - plastic)
+    z = bounded(compaction, -EXPONENT_MAX, EXPONENT_MAX)
     return bounded(exponential(z), low, high)
 
 
 @ti.func
-def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
+def plastic_return(f: mat2, low: f32, high: f32) -> Value:
     """Clamp the principal stretches of the trial gradient F to [low, high].
 
     The limits are 1 - theta_c and 1 + theta_s. Clamping q + r and q - r gives new q and
@@ -149,23 +162,25 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
         The elastic F, and the factor on Jp: trial stretches (at least
         :data:`STRETCH_MIN`) over clamped ones.
     """
-    turn = rotation(f)
-    cosine = turn[0]
-    sine = turn[1]
-    q = turn[2]
+    cosine, sine, q = rotation(f)
     h = 0.5 * (f[0, 0] - f[1, 1])
     k = 0.5 * (f[1, 0] + f[0, 1])
     r = ti.sqrt(h * h + k * k)
-    first = bounded(q + r, low, high)
-    second = bounded(q - r, low, high)
-    shrink = 0.0
+    trial_high = q + r
+    trial_low = q - r
+    new_high = bounded(trial_high, low, high)
+    new_low = bounded(trial_low, low, high)
+    new_q = 0.5 * (new_high + new_low)
+
+    r_ratio = 0.0
     if r > _SHEAR_EPSILON:
-        shrink = 0.5 * (first - second) / r
-    mean = 0.5 * (first + second)
-    e = mean * cosine
-    g = mean * sine
-    h = shrink * h
-    k = shrink * k
-    elastic = ti.Matrix([[e + h, k - g], [k + g, e - h]])
-    trial = larger(q + r, STRETCH_MIN) * larger(q - r, STRETCH_MIN)
-    return elastic, trial / (first * second)
+        r_ratio = 0.5 * (new_high - new_low) / r
+    e = new_q * cosine
+    g = new_q * sine
+    h = r_ratio * h
+    k = r_ratio * k
+    elastic = mat2([e + h, k - g], [k + g, e - h])
+
+    old_area = larger(trial_high, STRETCH_MIN) * larger(trial_low, STRETCH_MIN)
+    new_area = new_high * new_low
+    return elastic, old_area / new_area

@@ -26,12 +26,16 @@ Van Loan (Jacobi's method), Stomakhin et al. 2012, 2013.
 """
 
 import taichi as ti
+from taichi import f32
+from taichi.math import mat3, vec3
 
 from .constitutive import STRETCH_MIN, larger
 from .transfer import Value, bounded
 
 # Newton steps: relative error of V within 2e-6 for stretches from 0.3 to 2.5
 _NEWTON_STEPS = 6
+# pairs of axes that a sweep turns
+_AXIS_PAIRS = ((0, 1), (0, 2), (1, 2))
 # sweeps of Jacobi's method over the three pairs of axes
 _SWEEPS = 4
 # least derivative of the quartic, and least (s1 + s2) (s2 + s3) (s3 + s1)
@@ -39,7 +43,7 @@ _EPSILON = 1e-6
 
 
 @ti.func
-def principal_minors(b: ti.math.mat3) -> ti.f32:
+def principal_minors(b: mat3) -> f32:
     """Return the sum of the three principal minors of a symmetric matrix."""
     minor_z = b[0, 0] * b[1, 1] - b[0, 1] * b[0, 1]
     minor_x = b[1, 1] * b[2, 2] - b[1, 2] * b[1, 2]
@@ -48,40 +52,57 @@ def principal_minors(b: ti.math.mat3) -> ti.f32:
 
 
 @ti.func
-def determinant(f: ti.math.mat3) -> ti.f32:
+def determinant(f: mat3) -> f32:
     """Return det F, expanded along the first row."""
-    first = f[0, 0] * (f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1])
-    second = f[0, 1] * (f[1, 0] * f[2, 2] - f[1, 2] * f[2, 0])
-    third = f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
+    minor_x = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
+    minor_y = f[1, 0] * f[2, 2] - f[1, 2] * f[2, 0]
+    minor_z = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
+    first = f[0, 0] * minor_x
+    second = f[0, 1] * minor_y
+    third = f[0, 2] * minor_z
     return (first - second) + third
 
 
 @ti.func
-def left_stretch(b: ti.math.mat3, jacobian: ti.f32) -> ti.math.mat3:
+def trace(b: mat3) -> f32:
+    """Return the sum of the diagonal."""
+    return (b[0, 0] + b[1, 1]) + b[2, 2]
+
+
+@ti.func
+def add_to_diagonal(b: mat3, value: f32) -> mat3:
+    """Return b + value I."""
+    result = b
+    for axis in ti.static(range(3)):
+        result[axis, axis] = b[axis, axis] + value
+    return result
+
+
+@ti.func
+def left_stretch(b: mat3, jacobian: f32) -> mat3:
     """Return V of the polar decomposition F = V R, from B = F F^T and J = det F.
 
     It vanishes where the rotation is ambiguous: where two stretches are opposite.
     """
-    square = (b[0, 0] + b[1, 1]) + b[2, 2]
+    b_trace = trace(b)
     minors = principal_minors(b)
-    total = ti.sqrt(3.0 * square)
+    total = ti.sqrt(3.0 * b_trace)
     for _ in ti.static(range(_NEWTON_STEPS)):
-        gap = total * total - square
-        value = (gap * gap - 8.0 * jacobian * total) - 4.0 * minors
+        gap = total * total - b_trace
+        quartic = (gap * gap - 8.0 * jacobian * total) - 4.0 * minors
         slope = 4.0 * total * gap - 8.0 * jacobian
-        total = total - value / larger(slope, _EPSILON)
-    pairs = 0.5 * (total * total - square)
-    inverse = 1.0 / larger(pairs * total - jacobian, _EPSILON)
-    linear = pairs + square
-    constant = total * jacobian
-    v = linear * b - b @ b
-    for axis in ti.static(range(3)):
-        v[axis, axis] = v[axis, axis] + constant
-    return inverse * v
+        step = quartic / larger(slope, _EPSILON)
+        total = total - step
+    pairs = 0.5 * (total * total - b_trace)
+    divisor = larger(pairs * total - jacobian, _EPSILON)
+    inverse = 1.0 / divisor
+    numerator = (pairs + b_trace) * b - b @ b
+    numerator = add_to_diagonal(numerator, total * jacobian)
+    return inverse * numerator
 
 
 @ti.func
-def corotated_stress(f: ti.math.mat3, mu: ti.f32, la: ti.f32) -> ti.math.mat3:
+def corotated_stress(f: mat3, mu: f32, la: f32) -> mat3:
     """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
     Lame's constants mu and lambda are in [mass/(length s^2)].
@@ -89,14 +110,13 @@ def corotated_stress(f: ti.math.mat3, mu: ti.f32, la: ti.f32) -> ti.math.mat3:
     b = f @ f.transpose()
     jacobian = determinant(f)
     volumetric = la * (jacobian - 1.0) * jacobian
-    tau = (2.0 * mu) * (b - left_stretch(b, jacobian))
-    for axis in ti.static(range(3)):
-        tau[axis, axis] = tau[axis, axis] + volumetric
-    return tau
+    excess = b - left_stretch(b, jacobian)  # (F - R) F^T
+    stretch_stress = (2.0 * mu) * excess
+    return add_to_diagonal(stretch_stress, volumetric)
 
 
 @ti.func
-def principal_axes(b: ti.math.mat3) -> Value:
+def principal_axes(b: mat3) -> Value:
     """Return the eigenvalues of a symmetric matrix, and its eigenvectors as columns.
 
     Jacobi's method, four sweeps: each turns a pair of axes so that the entry between
@@ -104,41 +124,44 @@ def principal_axes(b: ti.math.mat3) -> Value:
     d = b_qq - b_pp, with the sign of d.
     """
     a = b
-    axes = ti.Matrix([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    axes = mat3([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     for _ in ti.static(range(_SWEEPS)):
-        for p, q in ti.static(((0, 1), (0, 2), (1, 2))):
+        for p, q in ti.static(_AXIS_PAIRS):
             double = 2.0 * a[p, q]
             difference = a[q, q] - a[p, p]
             root = ti.sqrt(difference * difference + double * double)
-            divisor = difference + ti.select(difference < 0.0, -root, root)
+            signed_root = ti.select(difference < 0.0, -root, root)
+            divisor = difference + signed_root
             is_diagonal = divisor == 0.0
-            tangent = ti.select(
-                is_diagonal, 0.0, double / ti.select(is_diagonal, 1.0, divisor)
-            )
+            safe_divisor = ti.select(is_diagonal, 1.0, divisor)
+            tangent = ti.select(is_diagonal, 0.0, double / safe_divisor)
             cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
-            r = ti.static(3 - p - q)
+
             shift = tangent * a[p, q]
             a[p, p] = a[p, p] - shift
             a[q, q] = a[q, q] + shift
             a[p, q] = 0.0
             a[q, p] = 0.0
-            of_p = cosine * a[r, p] - sine * a[r, q]
-            of_q = sine * a[r, p] + cosine * a[r, q]
-            a[r, p] = of_p
-            a[p, r] = of_p
-            a[r, q] = of_q
-            a[q, r] = of_q
+            # r is the third axis.
+            r = ti.static(3 - p - q)
+            entry_p = cosine * a[r, p] - sine * a[r, q]
+            entry_q = sine * a[r, p] + cosine * a[r, q]
+            a[r, p] = entry_p
+            a[p, r] = entry_p
+            a[r, q] = entry_q
+            a[q, r] = entry_q
             for row in ti.static(range(3)):
                 along_p = cosine * axes[row, p] - sine * axes[row, q]
                 along_q = sine * axes[row, p] + cosine * axes[row, q]
                 axes[row, p] = along_p
                 axes[row, q] = along_q
-    return ti.Vector([a[0, 0], a[1, 1], a[2, 2]]), axes
+    eigenvalues = vec3(a[0, 0], a[1, 1], a[2, 2])
+    return eigenvalues, axes
 
 
 @ti.func
-def plastic_return(f: ti.math.mat3, low: ti.f32, high: ti.f32) -> Value:
+def plastic_return(f: mat3, low: f32, high: f32) -> Value:
     """Clamp the principal stretches of the trial gradient F to [low, high].
 
     With the principal axes Q of B = F F^T, the elastic gradient is Q diag(new / old)
@@ -150,13 +173,15 @@ def plastic_return(f: ti.math.mat3, low: ti.f32, high: ti.f32) -> Value:
         The elastic F, and the factor on Jp: trial stretches over clamped ones.
     """
     squares, axes = principal_axes(f @ f.transpose())
-    scaled = axes
+    scaled_axes = axes
     growth = 1.0
     for k in ti.static(range(3)):
-        trial = larger(ti.sqrt(larger(squares[k], 0.0)), STRETCH_MIN)
+        square = larger(squares[k], 0.0)
+        trial = larger(ti.sqrt(square), STRETCH_MIN)
         clamped = bounded(trial, low, high)
         growth = growth * (trial / clamped)
         ratio = clamped / trial
         for row in ti.static(range(3)):
-            scaled[row, k] = ratio * axes[row, k]
-    return (scaled @ axes.transpose()) @ f, growth
+            scaled_axes[row, k] = ratio * axes[row, k]
+    stretch = scaled_axes @ axes.transpose()
+    return stretch @ f, growth

@@ -84,7 +84,9 @@ def flow(psi: Jet) -> tuple[Array, Array]:
     """Return velocity [point, 2] and its gradient C [point, 2, 2], multiples of
     2^-20.
     """
-    velocity = np.stack([psi.y, -psi.x], axis=-1)
+    u = psi.y
+    v = -psi.x
+    velocity = np.stack([u, v], axis=-1)
     gradient_of_u = np.stack([psi.xy, psi.yy], axis=-1)
     gradient_of_v = np.stack([-psi.xx, -psi.xy], axis=-1)
     affine = np.stack([gradient_of_u, gradient_of_v], axis=1)
@@ -113,8 +115,9 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
 
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
-    u = psi.y.reshape(node_count, node_count)
-    v = (-psi.x).reshape(node_count, node_count)
+    grid_shape = (node_count, node_count)
+    u = psi.y.reshape(grid_shape)
+    v = -psi.x.reshape(grid_shape)
 
     # neighbours of the inner nodes
     inner = slice(1, -1)

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .constants import constants, interval
+from .constants import constants, draw_between, interval
 from .decaying_vortices import kinetic_energy, particles_per_side
-from .draws import RandomSource, log_uniform, uniform
+from .draws import RandomSource, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import (
     Flow,
@@ -100,7 +100,7 @@ def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
     for _ in range(size.value("ring_count")):
         centre = rng.random((3,))
         normal = draw_direction(rng, 3)
-        radius = uniform(rng, *interval(size, "ring_radius"))
+        radius = draw_between(rng, size, "ring_radius")
         ring = ring_potential(position, centre=centre, normal=normal, radius=radius)
         for axis in range(3):
             potential[axis] = potential[axis] + ring[axis]
@@ -128,13 +128,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         kind = "rings"
         frequency = 0
         flow = _draw_rings(size, rng, position)
-        speed = uniform(rng, *interval(size, "ring_speed"))
+        speed = draw_between(rng, size, "ring_speed")
     else:
         kind = "noise"
         count = size.value("frequency_count")
         frequency = size.value("frequency_min") + scenario % count
         flow = draw_noise(rng, position, frequency)
-        speed = uniform(rng, *interval(size, "speed"))
+        speed = draw_between(rng, size, "speed")
     flow = scaled_to(flow, speed)
     reynolds = log_uniform(rng, *interval(size, "reynolds"))
     viscosity = speed / reynolds

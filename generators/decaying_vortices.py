@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 from lagbench.errors import UsageError
 
-from .constants import constants, interval
-from .draws import RandomSource, log_uniform, uniform
+from .constants import constants, draw_between, interval
+from .draws import RandomSource, log_uniform
 from .full_box_parameters import FullBoxParameters
 from .periodic_noise import (
     Flow,
@@ -77,7 +77,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     count = size.value("frequency_count")
     frequency = size.value("frequency_min") + scenario % count
     psi = noise(position, draw_lattice(rng, frequency, 2))
-    speed = uniform(rng, *interval(size, "speed"))
+    speed = draw_between(rng, size, "speed")
     flow = scaled_to(rotated_gradient(psi), speed)
     reynolds = log_uniform(rng, *interval(size, "reynolds"))
     viscosity = speed / reynolds

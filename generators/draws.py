@@ -22,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import WorkFailedError
 
+Array = NDArray[np.float64]
+
 # grain of everything that enters the solver; multiples below 16 are exact in float32
 QUANTUM = 2.0**-20
 _LARGEST = 16.0
@@ -31,7 +33,7 @@ _PRECISE = Context(prec=50)
 class RandomSource(Protocol):
     """The part of ``numpy.random.Generator`` that draws may use."""
 
-    def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
+    def random(self, size: tuple[int, ...]) -> Array:
         """Return uniform variates on [0, 1), multiples of 2^-53."""
 
 
@@ -95,7 +97,7 @@ def seed_text(
     return ", ".join(str(word) for word in words)
 
 
-def quantise(values: ArrayLike) -> NDArray[np.float64]:
+def quantise(values: ArrayLike) -> Array:
     """Round to the nearest multiple of 2^-20, halves to even.
 
     Such a number below 16 in magnitude is exact in float32, so that nothing is rounded
@@ -164,9 +166,7 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     return float(_PRECISE.multiply(Decimal(low), growth))
 
 
-def normal(
-    rng: RandomSource, deviation: float, shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> Array:
     """Draw nearly normal variates of mean 0: twelve uniforms, minus six (Irwin-Hall).
 
     Mean, variance and skewness are the normal ones, the excess kurtosis is -0.1, and
@@ -221,7 +221,7 @@ def draw_program(
     *,
     amplitude: float,
     knot_gap: tuple[float, float],
-) -> NDArray[np.float64]:
+) -> Array:
     """Draw the values of a program towards each frame, shape [frame].
 
     A program is smooth: the speed of a wall, or a body force. Its knots have values
@@ -261,7 +261,7 @@ def fill(
     low: float,
     high: float,
     jitter: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
     The columns number floor(sqrt(count)), their counts differ by one at the most, and
@@ -292,7 +292,7 @@ def fill_grid(
     low: float,
     high: float,
     jitter: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
     ends = rows * np.arange(columns + 1)
     return _fill_columns(rng, ends, low=low, high=high, jitter=jitter)
@@ -305,7 +305,7 @@ def _fill_columns(
     low: float,
     high: float,
     jitter: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Put particles near the middles of their cells, column by column.
 
     Each is (r - 1/2) jitter spacings off. ``ends`` counts the particles before each

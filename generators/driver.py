@@ -10,13 +10,12 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
 from .full_box_parameters import FullBoxParameters
-from .solver import Health
+from .solver import Health, Singles
 from .split import (
     ClosedBoxParameters,
     Device,
@@ -34,10 +33,10 @@ Parameters = TypeVar(
 class Field(Protocol):
     """The part of a Taichi field that a driver uses."""
 
-    def from_numpy(self, array: NDArray[np.float32]) -> None:
+    def from_numpy(self, array: Singles) -> None:
         """Set all values."""
 
-    def to_numpy(self) -> NDArray[np.float32]:
+    def to_numpy(self) -> Singles:
         """Return all values."""
 
 
@@ -45,8 +44,8 @@ class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
     x: Field  # particle positions [length], filled up with zeros
-    carried: Field  # what particles spread, the velocity first
-    fill: Field  # m / (rho dx^d), shape [scenario]
+    particle_state: Field  # what particles spread, the velocity first
+    particle_volume: Field  # m / (rho dx^d), shape [scenario]
     speed_bound: float  # the CFL bound dx/dt [length/s]
 
     @property
@@ -58,11 +57,11 @@ class Kernels(Protocol):
         """Derivative of the velocity, first, at the particles, along each axis."""
 
     @property
-    def least(self) -> float | Sequence[float]:
+    def position_min(self) -> float | Sequence[float]:
         """Smallest coordinate of a particle, along all axes or along each [length]."""
 
     @property
-    def most(self) -> float | Sequence[float]:
+    def position_max(self) -> float | Sequence[float]:
         """Largest coordinate of a particle, along all axes or along each [length]."""
 
     def run_serially(self, substeps: int) -> None:
@@ -140,14 +139,15 @@ class Driver(ABC, Generic[Parameters]):
         kernels = self._kernels
         self._fixed = self._fixed_positions(states)
         self._place(stack(states, "position"))
-        carried = np.empty((self.scenarios, p.particles, 4), np.float32)
+        shape = (self.scenarios, p.particles, 4)
+        particle_state = np.empty(shape, np.float32)
         # what stands behind the velocity keeps its value at rest; its slopes are 0
-        carried[...] = kernels.at_rest
-        carried[..., : self.dimension] = stack(states, "velocity")
-        self._write(kernels.carried, carried, at_rest=kernels.at_rest)
+        particle_state[...] = kernels.at_rest
+        particle_state[..., : self.dimension] = stack(states, "velocity")
+        self._write(kernels.particle_state, particle_state, at_rest=kernels.at_rest)
         affine = stack(states, "affine")
         for axis, field in enumerate(kernels.slopes):
-            slope = np.zeros_like(carried)
+            slope = np.zeros(shape, np.float32)
             slope[..., : self.dimension] = affine[..., axis]
             self._write(field, slope)
 
@@ -155,8 +155,8 @@ class Driver(ABC, Generic[Parameters]):
         volumes = [state.area / p.particles for state in states]
         self._volume = np.array(volumes)
         # volume of a particle in cells
-        fill = self._volume * p.grid**self.dimension
-        kernels.fill.from_numpy(fill.astype(np.float32))
+        cell_volumes = self._volume * p.grid**self.dimension
+        kernels.particle_volume.from_numpy(cell_volumes.astype(np.float32))
         self._start(states)
         self._substeps = 0
         kernels.restart_extremes()
@@ -221,17 +221,17 @@ class Driver(ABC, Generic[Parameters]):
         """
         return end
 
-    def position(self) -> NDArray[np.float32]:
+    def position(self) -> Singles:
         """Particle positions [length], shape [scenario, particle, axis]."""
         x = self._read(self._kernels.x)
         return x[..., : self.dimension]
 
-    def velocity(self) -> NDArray[np.float32]:
+    def velocity(self) -> Singles:
         """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
-        carried = self._kernels.carried.to_numpy()
-        return carried[:, : self.parameters.particles, : self.dimension]
+        state = self._kernels.particle_state.to_numpy()
+        return state[:, : self.parameters.particles, : self.dimension]
 
-    def _read(self, field: Field) -> NDArray[np.float32]:
+    def _read(self, field: Field) -> Singles:
         """Return a field of the particles, shape [scenario, particle, 4]."""
         particles = self.parameters.particles
         if self.device is not Device.CPU:
@@ -240,13 +240,14 @@ class Driver(ABC, Generic[Parameters]):
         _copy(field, values)
         return values
 
-    def displace(self, offset: NDArray[np.float32]) -> None:
+    def displace(self, offset: Singles) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, axis];
         kept in the box.
         """
-        self._place(self.position() + offset.astype(np.float32))
+        displaced = self.position() + offset.astype(np.float32)
+        self._place(displaced)
 
-    def _fixed_positions(self, states: Sequence[InitialState]) -> NDArray[np.float32]:
+    def _fixed_positions(self, states: Sequence[InitialState]) -> Singles:
         """Return where the particles that never move are, behind those of the states.
 
         The fields have so many rows more. Shape [scenario, particle, 4], zeros beside
@@ -254,9 +255,10 @@ class Driver(ABC, Generic[Parameters]):
         """
         return np.zeros((len(states), 0, 4), np.float32)
 
-    def _place(self, position: NDArray[np.float32]) -> None:
+    def _place(self, position: Singles) -> None:
         """Set the positions, kept in the box; the fields hold zeros beside."""
-        padded = np.zeros((*position.shape[:-1], 4), np.float32)
+        scenarios, particles, _ = position.shape
+        padded = np.zeros((scenarios, particles, 4), np.float32)
         padded[..., : self.dimension] = self._inside(position)
         rows = np.concatenate([padded, self._fixed], axis=1)
         self._kernels.x.from_numpy(rows)
@@ -264,7 +266,7 @@ class Driver(ABC, Generic[Parameters]):
     def _write(
         self,
         field: Field,
-        values: NDArray[np.float32],
+        values: Singles,
         at_rest: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
         """Fill a field of the particles.
@@ -279,10 +281,10 @@ class Driver(ABC, Generic[Parameters]):
         rows = np.concatenate([values, fixed], axis=1)
         field.from_numpy(rows)
 
-    def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _inside(self, position: Singles) -> Singles:
         """Return positions clipped to the box [length], shape [..., axis]."""
-        least = np.asarray(self._kernels.least, np.float32)
-        most = np.asarray(self._kernels.most, np.float32)
+        least = np.asarray(self._kernels.position_min, np.float32)
+        most = np.asarray(self._kernels.position_max, np.float32)
         return np.clip(position, least, most)
 
     def _check_state(self, index: int, state: InitialState) -> None:
@@ -352,7 +354,7 @@ def _copy(field: Template, values: ti.types.ndarray()) -> Nothing:  # type: igno
             values[0, p, c] = field[0, p][c]
 
 
-def stack(states: Sequence[InitialState], name: str) -> NDArray[np.float32]:
+def stack(states: Sequence[InitialState], name: str) -> Singles:
     """Return an array of every state as float32, shape [scenario, ...]."""
     arrays = [getattr(state, name) for state in states]
     return np.stack(arrays).astype(np.float32)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from .constants import (
     constants,
+    draw_between,
     free_surface_walls,
     interval,
     ranges,
@@ -71,7 +72,7 @@ def _draw_shape(rng: RandomSource, family: str, area: float, size: Size) -> Shap
         return Disc.of_area(area)
     if family == "thrown" and choice(rng, 2) == 1:
         return Disc.of_area(area)
-    aspect = uniform(rng, *interval(size, "aspect"))
+    aspect = draw_between(rng, size, "aspect")
     return Rectangle.of_area(area, aspect)
 
 
@@ -126,8 +127,8 @@ def _start_region(size: Size, start: str) -> Region:
 
 def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
     """Draw a column at rest on the floor, at the left wall or at the right one."""
-    area = uniform(rng, *interval(size, "area"))
-    aspect = uniform(rng, *interval(size, "column_aspect"))
+    area = draw_between(rng, size, "area")
+    aspect = draw_between(rng, size, "column_aspect")
     shape = Rectangle.of_area(area, 1.0 / aspect)
     low, high = free_surface_walls(size)
     half_width, half_height = shape.reach
@@ -159,7 +160,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         family = FAMILIES[number // 2 % len(FAMILIES)]
         area_range = "area_shift"
     start = _START[family]
-    area = uniform(rng, *interval(size, area_range))
+    area = draw_between(rng, size, area_range)
     shape = _draw_shape(rng, family, area, size)
     body = place(rng, shape, _start_region(size, start))
 

@@ -17,12 +17,12 @@ It is the dam break of Martin and Moyce (1952) between two glass walls.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .constants import constants, free_surface_walls, interval
+from .constants import constants, draw_between, free_surface_walls
 from .draws import RandomSource, add_in_order, choice, quantise, uniform
 from .shapes import Body, sample_points
 from .solids import Ball, Block, Solid
@@ -45,6 +45,14 @@ FAMILIES = ("falling-ball", "thrown-block", "dam-break", "splash")
 AT_REST: Point = (0.0, 0.0, 0.0)
 
 
+class _LiquidBody(NamedTuple):
+    """A body of liquid at the start."""
+
+    solid: Solid
+    centre: Point  # [length]
+    velocity: Point  # [length/s]
+
+
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
     """Return the solver's constants at this size."""
     return constants(FreeSurface3DParameters, size)
@@ -52,9 +60,9 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 def _draw_vector(rng: RandomSource, size: Size, name: str) -> Point:
     """Draw a vector from the intervals ``<name>_x``, ``<name>_y`` and ``<name>_z``."""
-    x = uniform(rng, *interval(size, f"{name}_x"))
-    y = uniform(rng, *interval(size, f"{name}_y"))
-    z = uniform(rng, *interval(size, f"{name}_z"))
+    x = draw_between(rng, size, f"{name}_x")
+    y = draw_between(rng, size, f"{name}_y")
+    z = draw_between(rng, size, f"{name}_z")
     return x, y, z
 
 
@@ -73,32 +81,33 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
 
 
 def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
-    radius = uniform(rng, *interval(size, "ball_radius"))
+    radius = draw_between(rng, size, "ball_radius")
     ball = Ball(radius)
     centre = _draw_place(rng, size, ball, size.value("fall_height"))
     velocity = _draw_vector(rng, size, "fall_velocity")
-    return _state(rng, size, "falling-ball", [(ball, centre, velocity)])
+    body = _LiquidBody(ball, centre, velocity)
+    return _state(rng, size, "falling-ball", [body])
 
 
 def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
-    side_range = interval(size, "block_side")
-    width = uniform(rng, *side_range)
-    height = uniform(rng, *side_range)
-    depth = uniform(rng, *side_range)
+    width = draw_between(rng, size, "block_side")
+    height = draw_between(rng, size, "block_side")
+    depth = draw_between(rng, size, "block_side")
     block = Block((width, height, depth))
     centre = _draw_place(rng, size, block, 0.0)
     u, v, w = _draw_vector(rng, size, "throw_velocity")
     # towards either end of both horizontal axes
     sign_x = 1.0 - 2.0 * choice(rng, 2)
     sign_z = 1.0 - 2.0 * choice(rng, 2)
-    thrown = (sign_x * u, v, sign_z * w)
-    return _state(rng, size, "thrown-block", [(block, centre, thrown)])
+    velocity = (sign_x * u, v, sign_z * w)
+    body = _LiquidBody(block, centre, velocity)
+    return _state(rng, size, "thrown-block", [body])
 
 
 def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     low, high = free_surface_walls(size)
-    width = uniform(rng, *interval(size, "column_width"))
-    height = uniform(rng, *interval(size, "column_height"))
+    width = draw_between(rng, size, "column_width")
+    height = draw_between(rng, size, "column_height")
     start = low + 0.5 * width
     if choice(rng, 2) == 1:
         start = high - 0.5 * width
@@ -110,62 +119,62 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     else:
         column = Block((high - low, height, width))
         centre = (middle, y, start)
-    return _state(rng, size, "dam-break", [(column, centre, AT_REST)])
+    body = _LiquidBody(column, centre, AT_REST)
+    return _state(rng, size, "dam-break", [body])
 
 
 def _splash(rng: RandomSource, size: Size) -> InitialState:
     low, high = free_surface_walls(size)
-    depth = uniform(rng, *interval(size, "pool_depth"))
+    depth = draw_between(rng, size, "pool_depth")
     pool = Block((high - low, depth, high - low))
     middle = 0.5 * (low + high)
     pool_centre = (middle, low + 0.5 * depth, middle)
-    radius = uniform(rng, *interval(size, "drop_radius"))
+    radius = draw_between(rng, size, "drop_radius")
     ball = Ball(radius)
     lowest = low + depth + size.value("margin") + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
-    bodies: list[tuple[Solid, Point, Point]] = [
-        (pool, pool_centre, AT_REST),
-        (ball, ball_centre, velocity),
-    ]
-    return _state(rng, size, "splash", bodies)
+    pool_body = _LiquidBody(pool, pool_centre, AT_REST)
+    ball_body = _LiquidBody(ball, ball_centre, velocity)
+    return _state(rng, size, "splash", [pool_body, ball_body])
 
 
 def _state(
     rng: RandomSource,
     size: Size,
     family: str,
-    bodies: list[tuple[Solid, Point, Point]],
+    bodies: list[_LiquidBody],
 ) -> InitialState:
-    """Return bodies of liquid, each a solid, its centre and its velocity.
+    """Return the initial state of bodies of liquid.
 
     Particles are shared out by volume; the last body has what rounding leaves.
     """
-    total_volume = add_in_order(solid.measure for solid, _, _ in bodies)
+    volumes = [body.solid.measure for body in bodies]
+    total_volume = add_in_order(volumes)
     positions = []
     velocities = []
     left_count = size.particles
-    for index, (solid, centre, velocity) in enumerate(bodies):
+    for index, body in enumerate(bodies):
         count = left_count
         if index < len(bodies) - 1:
-            volume_share = solid.measure / total_volume
+            volume_share = volumes[index] / total_volume
             count = int(size.particles * volume_share)
         left_count -= count
-        body = Body(solid, np.array(centre))
-        position = sample_points(rng, body, count)
+        place = Body(body.solid, np.array(body.centre))
+        position = sample_points(rng, place, count)
         positions.append(position)
-        velocities.append(np.full(position.shape, velocity))
+        velocities.append(np.full(position.shape, body.velocity))
 
     low, high = free_surface_walls(size)
     position = np.clip(np.concatenate(positions), low, high)
-    _, last_centre, last_velocity = bodies[-1]
+    last_body = bodies[-1]
     parameters: dict[str, int | float | str] = {
         "family": family,
         "volume": total_volume,
     }
     for axis, name in enumerate("xyz"):
-        parameters[f"centre_{name}"] = float(quantise(last_centre[axis]))
-        parameters[f"velocity_{name}"] = float(last_velocity[axis])
+        parameters[f"centre_{name}"] = float(quantise(last_body.centre[axis]))
+        parameters[f"velocity_{name}"] = float(last_body.velocity[axis])
     return InitialState(
         position=position,
         velocity=quantise(np.concatenate(velocities)),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .driver import Driver, stack
 from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
-from .solver import Health
+from .solver import Health, Singles
 from .soundness import sound_speeds
 from .split import FreeSurfaceParameters, InitialState, Material
 
@@ -68,13 +68,13 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
     _kernels: FreeSurfaceKernels
 
     @abstractmethod
-    def deformation(self) -> NDArray[np.float32]:
+    def deformation(self) -> Singles:
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, axis, axis].
         """
 
     @abstractmethod
-    def _set_deformation(self, gradients: NDArray[np.float32]) -> None:
+    def _set_deformation(self, gradients: Singles) -> None:
         """Fill the field of F, shape [scenario, particle, axis, axis]."""
 
     def _start(self, states: Sequence[InitialState]) -> None:
@@ -82,7 +82,8 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         kernels = self._kernels
         # Material of each particle, shape [scenario, particle]
         self._material = stack(states, "material").astype(np.int32)
-        kernels.solid = bool((self._material != Material.LIQUID).any())
+        is_solid = self._material != Material.LIQUID
+        kernels.solid = bool(is_solid.any())
         matter = np.zeros((*shape, 4), np.float32)
         matter[:, :, 0] = self._material
         matter[:, :, 1:] = 1.0
@@ -122,7 +123,7 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             return {name: f"{quantity} = {reach:.6g}"}
         return {}
 
-    def affine(self) -> NDArray[np.float32]:
+    def affine(self) -> Singles:
         """APIC matrices C = grad v [1/s], shape [scenario, particle, axis, axis]."""
         columns = []
         for field in self._kernels.slopes:
@@ -130,7 +131,7 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             columns.append(slope[..., : self.dimension])
         return np.stack(columns, axis=-1)
 
-    def volume_ratio(self) -> NDArray[np.float32]:
+    def volume_ratio(self) -> Singles:
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario,
         particle].
         """
@@ -139,14 +140,14 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
 
     def volume_ratio_extremes(
         self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[Singles, Singles]:
         """Smallest and largest :meth:`volume_ratio` of each particle at any substep
         since the start [1], each of shape [scenario, particle].
         """
         matter = self._read(self._kernels.matter)
         return matter[..., 2], matter[..., 3]
 
-    def jacobian(self) -> NDArray[np.float32]:
+    def jacobian(self) -> Singles:
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario,
         particle].
         """
@@ -161,7 +162,7 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         position = self.position().astype(np.float64)
         velocity = self.velocity().astype(np.float64)
         affine = self.affine().astype(np.float64)
-        height = position[..., 1] - self._kernels.least
+        height = position[..., 1] - self._kernels.position_min
         velocity_square = (velocity**2).sum(axis=-1)
         affine_square = (affine**2).sum(axis=(-2, -1))
         spin = affine_square / (4.0 * p.grid**2)
@@ -216,11 +217,11 @@ class FreeSurface(FreeSurfaceDriver):
             self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
         )
 
-    def deformation(self) -> NDArray[np.float32]:
+    def deformation(self) -> Singles:
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, 2, 2].
         """
-        return np.asarray(self._kernels.f.to_numpy())
+        return np.asarray(self._kernels.deformation.to_numpy())
 
-    def _set_deformation(self, gradients: NDArray[np.float32]) -> None:
-        self._kernels.f.from_numpy(gradients)
+    def _set_deformation(self, gradients: Singles) -> None:
+        self._kernels.deformation.from_numpy(gradients)

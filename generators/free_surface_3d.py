@@ -11,10 +11,10 @@ axis, max abs(v_i) dt <= dx (checked), and while sound does not either
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .free_surface import FreeSurfaceDriver
 from .particle_stress_3d import ParticleStress3D
+from .solver import Singles
 
 
 class FreeSurface3D(FreeSurfaceDriver):
@@ -32,15 +32,17 @@ class FreeSurface3D(FreeSurfaceDriver):
             self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
         )
 
-    def deformation(self) -> NDArray[np.float32]:
+    def deformation(self) -> Singles:
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, 3, 3].
         """
-        columns = [field.to_numpy()[..., :3] for field in self._kernels.f]
+        columns = [
+            field.to_numpy()[..., :3] for field in self._kernels.deformation_columns
+        ]
         return np.stack(columns, axis=-1)
 
-    def _set_deformation(self, gradients: NDArray[np.float32]) -> None:
-        for axis, field in enumerate(self._kernels.f):
+    def _set_deformation(self, gradients: Singles) -> None:
+        for axis, field in enumerate(self._kernels.deformation_columns):
             column = np.zeros((*gradients.shape[:2], 4), np.float32)
             column[..., :3] = gradients[..., axis]
             field.from_numpy(column)

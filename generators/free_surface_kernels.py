@@ -7,6 +7,8 @@ in :mod:`.particle_stress` and :mod:`.particle_stress_3d`.
 from typing import ClassVar
 
 import taichi as ti
+from taichi import f32, i32
+from taichi.math import vec4
 
 from . import backend
 from .constitutive import lame, larger
@@ -44,6 +46,7 @@ class FreeSurfaceKernels:
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
+        self.particles = p.particles
         self.solid = True  # whether some particles are no liquid
         self.inv_dx = float(p.grid)
         self.dx = 1.0 / p.grid
@@ -53,8 +56,8 @@ class FreeSurfaceKernels:
         self.low = p.wall
         self.high = p.grid - p.wall
         # smallest and largest coordinate of a particle
-        self.least = (self.low + _INSET) * self.dx
-        self.most = (self.high - _INSET) * self.dx
+        self.position_min = (self.low + _INSET) * self.dx
+        self.position_max = (self.high - _INSET) * self.dx
         self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
         # of abs(v) + abs(A o), what sums have room for
         self.reach_bound = self.reach * self.speed_bound
@@ -62,8 +65,8 @@ class FreeSurfaceKernels:
         self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
-        self.impulse = 4.0 * p.dt * p.grid / p.density
-        self.fall = p.gravity * p.dt
+        self.stress_factor = 4.0 * p.dt * p.grid / p.density  # 4 dt / (rho dx)
+        self.gravity_gain = p.gravity * p.dt  # dt g
         self.liquid_viscosity = p.density * p.liquid_viscosity
         self.solid_viscosity = p.density * p.elastic_damping
         self.jelly = lame(p.jelly_modulus, p.jelly_poisson)
@@ -76,41 +79,44 @@ class FreeSurfaceKernels:
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
-        # particle positions [length], filled up with zeros
-        self.x = ti.Vector.field(4, ti.f32)
-        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads, v_p first
-        # derivative along each axis of what nodes hold, v first, at the particles:
+        # of each particle: its position [length], filled up with zeros
+        self.x = vec4.field()
+        # what P2G spreads, v_p first
+        self.particle_state = vec4.field()
+        # derivative along each axis of what nodes hold, v first, at the particle:
         # columns of C
-        self.slopes = [ti.Vector.field(4, ti.f32) for _ in range(self.dimension)]
+        self.slopes = [vec4.field() for _ in range(self.dimension)]
         # Material, J of liquid or plastic Jp of snow (1 in other solids), and the
         # smallest and largest that this was since the start
-        self.matter = ti.Vector.field(4, ti.f32)
+        self.matter = vec4.field()
         # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
         # advance began
-        self.extremes = ti.Vector.field(4, ti.f32)
-        self.fill = ti.field(ti.f32)  # m / (rho dx^d), shape [scenario]
-        # Coulomb friction of the walls, shape [scenario]
-        self.friction = ti.field(ti.f32)
+        self.extremes = vec4.field()
+        # of each scenario: m / (rho dx^d), and Coulomb friction of the walls
+        self.particle_volume = ti.field(f32)
+        self.friction = ti.field(f32)
 
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
-        particle_shape = (self.scenarios, self.parameters.particles)
+        particle_shape = (self.scenarios, self.particles)
         node_shape = (self.scenarios, self.node_count)
         # Two more: a node counts the rows of the two nodes before it as well.
         row_shape = (self.scenarios, self.node_count + 2)
         particle_fields = (
             self.x,
-            self.carried,
+            self.particle_state,
             *self.slopes,
             *self._particle_fields(),
             self.matter,
             self.extremes,
         )
+        scenario_shape = (self.scenarios,)
+        scenario_fields = (self.particle_volume, self.friction)
         backend.place(
-            *((particle_shape, [field]) for field in particle_fields),
-            *((node_shape, [field]) for field in self._node_fields()),
-            *((row_shape, [field]) for field in self._row_fields()),
-            ((self.scenarios,), [self.fill, self.friction]),
+            (particle_shape, particle_fields),
+            (node_shape, self._node_fields()),
+            (row_shape, self._row_fields()),
+            (scenario_shape, scenario_fields),
         )
 
     def run_serially(self, substeps: int) -> None:
@@ -140,17 +146,18 @@ class FreeSurfaceKernels:
         return ()
 
     @ti.func
-    def touched_nodes(self, particles: ti.i32) -> Value:
+    def touched_nodes(self, particles: i32) -> Value:
         """Return the first node that particles of scenario 0 touch along each axis, and
         the one behind the last.
 
         A node next to a wall counts its image, which no particle need touch.
         """
-        first = ti.Vector([self.high for _ in range(self.dimension)])
-        last = ti.Vector([0 for _ in range(self.dimension)])
+        first = ti.Vector([self.high] * self.dimension)
+        last = ti.Vector([0] * self.dimension)
         for p in range(particles):
             for axis in ti.static(range(self.dimension)):
-                base = ti.cast(self.x[0, p][axis] * self.inv_dx - 0.5, ti.i32)
+                scaled = self.x[0, p][axis] * self.inv_dx
+                base = ti.cast(scaled - 0.5, i32)
                 first[axis] = ti.min(first[axis], base)
                 last[axis] = ti.max(last[axis], base + 3)
         for axis in ti.static(range(self.dimension)):
@@ -161,7 +168,7 @@ class FreeSurfaceKernels:
         return first, last
 
     @ti.func
-    def image(self, index: ti.i32) -> ti.i32:
+    def image(self, index: i32) -> i32:
         """Return the mirror image of a node within a cell of a wall, else -1."""
         mirrored = -1
         if index <= self.low + 1:
@@ -171,21 +178,21 @@ class FreeSurfaceKernels:
         return mirrored
 
     @ti.func
-    def is_outward(self, index: ti.i32, normal: ti.f32) -> Value:
+    def is_outward(self, index: i32, normal: f32) -> Value:
         """Tell whether a node at a wall, or behind it, moves out of the box."""
-        return (index <= self.low and normal < 0.0) or (
-            index >= self.high and normal > 0.0
-        )
+        leaves_low = index <= self.low and normal < 0.0
+        leaves_high = index >= self.high and normal > 0.0
+        return leaves_low or leaves_high
 
 
 @ti.func
-def finite(value: ti.f32) -> ti.f32:
+def finite(value: f32) -> f32:
     """Return a positive value, or :data:`_HUGE` if it is not a finite number."""
     return ti.select(value < _HUGE, value, _HUGE)
 
 
 @ti.func
-def largest_of(a: ti.f32, b: ti.f32) -> ti.f32:
+def largest_of(a: f32, b: f32) -> f32:
     """Return the larger of two positive values.
 
     It is :data:`_HUGE` if either is not a number.

@@ -49,13 +49,18 @@ class FullBox(Driver[FullBoxParameters]):
         self._drive_towards(0)
         # nu dt / dx^2, shape [scenario]
         viscosity = np.array([state.viscosity for state in states])
-        spread = viscosity * p.dt * p.grid**2
-        kernels.spread.from_numpy(spread.astype(np.float32))
+        diffusion_number = viscosity * p.dt * p.grid**2
+        kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
         if p.obstacle_particles:
             kernels.place_obstacles(_obstacles_of(states))
         if p.fringe_rate:
             kernels.set_stream(_streams_of(states))
-        for field in (kernels.drag, kernels.node, kernels.moved, kernels.gain):
+        for field in (
+            kernels.drag,
+            kernels.node_state,
+            kernels.next_state,
+            kernels.node_gain,
+        ):
             field.fill(0.0)
 
     def _inside(self, position: Singles) -> Singles:
@@ -99,8 +104,9 @@ class FullBox(Driver[FullBoxParameters]):
 
     def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
-        carried = self._kernels.carried.to_numpy()
-        return np.asarray(carried[:, : self.parameters.particles, 3])
+        state = self._kernels.particle_state.to_numpy()
+        fluid = state[:, : self.parameters.particles]
+        return np.asarray(fluid[..., 3])
 
     def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s].
@@ -108,8 +114,8 @@ class FullBox(Driver[FullBoxParameters]):
         The shape is [scenario, *cells, axis]; a node is the middle of its cell.
         """
         nodes = self._kernels.tables.shape
-        moved = self._kernels.moved.to_numpy()
-        values = moved.reshape(self.scenarios, *nodes, -1)
+        state = self._kernels.next_state.to_numpy()
+        values = state.reshape(self.scenarios, *nodes, -1)
         interior = (slice(1, -1),) * self.dimension
         inside = values[(slice(None), *interior)]
         return np.asarray(inside[..., : self.dimension])
@@ -117,19 +123,22 @@ class FullBox(Driver[FullBoxParameters]):
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
         # largest velocity of any particle by component, and J, shape [scenario, 4]
-        extremes = self._read(self._kernels.extremes).max(axis=1)
+        particle_extremes = self._read(self._kernels.extremes)
+        extremes = particle_extremes.max(axis=1)
         # the fields of positions hold the largest -J of each particle
         positions = self._read(self._kernels.x)
         lowest = positions[..., 3].max(axis=1)
         # largest velocity component of any node, shape [scenario]
-        peaks = self._kernels.peak.to_numpy().max(axis=1)
+        node_peaks = self._kernels.peak_speed.to_numpy()
+        peaks = node_peaks.max(axis=1)
         healths = []
         for extreme, low, peak in zip(extremes, lowest, peaks, strict=True):
             *speeds, jacobian = extreme
             is_finite = np.isfinite([*extreme, low, peak])
+            max_speed = np.max([*speeds, peak])
             health = Health(
                 finite=bool(is_finite.all()),
-                max_speed=float(np.max([*speeds, peak])),
+                max_speed=float(max_speed),
                 jacobian_min=float(-low),
                 jacobian_max=float(jacobian),
             )

@@ -25,14 +25,18 @@ from numpy.typing import NDArray
 
 from lagbench.errors import WorkFailedError
 
-from .constants import constants, free_surface_walls, interval, shift_number
+from .constants import (
+    constants,
+    draw_between,
+    free_surface_walls,
+    shift_number,
+)
 from .draws import (
     RandomSource,
     add_in_order,
     choice,
     direction,
     quantise,
-    uniform,
 )
 from .shapes import Body, Disc, Rectangle, Shape, place, sample_points
 from .split import FreeSurfaceParameters, InitialState, Material
@@ -86,7 +90,7 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 
 def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
-    aspect = uniform(rng, *interval(size, "aspect"))
+    aspect = draw_between(rng, size, "aspect")
     return Rectangle.of_area(area, aspect)
 
 
@@ -108,9 +112,9 @@ def _draw_shape(
 ) -> Shape:
     """Draw a rope, a ball of jelly, or a block or ball of anything else."""
     if material is Material.ROPE:
-        length = uniform(rng, *interval(size, "rope_length"))
+        length = draw_between(rng, size, "rope_length")
         return kinds.rope(rng, size, length)
-    measure = uniform(rng, *interval(size, kinds.measure))
+    measure = draw_between(rng, size, kinds.measure)
     if material is Material.JELLY or choice(rng, 2) == 1:
         return kinds.ball(measure)
     return kinds.block(rng, size, measure)
@@ -147,7 +151,9 @@ def _keeps_gap(
 def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
     """Tell whether all bodies keep a gap [length] from one another."""
     for i, j in combinations(range(len(bodies)), 2):
-        if not _keeps_gap(bodies[i], bodies[j], offsets[j], gap):
+        first = bodies[i]
+        second = bodies[j]
+        if not _keeps_gap(first, second, offsets[j], gap):
             return False
     return True
 
@@ -224,7 +230,7 @@ def _draw_attractor(rng: RandomSource, size: Size) -> Array:
     """Draw the point that attracts all bodies [length], shape [axis]."""
     point = []
     for axis in "xyz"[: size.dimension]:
-        coordinate = uniform(rng, *interval(size, f"attractor_{axis}"))
+        coordinate = draw_between(rng, size, f"attractor_{axis}")
         point.append(coordinate)
     return np.array(point)
 
@@ -256,7 +262,7 @@ def draw_bodies(
 
     # the attractor: velocity of each body = rate (point - centre) [length/s]
     point = _draw_attractor(rng, size)
-    rate = uniform(rng, *interval(size, "attraction"))
+    rate = draw_between(rng, size, "attraction")
     velocities = []
     for body in bodies:
         way = point - body.centre

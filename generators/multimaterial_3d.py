@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .constants import constants, interval
-from .draws import RandomSource, direction_in_space, uniform
+from .constants import constants, draw_between
+from .draws import RandomSource, direction_in_space
 from .multimaterial import BodyShapes, draw_bodies
 from .solids import Ball, Block, Rod, Solid
 from .split import (
@@ -34,8 +34,8 @@ def _draw_rod(rng: RandomSource, size: Size, length: float) -> Solid:
 
 
 def _draw_block(rng: RandomSource, size: Size, volume: float) -> Solid:
-    along_x = uniform(rng, *interval(size, "aspect"))
-    along_z = uniform(rng, *interval(size, "aspect"))
+    along_x = draw_between(rng, size, "aspect")
+    along_z = draw_between(rng, size, "aspect")
     return Block.of_volume(volume, (along_x, along_z))
 
 

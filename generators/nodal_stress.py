@@ -29,6 +29,8 @@ stays in (0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of t
 from typing import Any
 
 import taichi as ti
+from taichi import f32, i32
+from taichi.math import vec2, vec4
 
 from . import backend
 from .split import ClosedBoxParameters
@@ -87,83 +89,103 @@ class NodalStress:
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
-        self.averaging = False  # whether the substeps to come count for the total
+        # whether the velocities of the coming substeps are summed, for their mean
+        self.averaging = False
         self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
+        self.particles = p.particles
         self.inv_dx = float(p.grid)
         self.width = p.grid + 1
         self.node_count = self.width**2
         self.dt = p.dt
-        self.least = (p.wall + 0.5 + _INSET) * dx  # smallest coordinate of a particle
-        # largest coordinate of a particle
-        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx
+        # smallest and largest coordinate of a particle [length]
+        wall_distance = p.wall + 0.5 + _INSET  # [cells]
+        self.position_min = wall_distance * dx
+        self.position_max = (p.grid - p.wall - 0.5 - _INSET) * dx
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
-        self.velocity_scale = fixed_point_scale(p.particles, _REACH * self.speed_bound)
+        reach_bound = _REACH * self.speed_bound
+        self.velocity_scale = fixed_point_scale(p.particles, reach_bound)
         self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
         self.cell_scale = self.velocity_scale * dx
-        self.pressure = p.dt * p.modulus / (p.density * 2.0 * dx)
-        self.gradient = 4.0 * self.inv_dx
-        self.shift = -p.shift * dx * dx
+        # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
+        divisor = p.density * 2.0 * dx
+        self.pressure_factor = p.dt * p.modulus / divisor
+        self.slope_factor = 4.0 * self.inv_dx  # 4/dx
+        self.shift_factor = -p.shift * dx * dx  # -beta dx^2
         self.shift_bound = 0.1 * dx
         self._declare_fields()
         self._tree = self._place_fields()
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
-        # particle positions [length], and two zeros
-        self.x = ti.Vector.field(4, ti.f32)
-        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
-        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # of a particle at rest
-        # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
-        self.slope_x = ti.Vector.field(4, ti.f32)
-        self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        # of each particle: its position [length], and two zeros
+        self.x = vec4.field()
+        # what P2G spreads: v_x, v_y, 1, J
+        self.particle_state = vec4.field()
+        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # state of a particle at rest
+        # v_x, v_y, r and Jbar of the nodes, at the particle
+        self.grid_state = vec4.field()
+        # d/dx of the same
+        self.slope_x = vec4.field()
+        # d/dy of the same
+        self.slope_y = vec4.field()
         self.slopes = (self.slope_x, self.slope_y)
-        # largest abs(v_x), abs(v_y), J and -J of each particle since the advance began
-        self.extremes = ti.Vector.field(4, ti.f32)
-        self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
-        # nodal v_x, v_y, r, Jbar at the particles
-        self.here = ti.Vector.field(4, ti.f32)
-        # nodal dt a at the particles, and two zeros
-        self.push = ti.Vector.field(4, ti.f32)
-        self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
-        self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
-        # the same after the forces of the last substep
-        self.moved = ti.Vector.field(4, ti.f32)
-        self.gain = ti.Vector.field(2, ti.f32)  # dt a
+        # dt a of the nodes, at the particle, and two zeros
+        self.grid_gain = vec4.field()
+        # largest abs(v_x), abs(v_y), J and -J since the advance began
+        self.extremes = vec4.field()
+        # rows of its stencil
+        self.weight_rows = [vec4.field() for _ in range(3)]
+
+        # of each node: n v_x, n v_y, n, n J
+        self.sums = ti.Vector.field(4, ti.i64)
+        # v_x, v_y, r, Jbar before the forces of this substep
+        self.node_state = vec4.field()
+        # the same after them
+        self.next_state = vec4.field()
+        self.node_gain = vec2.field()  # dt a
         # largest absolute velocity component since the advance began
-        self.peak = ti.field(ti.f32)
-        self.total = ti.Vector.field(2, ti.f64)  # sum over time of the nodal velocities
-        self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
-        self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
+        self.peak_speed = ti.field(f32)
+        # sum over time of the velocity
+        self.velocity_sum = ti.Vector.field(2, ti.f64)
+
+        # of each scenario: nu dt / dx^2 and m / (rho dx^2)
+        self.diffusion_number = ti.field(f32)
+        self.particle_volume = ti.field(f32)
 
     def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
         """Give the fields their memory, each an array of its own."""
         particle_fields = (
             self.x,
-            self.carried,
+            self.particle_state,
             self.slope_x,
             self.slope_y,
-            *self.rows,
-            self.here,
-            self.push,
+            *self.weight_rows,
+            self.grid_state,
+            self.grid_gain,
             self.extremes,
         )
         node_fields = (
             self.sums,
-            self.node,
-            self.moved,
-            self.gain,
-            self.peak,
-            self.total,
+            self.node_state,
+            self.next_state,
+            self.node_gain,
+            self.peak_speed,
+            self.velocity_sum,
         )
-        particle_shape = (self.scenarios, self.parameters.particles)
+        scenario_fields = [
+            self.walls.speed,
+            self.diffusion_number,
+            self.particle_volume,
+        ]
+        particle_shape = (self.scenarios, self.particles)
         node_shape = (self.scenarios, self.node_count)
-        scenario_fields = [self.walls.speed, self.spread, self.fill]
+        scenario_shape = (self.scenarios,)
         return backend.place(
-            *((particle_shape, [field]) for field in particle_fields),
-            *((node_shape, [field]) for field in node_fields),
-            ((self.scenarios,), scenario_fields),
+            (particle_shape, particle_fields),
+            (node_shape, node_fields),
+            (scenario_shape, scenario_fields),
         )
 
     def release(self) -> None:
@@ -171,207 +193,266 @@ class NodalStress:
         self._tree.destroy()
 
     @ti.func
-    def at(self, i: ti.i32, j: ti.i32) -> ti.i32:
-        """Return the index of a node."""
+    def at(self, i: i32, j: i32) -> i32:
+        """Return the number of a node."""
         return i * self.width + j
+
+    @ti.func
+    def state_at(self, s: i32, i: i32, j: i32) -> vec4:
+        """Return v_x, v_y, r and Jbar of a node before the forces."""
+        node = self.at(i, j)
+        return self.node_state[s, node]
+
+    @ti.func
+    def jacobian_at(self, s: i32, i: i32, j: i32) -> f32:
+        """Return Jbar of a node before the forces."""
+        node = self.at(i, j)
+        return self.node_state[s, node][3]
 
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
-    def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+    def clear(self, s: i32, i: i32, j: i32) -> None:
         """Set the sums of a node of scenario s to zero, before P2G adds to them."""
-        self.sums[s, self.at(i, j)] = ti.Vector([0, 0, 0, 0], ti.i64)
+        node = self.at(i, j)
+        self.sums[s, node] = ti.Vector.zero(ti.i64, 4)
 
     @ti.func
-    def locate(self, s: ti.i32, p: ti.i32) -> None:
+    def locate(self, s: i32, p: i32) -> None:
         """Keep for P2G and G2P which nodes a particle touches, and the weights."""
-        first, second, third = stencil(self.x[s, p], self.inv_dx, self.width)
-        self.rows[0][s, p] = first
-        self.rows[1][s, p] = second
-        self.rows[2][s, p] = third
+        x = self.x[s, p]
+        first, second, third = stencil(x, self.inv_dx, self.width)
+        self.weight_rows[0][s, p] = first
+        self.weight_rows[1][s, p] = second
+        self.weight_rows[2][s, p] = third
 
     @ti.func
-    def p2g(self, s: ti.i32, p: ti.i32) -> None:
+    def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.rows, s, p, self.node_count)
-        scale = ti.Vector(
-            [
-                self.velocity_scale,
-                self.velocity_scale,
-                self.count_scale,
-                self.count_scale,
-            ]
+        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        scale = vec4(
+            self.velocity_scale,
+            self.velocity_scale,
+            self.count_scale,
+            self.count_scale,
         )
         # n and J have no slope; a product with 0 is one, as nodes, and so slopes, are
         # finite.
-        only_v = ti.Vector([self.cell_scale, self.cell_scale, 0.0, 0.0])
-        c_x = only_v * self.slope_x[s, p]
-        c_y = only_v * self.slope_y[s, p]
-        middle = scale * self.carried[s, p] - offset[0] * c_x - offset[1] * c_y
+        slope_scale = vec4(self.cell_scale, self.cell_scale, 0.0, 0.0)
+        step_x = slope_scale * self.slope_x[s, p]
+        step_y = slope_scale * self.slope_y[s, p]
+        at_particle = scale * self.particle_state[s, p]
+        at_middle = at_particle - offset[0] * step_x - offset[1] * step_y
         for i, j in ti.static(ti.ndrange(3, 3)):
-            column = stepped(middle, c_x, i - 1)
-            value = stepped(column, c_y, j - 1)
-            node = ti.Vector([s, base + i * self.width + j])
-            weight = self.rows[i][s, p][j]
-            accumulate(self.sums, node, weight * value, self.atomic)
+            at_column = stepped(at_middle, step_x, i - 1)
+            at_node = stepped(at_column, step_y, j - 1)
+            node = base + i * self.width + j
+            weight = self.weight_rows[i][s, p][j]
+            accumulate(self.sums, s, node, weight * at_node, self.atomic)
 
     @ti.func
-    def received(self, s: ti.i32, i: ti.i32, j: ti.i32) -> Value:
+    def sums_at(self, s: i32, i: i32, j: i32) -> Value:
+        """Return n v_x, n v_y, n and n J of a node."""
+        node = self.at(i, j)
+        return self.sums[s, node]
+
+    @ti.func
+    def received(self, s: i32, i: i32, j: i32) -> Value:
         """Return the sums of a node and its mirror images, and the drag of the walls.
 
         The drag is the momentum that moving walls add.
         """
-        total = self.sums[s, self.at(i, j)]
-        drag = ti.Vector([0.0, 0.0])
+        total = self.sums_at(s, i, j)
+        drag = vec2(0.0)
         tangential = self.walls.tangential
-        x_ghost = self.walls.beyond(i)
-        y_ghost = self.walls.beyond(j)
-        if x_ghost != i:
-            image = self.sums[s, self.at(x_ghost, j)]
+        ghost_i = self.walls.beyond(i)
+        ghost_j = self.walls.beyond(j)
+        is_beside_x_wall = ghost_i != i
+        is_beside_y_wall = ghost_j != j
+        # Walls across x slide along y, and the other way round.
+        speed_y = self.walls.doubled_speed(s, 0, ghost_i)
+        speed_x = self.walls.doubled_speed(s, 2, ghost_j)
+        if is_beside_x_wall:
+            image = self.sums_at(s, ghost_i, j)
+            count = from_fixed(image[2], self.count_unit)
             total += ti.Vector([-1, tangential, 1, 1]) * image
+            drag[1] += speed_y * count
+        if is_beside_y_wall:
+            image = self.sums_at(s, i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * count
-        if y_ghost != j:
-            image = self.sums[s, self.at(i, y_ghost)]
             total += ti.Vector([tangential, -1, 1, 1]) * image
+            drag[0] += speed_x * count
+        if is_beside_x_wall and is_beside_y_wall:
+            image = self.sums_at(s, ghost_i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * count
-        if x_ghost != i and y_ghost != j:
-            image = self.sums[s, self.at(x_ghost, y_ghost)]
             total += ti.Vector([-tangential, -tangential, 1, 1]) * image
-            count = from_fixed(image[2], self.count_unit)
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * count
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * count
+            drag[0] += speed_x * count
+            drag[1] += speed_y * count
         return total, drag
 
     @ti.func
-    def fold(self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32) -> None:
+    def fold(self, s: i32, i: i32, j: i32, particle_volume: f32) -> None:
         """Turn the sums of an interior node into v, r and Jbar."""
         total, drag = self.received(s, i, j)
-        state = ti.Vector([0.0, 0.0, 0.0, 1.0])
+        state = vec4(0.0, 0.0, 0.0, 1.0)
         if total[2] > 0:
             count = from_fixed(total[2], self.count_unit)
             momentum_x = from_fixed(total[0], self.velocity_unit) + drag[0]
             momentum_y = from_fixed(total[1], self.velocity_unit) + drag[1]
+            jacobian_sum = from_fixed(total[3], self.count_unit)
             state[0] = momentum_x / count
             state[1] = momentum_y / count
-            state[2] = count * fill
-            state[3] = from_fixed(total[3], self.count_unit) / count
-        self.node[s, self.at(i, j)] = state
+            state[2] = count * particle_volume
+            state[3] = jacobian_sum / count
+        node = self.at(i, j)
+        self.node_state[s, node] = state
 
     @ti.func
-    def mirror(self, state: Template, s: ti.i32, k: ti.i32) -> None:
+    def source(self, i: i32, j: i32) -> i32:
+        """Return the number of the interior node that a ghost node mirrors."""
+        source_i = self.walls.source(i)
+        source_j = self.walls.source(j)
+        return self.at(source_i, source_j)
+
+    @ti.func
+    def mirror(self, states: Template, s: i32, k: i32) -> None:
         """Fill the k-th ghost node of (v, r, Jbar).
 
         r and Jbar are even about the wall, v is odd about the velocity of the wall.
         """
         i, j = self.walls.ring(k)
-        source = self.at(self.walls.source(i), self.walls.source(j))
-        image = state[s, source]
+        node = self.at(i, j)
+        source = self.source(i, j)
+        image = states[s, source]
         sign = self.walls.reflection(i, j)
         drive = self.walls.drive(s, i, j)
-        v_x = sign[0] * image[0] + drive[0]
-        v_y = sign[1] * image[1] + drive[1]
-        state[s, self.at(i, j)] = ti.Vector([v_x, v_y, image[2], image[3]])
+        image[0] = sign[0] * image[0] + drive[0]
+        image[1] = sign[1] * image[1] + drive[1]
+        states[s, node] = image
 
     @ti.func
-    def mirror_gain(self, s: ti.i32, k: ti.i32) -> None:
+    def mirror_gain(self, s: i32, k: i32) -> None:
         """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
         i, j = self.walls.ring(k)
-        source = self.at(self.walls.source(i), self.walls.source(j))
+        node = self.at(i, j)
+        source = self.source(i, j)
         sign = self.walls.reflection(i, j)
-        self.gain[s, self.at(i, j)] = sign * self.gain[s, source]
+        self.node_gain[s, node] = sign * self.node_gain[s, source]
 
     @ti.func
-    def force(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
-        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v.
-
-        Gradients are weighted 1/8, 3/4, 1/8 across.
-        """
-        east = self.node[s, self.at(i + 1, j)]
-        west = self.node[s, self.at(i - 1, j)]
-        north = self.node[s, self.at(i, j + 1)]
-        south = self.node[s, self.at(i, j - 1)]
-        north_east = self.node[s, self.at(i + 1, j + 1)][3]
-        south_west = self.node[s, self.at(i - 1, j - 1)][3]
+    def pressure_gradient(self, s: i32, i: i32, j: i32) -> vec2:
+        """Return 2 dx grad Jbar, weighted 1/8, 3/4, 1/8 across."""
+        east = self.jacobian_at(s, i + 1, j)
+        west = self.jacobian_at(s, i - 1, j)
+        north = self.jacobian_at(s, i, j + 1)
+        south = self.jacobian_at(s, i, j - 1)
+        north_east = self.jacobian_at(s, i + 1, j + 1)
+        south_west = self.jacobian_at(s, i - 1, j - 1)
+        south_east = self.jacobian_at(s, i + 1, j - 1)
+        north_west = self.jacobian_at(s, i - 1, j + 1)
         rising = north_east - south_west
-        south_east = self.node[s, self.at(i + 1, j - 1)][3]
-        north_west = self.node[s, self.at(i - 1, j + 1)][3]
         falling = south_east - north_west
-        grad_x = 0.75 * (east[3] - west[3]) + 0.125 * (rising + falling)
-        grad_y = 0.75 * (north[3] - south[3]) + 0.125 * (rising - falling)
-
-        here = self.node[s, self.at(i, j)]
-        laplacian = ((east + west) + (north + south)) - 4.0 * here
-        gain_x = self.pressure * grad_x + self.spread[s] * laplacian[0]
-        gain_y = self.pressure * grad_y + self.spread[s] * laplacian[1]
-        v_x = here[0] + gain_x
-        v_y = here[1] + gain_y
-        self.gain[s, self.at(i, j)] = ti.Vector([gain_x, gain_y])
-        self.moved[s, self.at(i, j)] = ti.Vector([v_x, v_y, here[2], here[3]])
-        peak = largest(ti.abs(v_y), self.peak[s, self.at(i, j)])
-        self.peak[s, self.at(i, j)] = largest(ti.abs(v_x), peak)
+        slope_x = 0.75 * (east - west) + 0.125 * (rising + falling)
+        slope_y = 0.75 * (north - south) + 0.125 * (rising - falling)
+        return vec2(slope_x, slope_y)
 
     @ti.func
-    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+    def laplacian(self, s: i32, i: i32, j: i32) -> vec4:
+        """Return dx^2 times the Laplacian of (v, r, Jbar), by the four neighbours."""
+        east = self.state_at(s, i + 1, j)
+        west = self.state_at(s, i - 1, j)
+        north = self.state_at(s, i, j + 1)
+        south = self.state_at(s, i, j - 1)
+        neighbours = (east + west) + (north + south)
+        return neighbours - 4.0 * self.state_at(s, i, j)
+
+    @ti.func
+    def add_forces(self, s: i32, i: i32, j: i32) -> None:
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v."""
+        node = self.at(i, j)
+        state = self.node_state[s, node]
+        gradient = self.pressure_gradient(s, i, j)
+        laplacian = self.laplacian(s, i, j)
+        diffusion = self.diffusion_number[s]
+        gain = self.pressure_factor * gradient + diffusion * laplacian.xy
+        v = state.xy + gain
+        self.node_gain[s, node] = gain
+        state[0] = v[0]
+        state[1] = v[1]
+        self.next_state[s, node] = state
+        peak = self.peak_speed[s, node]
+        peak = largest(ti.abs(v[1]), peak)
+        peak = largest(ti.abs(v[0]), peak)
+        self.peak_speed[s, node] = peak
+
+    @ti.func
+    def g2p(self, s: i32, p: i32) -> None:
         """Interpolate (v, r, Jbar), their slopes and dt a."""
-        base, offset = base_node(self.rows, s, p, self.node_count)
-        here = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        gain = ti.Vector([0.0, 0.0])
-        slope_x = here
-        slope_y = here
+        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        state = vec4(0.0)
+        slope_x = vec4(0.0)
+        slope_y = vec4(0.0)
+        gain = vec2(0.0)
         for i, j in ti.static(ti.ndrange(3, 3)):
-            w = self.rows[i][s, p][j]
             node = base + i * self.width + j
-            share = w * self.moved[s, node]
-            gain += w * self.gain[s, node]
-            here += share
+            weight = self.weight_rows[i][s, p][j]
+            share = weight * self.next_state[s, node]
+            gain += weight * self.node_gain[s, node]
+            state += share
             slope_x = stepped(slope_x, share, i - 1)
             slope_y = stepped(slope_y, share, j - 1)
-        self.slope_x[s, p] = self.gradient * (slope_x - offset[0] * here)
-        self.slope_y[s, p] = self.gradient * (slope_y - offset[1] * here)
-        self.here[s, p] = here
-        self.push[s, p] = ti.Vector([gain[0], gain[1], 0.0, 0.0])
+        slope_x = slope_x - offset[0] * state
+        slope_y = slope_y - offset[1] * state
+        self.slope_x[s, p] = self.slope_factor * slope_x
+        self.slope_y[s, p] = self.slope_factor * slope_y
+        self.grid_state[s, p] = state
+        self.grid_gain[s, p] = vec4(gain[0], gain[1], 0.0, 0.0)
 
     @ti.func
-    def update(self, s: ti.i32, p: ti.i32) -> None:
+    def update(self, s: i32, p: i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
-        here = self.here[s, p]
+        grid_state = self.grid_state[s, p]
+        grid_velocity = grid_state.xy
+        grid_jacobian = grid_state[3]
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
-        volume = 1.0 / largest(here[2], 0.5)
-        density_slope = ti.Vector([slope_x[2], slope_y[2]])
-        shift = self.shift * volume * density_slope
+        volume = 1.0 / largest(grid_state[2], 0.5)
+
+        density_slope = vec2(slope_x[2], slope_y[2])
+        shift = self.shift_factor * volume * density_slope
         shift = bounded(shift, -self.shift_bound, self.shift_bound)
 
-        grid_v = ti.Vector([here[0], here[1]])
-        v = ti.Vector([self.carried[s, p][0], self.carried[s, p][1]])
-        v = v + ti.Vector([self.push[s, p][0], self.push[s, p][1]])
-        v = v + self.parameters.velocity_relaxation * (grid_v - v)
-        along_x = shift[0] * ti.Vector([slope_x[0], slope_x[1]])
-        along_y = shift[1] * ti.Vector([slope_y[0], slope_y[1]])
-        v = v + (along_x + along_y)
+        old_state = self.particle_state[s, p]
+        v = old_state.xy + self.grid_gain[s, p].xy
+        v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
+        change_x = shift[0] * slope_x.xy
+        change_y = shift[1] * slope_y.xy
+        v = v + (change_x + change_y)
 
-        x = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
-        x = bounded(x + (self.dt * grid_v + shift), self.least, self.most)
-        self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
+        step = self.dt * grid_velocity + shift
+        x = self.x[s, p].xy + step
+        x = bounded(x, self.position_min, self.position_max)
+        self.x[s, p] = vec4(x[0], x[1], 0.0, 0.0)
 
-        jacobian = self.carried[s, p][3]
+        divergence = slope_x[0] + slope_y[1]
+        jacobian = old_state[3]
         jacobian = (
             jacobian
-            + self.dt * (slope_x[0] + slope_y[1]) * jacobian
-            + self.parameters.jacobian_relaxation * (here[3] - jacobian)
-            + self.parameters.density_coupling * (volume - here[3])
+            + self.dt * divergence * jacobian
+            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
+            + self.parameters.density_coupling * (volume - grid_jacobian)
         )
-        self.carried[s, p] = ti.Vector([v[0], v[1], 1.0, jacobian])
-        reached = ti.Vector([ti.abs(v[0]), ti.abs(v[1]), jacobian, -jacobian])
-        self.extremes[s, p] = largest(reached, self.extremes[s, p])
+        self.particle_state[s, p] = vec4(v[0], v[1], 1.0, jacobian)
+        speed = ti.abs(v)
+        reached = vec4(speed[0], speed[1], jacobian, -jacobian)
+        extremes = self.extremes[s, p]
+        self.extremes[s, p] = largest(reached, extremes)
 
     @ti.func
-    def sum_velocity(self, s: ti.i32, n: ti.i32) -> None:
+    def sum_velocity(self, s: i32, n: i32) -> None:
         """Add a node's velocity to its sum over time, outside the path of the bits."""
-        v = ti.Vector([self.moved[s, n][0], self.moved[s, n][1]])
-        self.total[s, n] = self.total[s, n] + ti.cast(v, ti.f64)
+        velocity = ti.cast(self.next_state[s, n].xy, ti.f64)
+        self.velocity_sum[s, n] = self.velocity_sum[s, n] + velocity
 
     # The drivers: the same phases in the same order.
 
@@ -386,64 +467,66 @@ class NodalStress:
             self._add_to_total()
 
     @ti.kernel
-    def _serial_substeps(self, substeps: ti.i32, average: ti.i32) -> Nothing:
+    def _serial_substeps(self, substeps: i32, average: i32) -> Nothing:
+        first_node, end_node = ti.static(self.walls.all_nodes)
+        first_inner, end_inner = ti.static(self.walls.interior_nodes)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             # Read first, so that the address of the fields stays out of the loops: else
             # no vectors.
-            fill = self.fill[0]
-            for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
-                for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
+            particle_volume = self.particle_volume[0]
+            for i in range(first_node, end_node):
+                for j in range(first_node, end_node):
                     self.clear(0, i, j)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.locate(0, p)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.p2g(0, p)
-            for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
-                for j in range(self.walls.edge[0], self.walls.edge[1] + 1):
-                    self.fold(0, i, j, fill)
+            for i in range(first_inner, end_inner):
+                for j in range(first_inner, end_inner):
+                    self.fold(0, i, j, particle_volume)
             for k in range(self.walls.ring_size):
-                self.mirror(self.node, 0, k)
-            for i in range(self.walls.edge[0], self.walls.edge[1] + 1):
-                for j in range(self.walls.edge[0], self.walls.edge[1] + 1):
-                    self.force(0, i, j)
+                self.mirror(self.node_state, 0, k)
+            for i in range(first_inner, end_inner):
+                for j in range(first_inner, end_inner):
+                    self.add_forces(0, i, j)
             for k in range(self.walls.ring_size):
-                self.mirror(self.moved, 0, k)
+                self.mirror(self.next_state, 0, k)
                 self.mirror_gain(0, k)
             if average:
                 for n in range(self.node_count):
                     self.sum_velocity(0, n)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.g2p(0, p)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.update(0, p)
 
     @ti.kernel
     def _parallel_substep(self) -> Nothing:
-        all_nodes = ti.static((self.walls.ghost[0], self.walls.ghost[1] + 1))
-        interior = ti.static((self.walls.edge[0], self.walls.edge[1] + 1))
+        all_nodes = ti.static(self.walls.all_nodes)
+        interior = ti.static(self.walls.interior_nodes)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, all_nodes, all_nodes):
             self.clear(s, i, j)
         ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+        for s, p in ti.ndrange(self.scenarios, self.particles):
             self.locate(s, p)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, interior, interior):
-            self.fold(s, i, j, self.fill[s])
+            self.fold(s, i, j, self.particle_volume[s])
         ti.loop_config(parallelize=self.threads)
         for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
-            self.mirror(self.node, s, k)
+            self.mirror(self.node_state, s, k)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, interior, interior):
-            self.force(s, i, j)
+            self.add_forces(s, i, j)
         ti.loop_config(parallelize=self.threads)
         for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
-            self.mirror(self.moved, s, k)
+            self.mirror(self.next_state, s, k)
             self.mirror_gain(s, k)
         ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+        for s, p in ti.ndrange(self.scenarios, self.particles):
             self.g2p(s, p)
             self.update(s, p)
 
@@ -452,20 +535,20 @@ class NodalStress:
         self._restart_extremes(self.parameters.particles, self.node_count)
 
     @ti.kernel
-    def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
+    def _restart_extremes(self, particles: i32, nodes: i32) -> Nothing:
         # Counts are arguments: with some constants, such as 4,000, LLVM compiles for
         # twenty seconds.
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
-            now = self.carried[s, p]
-            speed_x = ti.abs(now[0])
-            speed_y = ti.abs(now[1])
-            self.extremes[s, p] = ti.Vector([speed_x, speed_y, now[3], -now[3]])
+            state = self.particle_state[s, p]
+            speed = ti.abs(state.xy)
+            jacobian = state[3]
+            self.extremes[s, p] = vec4(speed[0], speed[1], jacobian, -jacobian)
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
-            self.peak[s, n] = 0.0
+            self.peak_speed[s, n] = 0.0
 
     @ti.kernel
     def _add_to_total(self) -> Nothing:
-        for s, n in self.moved:
+        for s, n in self.next_state:
             self.sum_velocity(s, n)

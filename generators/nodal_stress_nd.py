@@ -32,9 +32,11 @@ from typing import Any
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from taichi import f32, i32, i64
+from taichi.math import vec3, vec4
 
 from . import backend
-from .box_tables import LANES, BoxTables
+from .box_tables import LANES, BoxTables, Singles
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import JACOBIAN_BOUND
 from .obstacle import Obstacle, is_inside
@@ -93,8 +95,10 @@ class NodalStressND:
         self.origin = p.origin  # coordinate of node 0 of each axis [cells]
         inset = np.where(p.box.periodic, 0.0, _INSET * dx)
         # smallest and largest coordinate of a particle along each axis
-        self.least = (np.array(p.box.low) + inset).tolist()
-        self.most = (np.array(p.box.high) - inset).tolist()
+        position_min = np.array(p.box.low) + inset
+        position_max = np.array(p.box.high) - inset
+        self.position_min = position_min.tolist()
+        self.position_max = position_max.tolist()
         self.period = p.box.lengths.tolist()
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         speed_reach = _REACH[self.dimension] * self.speed_bound
@@ -103,11 +107,14 @@ class NodalStressND:
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
         self.cell_scale = self.velocity_scale * dx
-        self.pressure = p.dt * p.modulus / (p.density * 2.0 * dx)
-        self.gradient = 4.0 * self.inv_dx
-        self.shift = -p.shift * dx * dx
+        # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
+        divisor = p.density * 2.0 * dx
+        self.pressure_factor = p.dt * p.modulus / divisor
+        self.slope_factor = 4.0 * self.inv_dx  # 4/dx
+        self.shift_factor = -p.shift * dx * dx  # -beta dx^2
         self.shift_bound = 0.1 * dx
         self.image_signs = self.tables.images.sign.tolist()
+        self.image_count = len(self.image_signs)
         self._make_stencils()
         self._declare_fields()
         self._tree = self._place_fields()
@@ -115,169 +122,193 @@ class NodalStressND:
 
     def _make_stencils(self) -> None:
         """List the neighbours of a node, which the kernels unroll."""
-        steps = (-1, 0, 1)
         # the rows of three nodes that a particle touches: steps along all but the last
         # axis
-        self.row_steps = tuple(itertools.product(steps, repeat=self.dimension - 1))
-        # one of each pair of opposite neighbours, with the weight of their difference
-        # in a gradient; nearest first
+        row_axes = self.dimension - 1
+        row_steps = itertools.product((-1, 0, 1), repeat=row_axes)
+        self.row_steps = tuple(row_steps)
+        # one of each pair of opposite neighbours; nearest first
         pairs = []
         for step in itertools.product((1, 0, -1), repeat=self.dimension):
             if step > (0,) * self.dimension:
                 pairs.append(step)
         self.pairs = tuple(sorted(pairs, key=_axis_count))
-        # weight of the pairs that differ along so many axes, less one
-        self.pair_weight = tuple(
-            0.75 ** (self.dimension - 1 - more) * 0.125**more
-            for more in range(self.dimension)
-        )
+        # weight in a gradient of the difference of a pair, by the number of further
+        # axes along which the two differ
+        weights = []
+        for further in range(self.dimension):
+            weights.append(0.75 ** (row_axes - further) * 0.125**further)
+        self.pair_weight = tuple(weights)
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
-        # particle positions [length], and the largest -J since the advance began
-        self.x = ti.Vector.field(LANES, ti.f32)
-        self.carried = ti.Vector.field(LANES, ti.f32)  # v_p, J_p
-        self.at_rest = (0.0, 0.0, 0.0, 1.0)  # of a particle at rest
-        # derivative of the nodal (v, r) at the particles, along each axis
-        self.slopes = [ti.Vector.field(LANES, ti.f32) for _ in range(self.dimension)]
-        # largest abs(v) by component, and J, of each particle since the advance began
-        self.extremes = ti.Vector.field(LANES, ti.f32)
-        # the three weights of a particle along each axis
-        self.weights = [ti.Vector.field(LANES, ti.f32) for _ in range(self.dimension)]
+        axes = range(self.dimension)
+        # of each particle: its position [length], and the largest -J since the
+        # advance began
+        self.x = vec4.field()
+        self.particle_state = vec4.field()  # v_p, J_p
+        self.at_rest = (0.0, 0.0, 0.0, 1.0)  # state of a particle at rest
+        # v and r of the nodes, at the particle
+        self.grid_state = vec4.field()
+        # derivative of the same along each axis
+        self.slopes = [vec4.field() for _ in axes]
+        # dt a and Jbar of the nodes, at the particle
+        self.grid_gain = vec4.field()
+        # largest abs(v) by component, and largest J, since the advance began
+        self.extremes = vec4.field()
+        # the three weights along each axis
+        self.weights = [vec4.field() for _ in axes]
         # offset from the middle node [cells], and the bits of the lowest node's number
-        self.spot = ti.Vector.field(LANES, ti.f32)
-        self.here = ti.Vector.field(LANES, ti.f32)  # nodal v, r at the particles
-        self.push = ti.Vector.field(LANES, ti.f32)  # nodal dt a, Jbar at the particles
+        self.stencil_place = vec4.field()
 
-        self.sums = ti.Vector.field(LANES, ti.i64)  # n v, n J
-        self.rows = ti.Vector.field(LANES, ti.i64)  # n of three nodes in a row
-        self.count = ti.field(ti.i64)  # n
-        self.drag = ti.Vector.field(LANES, ti.f32)  # what moving walls add to n v
-        self.node = ti.Vector.field(LANES, ti.f32)  # v, r
-        self.moved = ti.Vector.field(LANES, ti.f32)  # the same after the forces
-        self.ratio = ti.field(ti.f32)  # Jbar
-        self.gain = ti.Vector.field(LANES, ti.f32)  # dt a, Jbar
+        # of each node: n v, n J
+        self.sums = ti.Vector.field(LANES, i64)
+        self.weight_sum = ti.field(i64)  # n
+        self.drag = vec4.field()  # what moving walls add to n v
+        self.node_state = vec4.field()  # v, r
+        self.node_jacobian = ti.field(f32)  # Jbar
+        self.next_state = vec4.field()  # v, r after the forces
+        self.node_gain = vec4.field()  # dt a, Jbar
         # largest absolute velocity component since the advance began
-        self.peak = ti.field(ti.f32)
-        self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
-        self.fill = ti.field(ti.f32)  # m / (rho dx^d), shape [scenario]
-        # 1 at nodes of the fluid, 0 at those at rest inside an obstacle
-        self.open = ti.field(ti.f32)
-        # centre of the obstacle, and the least distance from it [length]
-        self.obstacle = ti.Vector.field(LANES, ti.f32)
-        self.damping = ti.field(ti.f32)  # dt sigma of the fringe, shape [node]
-        self.stream = ti.Vector.field(LANES, ti.f32)  # U, shape [scenario]
+        self.peak_speed = ti.field(f32)
+        # 1 in the fluid, 0 inside an obstacle
+        self.fluid_mask = ti.field(f32)
+        self.fringe_damping = ti.field(f32)  # dt sigma, equal in all scenarios
+        self.force_layer = ti.field(i32)
+        # n of three nodes in a row
+        self.row_sums = ti.Vector.field(LANES, i64)
 
-        # tables, shape [ghost], [edge], [edge, image], [interior] and [node]
-        self.ghost = ti.field(ti.i32)
-        self.source = ti.field(ti.i32)
-        self.sign = ti.Vector.field(LANES, ti.f32)
-        self.edge = ti.field(ti.i32)
-        self.image = ti.field(ti.i32)
-        self.interior = ti.field(ti.i32)
-        self.layer = ti.field(ti.i32)
+        # of each scenario: nu dt / dx^2 and m / (rho dx^d)
+        self.diffusion_number = ti.field(f32)
+        self.particle_volume = ti.field(f32)
+        # centre of the obstacle, and the least distance from it [length]
+        self.obstacle = vec4.field()
+        self.stream = vec4.field()  # U
+
+        # tables, shape [ghost], [edge], [edge, image] and [interior]
+        self.ghost_node = ti.field(i32)
+        self.ghost_source = ti.field(i32)
+        self.ghost_sign = vec4.field()
+        self.edge_node = ti.field(i32)
+        self.image_ghost = ti.field(i32)
+        self.interior_node = ti.field(i32)
         # what walls and forces do now, shape [scenario, ghost], [scenario, edge,
         # image] and [scenario, layer]
-        self.drive = ti.Vector.field(LANES, ti.f32)  # added to a ghost's v
-        self.image_drag = ti.Vector.field(LANES, ti.f32)  # n v per particle
-        self.force = ti.Vector.field(LANES, ti.f32)  # dt f
+        self.ghost_drive = vec4.field()  # added to a ghost's v
+        self.image_drag = vec4.field()  # n v per particle
+        self.force_gain = vec4.field()  # dt f
 
     def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
         """Give the fields their memory, each an array of its own."""
         particle_fields = (
             self.x,
-            self.carried,
+            self.particle_state,
             *self.slopes,
             self.extremes,
             *self.weights,
-            self.spot,
-            self.here,
-            self.push,
+            self.stencil_place,
+            self.grid_state,
+            self.grid_gain,
         )
         node_fields = (
             self.sums,
-            self.count,
+            self.weight_sum,
             self.drag,
-            self.node,
-            self.moved,
-            self.ratio,
-            self.gain,
-            self.peak,
+            self.node_state,
+            self.next_state,
+            self.node_jacobian,
+            self.node_gain,
+            self.peak_speed,
+        )
+        ghost_fields = (self.ghost_node, self.ghost_source, self.ghost_sign)
+        scenario_fields = (
+            self.diffusion_number,
+            self.particle_volume,
+            self.obstacle,
+            self.stream,
         )
         tables = self.tables
-        particle_shape = (self.scenarios, self.particles)
-        node_shape = (self.scenarios, tables.node_count)
-        # Two more: a node counts the rows of the two nodes before it as well.
-        row_shape = (self.scenarios, tables.node_count + 2)
-        ghost_shape = tables.ghosts.node.shape
+        scenarios = self.scenarios
+        node_count = tables.node_count
+        ghost_count = len(tables.ghosts.node)
+        edge_count = len(tables.images.node)
         image_shape = tables.images.ghost.shape
         layer_count = max(1, self.parameters.force_layers)
-        obstacle_shape = node_shape if self.has_obstacle else (1, 1)
-        fringe_shape = (tables.node_count,) if self.has_fringe else (1,)
+        mask_shape = (1, 1)
+        if self.has_obstacle:
+            mask_shape = (scenarios, node_count)
+        fringe_count = 1
+        if self.has_fringe:
+            fringe_count = node_count
         return backend.place(
-            *((particle_shape, [field]) for field in particle_fields),
-            *((node_shape, [field]) for field in node_fields),
-            (row_shape, [self.rows]),
-            *((ghost_shape, [field]) for field in (self.ghost, self.source, self.sign)),
-            (tables.images.node.shape, [self.edge]),
-            (image_shape, [self.image]),
-            (tables.interior.shape, [self.interior]),
-            ((tables.node_count,), [self.layer]),
-            ((self.scenarios, *ghost_shape), [self.drive]),
-            ((self.scenarios, *image_shape), [self.image_drag]),
-            ((self.scenarios, layer_count), [self.force]),
-            ((self.scenarios,), [self.spread, self.fill]),
-            (obstacle_shape, [self.open]),
-            ((self.scenarios,), [self.obstacle, self.stream]),
-            (fringe_shape, [self.damping]),
+            ((scenarios, self.particles), particle_fields),
+            ((scenarios, node_count), node_fields),
+            # Two more: a node counts the rows of the two nodes before it as well.
+            ((scenarios, node_count + 2), [self.row_sums]),
+            ((ghost_count,), ghost_fields),
+            ((edge_count,), [self.edge_node]),
+            (image_shape, [self.image_ghost]),
+            (tables.interior.shape, [self.interior_node]),
+            ((node_count,), [self.force_layer]),
+            ((scenarios, ghost_count), [self.ghost_drive]),
+            ((scenarios, *image_shape), [self.image_drag]),
+            ((scenarios, layer_count), [self.force_gain]),
+            ((scenarios,), scenario_fields),
+            (mask_shape, [self.fluid_mask]),
+            ((fringe_count,), [self.fringe_damping]),
         )
 
     def _fill_tables(self) -> None:
         tables = self.tables
-        self.ghost.from_numpy(tables.ghosts.node)
-        self.source.from_numpy(tables.ghosts.source)
-        self.sign.from_numpy(tables.ghosts.sign)
-        self.edge.from_numpy(tables.images.node)
-        self.image.from_numpy(tables.images.ghost)
-        self.interior.from_numpy(tables.interior)
+        self.ghost_node.from_numpy(tables.ghosts.node)
+        self.ghost_source.from_numpy(tables.ghosts.source)
+        self.ghost_sign.from_numpy(tables.ghosts.sign)
+        self.edge_node.from_numpy(tables.images.node)
+        self.image_ghost.from_numpy(tables.images.ghost)
+        self.interior_node.from_numpy(tables.interior)
         # the layer of each node along y; ghosts belong to the nearest one
-        row = np.clip(tables.index[:, 1] - 1, 0, self.cells[1] - 1)
-        layer = row * max(1, self.parameters.force_layers) // self.cells[1]
-        self.layer.from_numpy(layer.astype(np.int32))
+        row_count = self.cells[1]
+        layer_count = max(1, self.parameters.force_layers)
+        row = tables.index[:, 1] - 1
+        row = np.clip(row, 0, row_count - 1)
+        layer = row * layer_count // row_count
+        self.force_layer.from_numpy(layer.astype(np.int32))
         if self.has_fringe:
-            rates = self.parameters.fringe_rates(self._node_places()[:, 0])
-            self.damping.from_numpy((self.dt * rates).astype(np.float32))
+            places = self._node_places()
+            rates = self.parameters.fringe_rates(places[:, 0])
+            damping = self.dt * rates
+            self.fringe_damping.from_numpy(damping.astype(np.float32))
 
     def _node_places(self) -> NDArray[np.float64]:
         """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
-        place = (self.tables.index + np.array(self.origin)) / self.inv_dx
-        return np.asarray(place)
+        cells = self.tables.index + np.array(self.origin)
+        return np.asarray(cells / self.inv_dx)
 
-    def move_walls(self, velocity: NDArray[np.float32]) -> None:
+    def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
-        self.drive.from_numpy(self.tables.ghost_drive(velocity))
+        self.ghost_drive.from_numpy(self.tables.ghost_drive(velocity))
         self.image_drag.from_numpy(self.tables.image_drag(velocity))
 
-    def apply_force(self, acceleration: NDArray[np.float32]) -> None:
+    def apply_force(self, acceleration: Singles) -> None:
         """Let a force act [length/s^2], shape [scenario, layer, axis]."""
         scenarios, layers, dimension = acceleration.shape
         gain = np.zeros((scenarios, layers, LANES), np.float32)
         gain[..., :dimension] = np.float32(self.dt) * acceleration
-        self.force.from_numpy(gain)
+        self.force_gain.from_numpy(gain)
 
     def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the nodes that each scenario's obstacle holds at rest."""
-        place = self._node_places()
-        is_open = np.empty((self.scenarios, len(place)), np.float32)
-        values = np.zeros((self.scenarios, LANES), np.float32)
-        for index, obstacle in enumerate(obstacles):
-            is_open[index] = ~is_inside(place, obstacle.centre, obstacle.radius)
-            values[index, : self.dimension] = obstacle.centre
-            values[index, 3] = obstacle.radius + _INSET / self.inv_dx
-        self.open.from_numpy(is_open)
-        self.obstacle.from_numpy(values)
+        places = self._node_places()
+        mask = np.empty((self.scenarios, len(places)), np.float32)
+        discs = np.zeros((self.scenarios, LANES), np.float32)
+        for s, obstacle in enumerate(obstacles):
+            mask[s] = ~is_inside(places, obstacle.centre, obstacle.radius)
+            discs[s, : self.dimension] = obstacle.centre
+            discs[s, 3] = obstacle.radius + _INSET / self.inv_dx
+        self.fluid_mask.from_numpy(mask)
+        self.obstacle.from_numpy(discs)
 
-    def set_stream(self, velocity: NDArray[np.float32]) -> None:
+    def set_stream(self, velocity: Singles) -> None:
         """Let the fringe draw to a velocity [length/s], shape [scenario, axis]."""
         stream = np.zeros((self.scenarios, LANES), np.float32)
         stream[:, : self.dimension] = velocity
@@ -290,213 +321,260 @@ class NodalStressND:
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
-    def clear(self, s: ti.i32, n: ti.i32) -> None:
+    def clear(self, s: i32, n: i32) -> None:
         """Set a node's sums to zero."""
-        zero = ti.Vector([0, 0, 0, 0], ti.i64)
+        zero = ti.Vector.zero(i64, LANES)
         self.sums[s, n] = zero
-        self.rows[s, n + 2] = zero
+        self.row_sums[s, n + 2] = zero
 
     @ti.func
-    def locate(self, s: ti.i32, p: ti.i32) -> None:
+    def locate(self, s: i32, p: i32) -> None:
         """Keep for P2G and G2P which nodes a particle touches, and the weights."""
+        x = self.x[s, p]
         number = 0
-        offset = ti.Vector([0.0, 0.0, 0.0])
+        offset = vec3(0.0)
         for axis in ti.static(range(self.dimension)):
-            scaled = self.x[s, p][axis] * self.inv_dx - ti.static(self.origin[axis])
-            # A periodic coordinate may round up to the end of its last cell.
+            origin = ti.static(self.origin[axis])
+            stride = ti.static(self.tables.stride[axis])
             last = ti.static(self.cells[axis] - 1)
-            lowest = ti.min(ti.cast(scaled - 0.5, ti.i32), last)
-            f = scaled - ti.cast(lowest, ti.f32)
+            scaled = x[axis] * self.inv_dx - origin
+            lowest = ti.cast(scaled - 0.5, i32)
+            # A periodic coordinate may round up to the end of its last cell.
+            lowest = ti.min(lowest, last)
+            f = scaled - ti.cast(lowest, f32)
             low, mid, high = spline_weights(f)
-            self.weights[axis][s, p] = ti.Vector([low, mid, high, 0.0])
+            weights = vec4(low, mid, high, 0.0)
+            self.weights[axis][s, p] = weights
             offset[axis] = f - 1.0
-            number += lowest * ti.static(self.tables.stride[axis])
-        bits = ti.bit_cast(number, ti.f32)
-        self.spot[s, p] = ti.Vector([offset[0], offset[1], offset[2], bits])
+            number += lowest * stride
+        number_bits = ti.bit_cast(number, f32)
+        place = vec4(offset[0], offset[1], offset[2], number_bits)
+        self.stencil_place[s, p] = place
 
     @ti.func
-    def load_along(self, fields: Template, s: ti.i32, p: ti.i32) -> Value:
+    def lowest_node(self, place: vec4) -> i32:
+        """Return the number of the lowest node of a particle's stencil."""
+        return node_number(place[3], self.tables.node_count)
+
+    @ti.func
+    def load_along(self, fields: Template, s: i32, p: i32) -> Value:
         """Return a particle's vectors in three fields: one field for each of x, y, z.
 
         In two dimensions the third is zero. Callers load before they write anything:
         LLVM cannot know that the fields do not overlap, and would read again after each
         write.
         """
-        third = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        first = fields[0][s, p]
+        second = fields[1][s, p]
+        third = vec4(0.0)
         if ti.static(self.dimension == 3):
             third = fields[2][s, p]
-        return fields[0][s, p], fields[1][s, p], third
+        return first, second, third
 
     @ti.func
-    def row_shares(
-        self,
-        weight_x: ti.math.vec4,
-        weight_y: ti.math.vec4,
-        weight_z: ti.math.vec4,
-        step: Template,
+    def row_weights(
+        self, weight_x: vec4, weight_y: vec4, weight_z: vec4, step: Template
     ) -> Value:
         """Return the weights of the three nodes of a row, and a zero."""
-        shares = weight_x[step[0] + 1] * weight_y
+        across = weight_x[step[0] + 1]
+        weights = across * weight_y
         if ti.static(self.dimension == 3):
-            shares = (weight_x[step[0] + 1] * weight_y[step[1] + 1]) * weight_z
-        return shares
+            across = across * weight_y[step[1] + 1]
+            weights = across * weight_z
+        return weights
 
     @ti.func
-    def row_start(self, lowest: ti.i32, step: Template) -> ti.i32:
+    def row_start(self, lowest: i32, step: Template) -> i32:
         """Return the number of the first node of a row."""
         number = lowest
         for axis in ti.static(range(self.dimension - 1)):
-            number += ti.static((step[axis] + 1) * self.tables.stride[axis])
+            stride = ti.static(self.tables.stride[axis])
+            number += ti.static((step[axis] + 1) * stride)
         return number
 
     @ti.func
-    def p2g(self, s: ti.i32, p: ti.i32) -> None:
+    def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        spot = self.spot[s, p]
-        lowest = node_number(spot[3], self.tables.node_count)
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         slope_x, slope_y, slope_z = self.load_along(self.slopes, s, p)
         # Weights carry the scale of n and J, so that v lacks the rest of its own. All
         # are powers of two, which round nothing.
         weight_x = self.count_scale * weight_x
         rest = ti.static(self.velocity_scale / self.count_scale)
-        scale = ti.Vector([rest, rest, rest, 1.0])
+        scale = vec4(rest, rest, rest, 1.0)
         # J has no slope; a product with 0 is one, as nodes, and so slopes, are finite.
         cell = ti.static(self.cell_scale / self.count_scale)
-        only_v = ti.Vector([cell, cell, cell, 0.0])
-        c_x = only_v * slope_x
-        c_y = only_v * slope_y
-        c_z = only_v * slope_z
-        middle = scale * self.carried[s, p] - spot[0] * c_x - spot[1] * c_y
+        slope_scale = vec4(cell, cell, cell, 0.0)
+        step_x = slope_scale * slope_x
+        step_y = slope_scale * slope_y
+        step_z = slope_scale * slope_z
+        at_particle = scale * self.particle_state[s, p]
+        at_middle = at_particle - place[0] * step_x - place[1] * step_y
         if ti.static(self.dimension == 3):
-            middle = middle - spot[2] * c_z
+            at_middle = at_middle - place[2] * step_z
         for step in ti.static(self.row_steps):
-            shares = self.row_shares(weight_x, weight_y, weight_z, step)
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
-            value = stepped(middle, c_x, step[0])
-            along = c_y
+            at_row = stepped(at_middle, step_x, step[0])
+            row_step = step_y
             if ti.static(self.dimension == 3):
-                value = stepped(value, c_y, step[1])
-                along = c_z
+                at_row = stepped(at_row, step_y, step[1])
+                row_step = step_z
             for k in ti.static(range(3)):
-                share = shares[k] * stepped(value, along, k - 1)
-                add_shifted(self.sums, ti.Vector([s, start + k]), share, self.atomic)
-            # The fourth share is 0, so that the fourth sum counts shifts.
-            add_shifted(self.rows, ti.Vector([s, start + 2]), shares, self.atomic)
+                at_node = stepped(at_row, row_step, k - 1)
+                share = weights[k] * at_node
+                add_shifted(self.sums, s, start + k, share, self.atomic)
+            # The fourth weight is 0, so that the fourth sum counts shifts.
+            add_shifted(self.row_sums, s, start + 2, weights, self.atomic)
 
     @ti.func
-    def settle(self, s: ti.i32, n: ti.i32) -> None:
+    def settle(self, s: i32, n: i32) -> None:
         """Take the shifts off a node's sums, and add up its n from three rows."""
-        count, shifts = row_count(self.rows, s, n)
+        weight_sum, shifts = row_count(self.row_sums, s, n)
         self.sums[s, n] = self.sums[s, n] - shifts
-        self.count[s, n] = count
+        self.weight_sum[s, n] = weight_sum
 
     @ti.func
     def image_sign(self, k: Template) -> Value:
         """Return the signs with which the k-th image of a node counts for (v, J)."""
         signs = ti.static(self.image_signs[k])
-        return ti.Vector([signs[0], signs[1], signs[2], signs[3]], ti.i64)
+        return ti.Vector(signs, i64)
 
     @ti.func
-    def add_images(self, s: ti.i32, e: ti.i32) -> None:
+    def add_images(self, s: i32, e: i32) -> None:
         """Add to a node beside ghosts what its images received, and the walls' drag."""
-        n = self.edge[e]
+        n = self.edge_node[e]
         total = self.sums[s, n]
-        count = self.count[s, n]
-        drag = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        for k in ti.static(range(self.tables.images.ghost.shape[1])):
-            ghost = self.image[e, k]
+        weight_sum = self.weight_sum[s, n]
+        drag = vec4(0.0)
+        for k in ti.static(range(self.image_count)):
+            ghost = self.image_ghost[e, k]
             if ghost >= 0:
+                ghost_weight = self.weight_sum[s, ghost]
                 total += self.image_sign(k) * self.sums[s, ghost]
-                count += self.count[s, ghost]
+                weight_sum += ghost_weight
                 if ti.static(self.has_walls):
-                    ghost_count = from_fixed(self.count[s, ghost], self.count_unit)
-                    drag += self.image_drag[s, e, k] * ghost_count
+                    count = from_fixed(ghost_weight, self.count_unit)
+                    drag += self.image_drag[s, e, k] * count
         self.sums[s, n] = total
-        self.count[s, n] = count
+        self.weight_sum[s, n] = weight_sum
         self.drag[s, n] = drag
 
     @ti.func
-    def fold(self, s: ti.i32, n: ti.i32, fill: ti.f32) -> None:
+    def fold(self, s: i32, n: i32, particle_volume: f32) -> None:
         """Turn the sums of an interior node into v, r and Jbar."""
-        state = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        ratio = 1.0
-        if self.count[s, n] > 0:
+        state = vec4(0.0)
+        jacobian = 1.0
+        weight_sum = self.weight_sum[s, n]
+        if weight_sum > 0:
             total = self.sums[s, n]
-            count = from_fixed(self.count[s, n], self.count_unit)
-            momentum = from_fixed(total, self.velocity_unit) + self.drag[s, n]
-            v = momentum / count
-            ratio = from_fixed(total[3], self.count_unit) / count
-            state = ti.Vector([v[0], v[1], v[2], count * fill])
-        self.node[s, n] = state
-        self.ratio[s, n] = ratio
+            count = from_fixed(weight_sum, self.count_unit)
+            received = from_fixed(total, self.velocity_unit)
+            momentum = received + self.drag[s, n]
+            state = momentum / count
+            state[3] = count * particle_volume
+            jacobian = from_fixed(total[3], self.count_unit) / count
+        self.node_state[s, n] = state
+        self.node_jacobian[s, n] = jacobian
 
     @ti.func
-    def mirror(self, s: ti.i32, g: ti.i32) -> None:
+    def mirror(self, s: i32, g: i32) -> None:
         """Fill a ghost node before the forces."""
-        n = self.ghost[g]
-        source = self.source[g]
-        self.node[s, n] = self.sign[g] * self.node[s, source] + self.drive[s, g]
-        self.ratio[s, n] = self.ratio[s, source]
+        n = self.ghost_node[g]
+        source = self.ghost_source[g]
+        image = self.ghost_sign[g] * self.node_state[s, source]
+        self.node_state[s, n] = image + self.ghost_drive[s, g]
+        self.node_jacobian[s, n] = self.node_jacobian[s, source]
 
     @ti.func
-    def mirror_moved(self, s: ti.i32, g: ti.i32) -> None:
+    def mirror_forces(self, s: i32, g: i32) -> None:
         """Fill a ghost node after the forces; walls at rest mirror dt a."""
-        n = self.ghost[g]
-        source = self.source[g]
-        self.moved[s, n] = self.sign[g] * self.moved[s, source] + self.drive[s, g]
-        self.gain[s, n] = self.sign[g] * self.gain[s, source]
+        n = self.ghost_node[g]
+        source = self.ghost_source[g]
+        sign = self.ghost_sign[g]
+        image = sign * self.next_state[s, source]
+        self.next_state[s, n] = image + self.ghost_drive[s, g]
+        self.node_gain[s, n] = sign * self.node_gain[s, source]
 
     @ti.func
-    def neighbour(self, n: ti.i32, step: Template, side: Template) -> ti.i32:
+    def neighbour(self, n: i32, step: Template, side: Template) -> i32:
         """Return the number of a node's neighbour, or of the opposite one."""
         number = n
         for axis in ti.static(range(self.dimension)):
-            number += ti.static(side * step[axis] * self.tables.stride[axis])
+            stride = ti.static(self.tables.stride[axis])
+            number += ti.static(side * step[axis] * stride)
         return number
 
     @ti.func
-    def add_forces(self, s: ti.i32, n: ti.i32) -> None:
-        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v + dt f."""
-        here = self.node[s, n]
-        zero = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        # differences of Jbar, by the number of axes along which the pairs differ
-        rises = ti.Matrix([[0.0] * 3] * 3)
-        around = zero
+    def pressure_gradient(self, s: i32, n: i32) -> vec4:
+        """Return 2 dx grad Jbar, weighted 1/8, 3/4, 1/8 along every other axis."""
+        # differences of Jbar, by the number of further axes along which pairs differ
+        rises = ti.Matrix.zero(f32, 3, 3)
         for step in ti.static(self.pairs):
             ahead = self.neighbour(n, step, 1)
             behind = self.neighbour(n, step, -1)
-            rise = self.ratio[s, ahead] - self.ratio[s, behind]
-            more = ti.static(_axis_count(step) - 1)
+            jacobian_ahead = self.node_jacobian[s, ahead]
+            jacobian_behind = self.node_jacobian[s, behind]
+            rise = jacobian_ahead - jacobian_behind
+            further = ti.static(_axis_count(step) - 1)
             for axis in ti.static(range(self.dimension)):
-                rises[more, axis] = stepped(rises[more, axis], rise, step[axis])
-            if ti.static(more == 0):
-                around = around + (self.node[s, ahead] + self.node[s, behind])
-        gradient = zero
+                sum_before = rises[further, axis]
+                rises[further, axis] = stepped(sum_before, rise, step[axis])
+        gradient = vec4(0.0)
         for axis in ti.static(range(self.dimension)):
             slope = ti.static(self.pair_weight[0]) * rises[0, axis]
-            for more in ti.static(range(1, self.dimension)):
-                slope = slope + ti.static(self.pair_weight[more]) * rises[more, axis]
+            for further in ti.static(range(1, self.dimension)):
+                weight = ti.static(self.pair_weight[further])
+                slope = slope + weight * rises[further, axis]
             gradient[axis] = slope
-        laplacian = around - ti.static(2.0 * self.dimension) * here
-        gain = self.pressure * gradient + self.spread[s] * laplacian
-        if ti.static(self.parameters.force_layers > 0):
-            gain = gain + self.force[s, self.layer[n]]
-        if ti.static(self.has_fringe):
-            gain = gain + self.damping[n] * (self.stream[s] - here)
-        v = here + gain
-        if ti.static(self.has_obstacle):
-            gain = self.open[s, n] * gain
-            v = self.open[s, n] * v
-        self.gain[s, n] = ti.Vector([gain[0], gain[1], gain[2], self.ratio[s, n]])
-        self.moved[s, n] = ti.Vector([v[0], v[1], v[2], here[3]])
-        peak = self.peak[s, n]
-        for axis in ti.static(range(self.dimension)):
-            peak = largest(ti.abs(v[axis]), peak)
-        self.peak[s, n] = peak
+        return gradient
 
     @ti.func
-    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+    def laplacian(self, s: i32, n: i32) -> vec4:
+        """Return dx^2 times the Laplacian of (v, r), by the nearest neighbours."""
+        neighbours = vec4(0.0)
+        for step in ti.static(self.pairs[: self.dimension]):
+            ahead = self.neighbour(n, step, 1)
+            behind = self.neighbour(n, step, -1)
+            state_ahead = self.node_state[s, ahead]
+            state_behind = self.node_state[s, behind]
+            neighbours = neighbours + (state_ahead + state_behind)
+        neighbour_count = ti.static(2.0 * self.dimension)
+        return neighbours - neighbour_count * self.node_state[s, n]
+
+    @ti.func
+    def add_forces(self, s: i32, n: i32) -> None:
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v + dt f."""
+        state = self.node_state[s, n]
+        gradient = self.pressure_gradient(s, n)
+        laplacian = self.laplacian(s, n)
+        diffusion = self.diffusion_number[s]
+        gain = self.pressure_factor * gradient + diffusion * laplacian
+        if ti.static(self.parameters.force_layers > 0):
+            layer = self.force_layer[n]
+            gain = gain + self.force_gain[s, layer]
+        if ti.static(self.has_fringe):
+            lag = self.stream[s] - state
+            gain = gain + self.fringe_damping[n] * lag
+        v = state + gain
+        if ti.static(self.has_obstacle):
+            mask = self.fluid_mask[s, n]
+            gain = mask * gain
+            v = mask * v
+        peak = self.peak_speed[s, n]
+        for axis in ti.static(range(self.dimension)):
+            peak = largest(ti.abs(v[axis]), peak)
+        self.peak_speed[s, n] = peak
+        # The fourth lanes hold Jbar and r.
+        gain[3] = self.node_jacobian[s, n]
+        v[3] = state[3]
+        self.node_gain[s, n] = gain
+        self.next_state[s, n] = v
+
+    @ti.func
+    def g2p(self, s: i32, p: i32) -> None:
         """Interpolate (v, r), its slopes, dt a and Jbar."""
         if ti.static(self.dimension == 2):
             self.g2p_flat(s, p)
@@ -504,158 +582,168 @@ class NodalStressND:
             self.g2p_solid(s, p)
 
     @ti.func
-    def g2p_flat(self, s: ti.i32, p: ti.i32) -> None:
+    def g2p_flat(self, s: i32, p: i32) -> None:
         """Interpolate in two dimensions, node by node as :mod:`.nodal_stress` does."""
-        spot = self.spot[s, p]
-        lowest = node_number(spot[3], self.tables.node_count)
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
-        here = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        push = here
-        slope_x = here
-        slope_y = here
+        state = vec4(0.0)
+        gain = vec4(0.0)
+        slope_x = vec4(0.0)
+        slope_y = vec4(0.0)
         for step in ti.static(self.row_steps):
-            shares = self.row_shares(weight_x, weight_y, weight_z, step)
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
             for k in ti.static(range(3)):
-                share = shares[k] * self.moved[s, start + k]
-                push += shares[k] * self.gain[s, start + k]
-                here += share
+                node = start + k
+                share = weights[k] * self.next_state[s, node]
+                gain += weights[k] * self.node_gain[s, node]
+                state += share
                 slope_x = stepped(slope_x, share, step[0])
                 slope_y = stepped(slope_y, share, k - 1)
-        self.here[s, p] = here
-        self.push[s, p] = push
-        self.slopes[0][s, p] = self.gradient * (slope_x - spot[0] * here)
-        self.slopes[1][s, p] = self.gradient * (slope_y - spot[1] * here)
+        self.grid_state[s, p] = state
+        self.grid_gain[s, p] = gain
+        slope_x = slope_x - place[0] * state
+        slope_y = slope_y - place[1] * state
+        self.slopes[0][s, p] = self.slope_factor * slope_x
+        self.slopes[1][s, p] = self.slope_factor * slope_y
 
     @ti.func
-    def g2p_solid(self, s: ti.i32, p: ti.i32) -> None:
-        """Interpolate velocity, its gain and its gradient to a particle in three
-        dimensions.
-
-        Nodes are summed row by row along z, which takes fewer sums. ``spot`` holds the
-        particle's place among the 27 nodes, and the number of the lowest one.
+    def g2p_solid(self, s: i32, p: i32) -> None:
+        """Interpolate in three dimensions, row by row along z, which takes fewer
+        sums.
         """
-        spot = self.spot[s, p]
-        lowest = node_number(spot[3], self.tables.node_count)
+        place = self.stencil_place[s, p]
+        lowest = self.lowest_node(place)
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
-        here = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        push = here
-        slope_x = here
-        slope_y = here
-        slope_z = here
+        state = vec4(0.0)
+        gain = vec4(0.0)
+        slope_x = vec4(0.0)
+        slope_y = vec4(0.0)
+        slope_z = vec4(0.0)
         for step in ti.static(self.row_steps):
-            shares = self.row_shares(weight_x, weight_y, weight_z, step)
+            weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
-            low = shares[0] * self.moved[s, start]
-            mid = shares[1] * self.moved[s, start + 1]
-            high = shares[2] * self.moved[s, start + 2]
-            row = low + mid + high
-            row_push = shares[0] * self.gain[s, start]
-            row_push = row_push + shares[1] * self.gain[s, start + 1]
-            row_push = row_push + shares[2] * self.gain[s, start + 2]
-            here += row
-            push += row_push
-            slope_x = stepped(slope_x, row, step[0])
-            slope_y = stepped(slope_y, row, step[1])
+            low = weights[0] * self.next_state[s, start]
+            mid = weights[1] * self.next_state[s, start + 1]
+            high = weights[2] * self.next_state[s, start + 2]
+            row_state = low + mid + high
+            low_gain = weights[0] * self.node_gain[s, start]
+            mid_gain = weights[1] * self.node_gain[s, start + 1]
+            high_gain = weights[2] * self.node_gain[s, start + 2]
+            row_gain = low_gain + mid_gain + high_gain
+            state += row_state
+            gain += row_gain
+            slope_x = stepped(slope_x, row_state, step[0])
+            slope_y = stepped(slope_y, row_state, step[1])
             slope_z += high - low
-        self.here[s, p] = here
-        self.push[s, p] = push
-        self.slopes[0][s, p] = self.gradient * (slope_x - spot[0] * here)
-        self.slopes[1][s, p] = self.gradient * (slope_y - spot[1] * here)
-        self.slopes[2][s, p] = self.gradient * (slope_z - spot[2] * here)
+        self.grid_state[s, p] = state
+        self.grid_gain[s, p] = gain
+        slope_x = slope_x - place[0] * state
+        slope_y = slope_y - place[1] * state
+        self.slopes[0][s, p] = self.slope_factor * slope_x
+        self.slopes[1][s, p] = self.slope_factor * slope_y
+        slope_z = slope_z - place[2] * state
+        self.slopes[2][s, p] = self.slope_factor * slope_z
 
     @ti.func
-    def update(self, s: ti.i32, p: ti.i32) -> None:
+    def update(self, s: i32, p: i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
-        here = self.here[s, p]
-        push = self.push[s, p]
-        carried = self.carried[s, p]
-        volume = 1.0 / largest(here[3], 0.5)
-        v = ti.Vector([carried[0], carried[1], carried[2]])
-        grid_v = ti.Vector([here[0], here[1], here[2]])
-        v = v + ti.Vector([push[0], push[1], push[2]])
-        v = v + self.parameters.velocity_relaxation * (grid_v - v)
+        grid_state = self.grid_state[s, p]
+        grid_velocity = grid_state.xyz
+        grid_gain = self.grid_gain[s, p]
+        grid_jacobian = grid_gain[3]
+        volume = 1.0 / largest(grid_state[3], 0.5)
+        old_state = self.particle_state[s, p]
+        v = old_state.xyz + grid_gain.xyz
+        v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
 
-        shift = ti.Vector([0.0, 0.0, 0.0])
-        carry = ti.Vector([0.0, 0.0, 0.0])
+        shift = vec3(0.0)
+        shift_change = vec3(0.0)  # of the velocity, along the shift
         divergence = 0.0
         for axis in ti.static(range(self.dimension)):
             slope = self.slopes[axis][s, p]
-            away = self.shift * volume * slope[3]
-            shift[axis] = bounded(away, -self.shift_bound, self.shift_bound)
-            along = shift[axis] * ti.Vector([slope[0], slope[1], slope[2]])
+            wanted = self.shift_factor * volume * slope[3]
+            shift[axis] = bounded(wanted, -self.shift_bound, self.shift_bound)
+            axis_change = shift[axis] * slope.xyz
             if ti.static(axis == 0):
-                carry = along
+                shift_change = axis_change
                 divergence = slope[0]
             else:
-                carry = carry + along
+                shift_change = shift_change + axis_change
                 divergence = divergence + slope[axis]
-        v = v + carry
+        v = v + shift_change
 
-        place = ti.Vector([0.0, 0.0, 0.0])
+        old_x = self.x[s, p]
+        inside = vec3(0.0)
         for axis in ti.static(range(self.dimension)):
-            target = self.x[s, p][axis] + (self.dt * grid_v[axis] + shift[axis])
-            place[axis] = self.kept_inside(target, axis)
-        x = place
+            step = self.dt * grid_velocity[axis] + shift[axis]
+            inside[axis] = self.kept_inside(old_x[axis] + step, axis)
+        x = inside
         if ti.static(self.has_obstacle):
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
-            x = self.kept_outside(s, place)
-        jacobian = carried[3]
+            x = self.kept_outside(s, inside)
+
+        jacobian = old_state[3]
         jacobian = (
             jacobian
             + self.dt * divergence * jacobian
-            + self.parameters.jacobian_relaxation * (push[3] - jacobian)
-            + self.parameters.density_coupling * (volume - push[3])
+            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
+            + self.parameters.density_coupling * (volume - grid_jacobian)
         )
-        self.carried[s, p] = ti.Vector([v[0], v[1], v[2], jacobian])
-        reached = ti.Vector([ti.abs(v[0]), ti.abs(v[1]), ti.abs(v[2]), jacobian])
-        self.extremes[s, p] = largest(reached, self.extremes[s, p])
-        lowest = largest(-jacobian, self.x[s, p][3])
-        self.x[s, p] = ti.Vector([x[0], x[1], x[2], lowest])
+        self.particle_state[s, p] = vec4(v[0], v[1], v[2], jacobian)
+        speed = ti.abs(v)
+        reached = vec4(speed[0], speed[1], speed[2], jacobian)
+        extremes = self.extremes[s, p]
+        self.extremes[s, p] = largest(reached, extremes)
+        minus_jacobian = largest(-jacobian, old_x[3])
+        self.x[s, p] = vec4(x[0], x[1], x[2], minus_jacobian)
 
     @ti.func
-    def hold(self, s: ti.i32, p: ti.i32) -> None:
+    def hold(self, s: i32, p: i32) -> None:
         """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
-        here = self.here[s, p]
-        push = self.push[s, p]
-        volume = 1.0 / largest(here[3], 0.5)
+        density = self.grid_state[s, p][3]
+        volume = 1.0 / largest(density, 0.5)
+        grid_jacobian = self.grid_gain[s, p][3]
         for axis in ti.static(range(self.dimension)):
-            self.slopes[axis][s, p] = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        jacobian = self.carried[s, p][3]
+            self.slopes[axis][s, p] = vec4(0.0)
+        jacobian = self.particle_state[s, p][3]
         jacobian = (
             jacobian
-            + self.parameters.jacobian_relaxation * (push[3] - jacobian)
-            + self.parameters.density_coupling * (volume - push[3])
+            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
+            + self.parameters.density_coupling * (volume - grid_jacobian)
         )
-        self.carried[s, p] = ti.Vector([0.0, 0.0, 0.0, jacobian])
+        self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
 
     @ti.func
-    def kept_outside(self, s: ti.i32, target: ti.math.vec3) -> Value:
+    def kept_outside(self, s: i32, target: vec3) -> Value:
         """Return a place, or the nearest on the obstacle's surface if inside."""
         obstacle = self.obstacle[s]
-        way = target - ti.Vector([obstacle[0], obstacle[1], obstacle[2]])
+        radius = obstacle[3]
+        way = target - obstacle.xyz
         square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
         # A place at the very centre has no nearest one; it stays.
-        is_inside = (square < obstacle[3] * obstacle[3]) and (square > 0.0)
-        stretch = obstacle[3] / ti.sqrt(ti.select(is_inside, square, 1.0))
-        moved = target + (stretch - 1.0) * way
-        return ti.select(is_inside, moved, target)
+        is_inside = (square < radius * radius) and (square > 0.0)
+        safe_square = ti.select(is_inside, square, 1.0)
+        stretch = radius / ti.sqrt(safe_square)
+        on_surface = target + (stretch - 1.0) * way
+        return ti.select(is_inside, on_surface, target)
 
     @ti.func
-    def kept_inside(self, target: ti.f32, axis: Template) -> ti.f32:
+    def kept_inside(self, target: f32, axis: Template) -> f32:
         """Return a coordinate between the walls, or wrapped into [low, high)."""
-        least = ti.static(self.least[axis])
-        most = ti.static(self.most[axis])
-        result = target
+        low = ti.static(self.position_min[axis])
+        high = ti.static(self.position_max[axis])
+        x = target
         if ti.static(self.periodic[axis]):
             period = ti.static(self.period[axis])
-            result = ti.select(result >= most, result - period, result)
-            result = ti.select(result < least, result + period, result)
+            x = ti.select(x >= high, x - period, x)
+            x = ti.select(x < low, x + period, x)
             # The sum may round up to the end of the period; NaN becomes its start.
-            result = ti.select(result < most, result, least)
+            x = ti.select(x < high, x, low)
         else:
-            result = bounded(result, least, most)
-        return result
+            x = bounded(x, low, high)
+        return x
 
     # The drivers: the same phases in the same order.
 
@@ -687,19 +775,19 @@ class NodalStressND:
     @ti.kernel
     def _serial_substeps(
         self,
-        substeps: ti.i32,
-        particles: ti.i32,
-        fluid: ti.i32,
-        nodes: ti.i32,
-        interior: ti.i32,
-        edges: ti.i32,
-        ghosts: ti.i32,
+        substeps: i32,
+        particles: i32,
+        fluid: i32,
+        nodes: i32,
+        interior: i32,
+        edges: i32,
+        ghosts: i32,
     ) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             # Read before the loops: with the address of the fields inside them LLVM
             # would not vectorise.
-            fill = self.fill[0]
+            particle_volume = self.particle_volume[0]
             for n in range(nodes):
                 self.clear(0, n)
             for p in range(particles):
@@ -711,13 +799,13 @@ class NodalStressND:
             for e in range(edges):
                 self.add_images(0, e)
             for i in range(interior):
-                self.fold(0, self.interior[i], fill)
+                self.fold(0, self.interior_node[i], particle_volume)
             for g in range(ghosts):
                 self.mirror(0, g)
             for i in range(interior):
-                self.add_forces(0, self.interior[i])
+                self.add_forces(0, self.interior_node[i])
             for g in range(ghosts):
-                self.mirror_moved(0, g)
+                self.mirror_forces(0, g)
             for p in range(particles):
                 self.g2p(0, p)
             for p in range(fluid):
@@ -729,12 +817,12 @@ class NodalStressND:
     @ti.kernel
     def _parallel_substep(
         self,
-        particles: ti.i32,
-        fluid: ti.i32,
-        nodes: ti.i32,
-        interior: ti.i32,
-        edges: ti.i32,
-        ghosts: ti.i32,
+        particles: i32,
+        fluid: i32,
+        nodes: i32,
+        interior: i32,
+        edges: i32,
+        ghosts: i32,
     ) -> Nothing:
         ti.loop_config(parallelize=self.threads)
         for s, n in ti.ndrange(self.scenarios, nodes):
@@ -751,16 +839,17 @@ class NodalStressND:
             self.add_images(s, e)
         ti.loop_config(parallelize=self.threads)
         for s, i in ti.ndrange(self.scenarios, interior):
-            self.fold(s, self.interior[i], self.fill[s])
+            particle_volume = self.particle_volume[s]
+            self.fold(s, self.interior_node[i], particle_volume)
         ti.loop_config(parallelize=self.threads)
         for s, g in ti.ndrange(self.scenarios, ghosts):
             self.mirror(s, g)
         ti.loop_config(parallelize=self.threads)
         for s, i in ti.ndrange(self.scenarios, interior):
-            self.add_forces(s, self.interior[i])
+            self.add_forces(s, self.interior_node[i])
         ti.loop_config(parallelize=self.threads)
         for s, g in ti.ndrange(self.scenarios, ghosts):
-            self.mirror_moved(s, g)
+            self.mirror_forces(s, g)
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
             self.g2p(s, p)
@@ -777,20 +866,20 @@ class NodalStressND:
         self._restart_extremes(self.parameters.particles, self.tables.node_count)
 
     @ti.kernel
-    def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
+    def _restart_extremes(self, particles: i32, nodes: i32) -> Nothing:
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
-            now = self.carried[s, p]  # v_p, J_p
-            reached = ti.Vector(
-                [ti.abs(now[0]), ti.abs(now[1]), ti.abs(now[2]), now[3]]
-            )
-            self.extremes[s, p] = reached
-            self.x[s, p][3] = -now[3]  # this lane keeps the largest -J
+            state = self.particle_state[s, p]  # v_p, J_p
+            speed = ti.abs(state.xyz)
+            jacobian = state[3]
+            self.extremes[s, p] = vec4(speed[0], speed[1], speed[2], jacobian)
+            self.x[s, p][3] = -jacobian  # this lane keeps the largest -J
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
-            self.peak[s, n] = 0.0
+            self.peak_speed[s, n] = 0.0
 
 
 def _axis_count(step: tuple[int, ...]) -> int:
     """Return along how many axes a neighbour lies off."""
-    return sum(1 for value in step if value != 0)
+    nonzero = [value for value in step if value != 0]
+    return len(nonzero)

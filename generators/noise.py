@@ -58,13 +58,16 @@ class Jet:
         f_y = self.y
         g_x = other.x
         g_y = other.y
+        xx = self.xx * g + 2.0 * (f_x * g_x) + f * other.xx
+        xy = self.xy * g + f_x * g_y + f_y * g_x + f * other.xy
+        yy = self.yy * g + 2.0 * (f_y * g_y) + f * other.yy
         return Jet(
-            f * g,
-            f_x * g + f * g_x,
-            f_y * g + f * g_y,
-            self.xx * g + 2.0 * (f_x * g_x) + f * other.xx,
-            self.xy * g + f_x * g_y + f_y * g_x + f * other.xy,
-            self.yy * g + 2.0 * (f_y * g_y) + f * other.yy,
+            value=f * g,
+            x=f_x * g + f * g_x,
+            y=f_y * g + f * g_y,
+            xx=xx,
+            xy=xy,
+            yy=yy,
         )
 
     def scale(self, factor: Array | float) -> Jet:
@@ -134,7 +137,8 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
 
     def corner(k: int, m: int) -> Jet:
         """Return the ramp along the gradient of one corner of the cell."""
-        slope_x, slope_y = lattice[i + k, j + m].T
+        gradient = lattice[i + k, j + m]
+        slope_x, slope_y = gradient.T
         from_corner_x = p.shift(-float(k))
         from_corner_y = q.shift(-float(m))
         return from_corner_x.scale(slope_x) + from_corner_y.scale(slope_y)

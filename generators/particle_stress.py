@@ -24,9 +24,12 @@ without it a settled liquid loses a fifth of its depth.
 """
 
 import taichi as ti
+from taichi import f32, i32, i64
+from taichi.math import mat2, vec4
 
 from .constitutive import (
     corotated_stress,
+    determinant,
     hardening,
     larger,
     liquid_stress,
@@ -63,33 +66,42 @@ class ParticleStress(FreeSurfaceKernels):
         """
         super()._declare_fields()
         self.slope_x, self.slope_y = self.slopes
-        # deformation gradients of the solids [1]
-        self.f = ti.Matrix.field(2, 2, ti.f32)
-        self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
+        # of each particle: the deformation gradient of a solid [1]
+        self.deformation = mat2.field()
+        # rows of its stencil
+        self.weight_rows = [vec4.field() for _ in range(3)]
         # first column of A, scaled, and two zeros
-        self.a_x = ti.Vector.field(4, ti.f32)
-        self.a_y = ti.Vector.field(4, ti.f32)  # second column
-        self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
-        self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
-        self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
+        self.momentum_slope_x = vec4.field()
+        # second column
+        self.momentum_slope_y = vec4.field()
+        # v_x, v_y, r and Jbar of the nodes, at the particle
+        self.grid_state = vec4.field()
+
+        # of each node: n v_x, n v_y, n, n J
+        self.sums = ti.Vector.field(4, i64)
+        self.node_state = vec4.field()  # v_x, v_y, r, Jbar
 
     def _particle_fields(self) -> tuple[ti.Field, ...]:
-        return self.f, *self.rows, self.a_x, self.a_y, self.here
+        return (
+            self.deformation,
+            *self.weight_rows,
+            self.momentum_slope_x,
+            self.momentum_slope_y,
+            self.grid_state,
+        )
 
     def _node_fields(self) -> tuple[ti.Field, ...]:
-        return self.sums, self.node
+        return self.sums, self.node_state
 
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
-    def stress(
-        self, s: ti.i32, p: ti.i32, c: ti.math.mat2, solid: Template
-    ) -> ti.math.mat2:
+    def stress(self, s: i32, p: i32, c: mat2, solid: Template) -> mat2:
         """Return the Kirchhoff stress tau of a particle."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
-        pull = liquid_stress(ratio, self.parameters.liquid_modulus)
-        tau = ti.Matrix([[pull, 0.0], [0.0, pull]])
+        pressure = liquid_stress(ratio, self.parameters.liquid_modulus)
+        tau = mat2([pressure, 0.0], [0.0, pressure])
         viscosity = self.liquid_viscosity
         if ti.static(solid):
             mu = self.jelly[0]
@@ -108,97 +120,103 @@ class ParticleStress(FreeSurfaceKernels):
                 mu = self.snow[0] * factor
                 la = self.snow[1] * factor
                 damping = 0.0
-            elastic = corotated_stress(self.f[s, p], mu, la)
+            elastic = corotated_stress(self.deformation[s, p], mu, la)
             tau = ti.select(kind == LIQUID, tau, elastic)
             viscosity = ti.select(kind == LIQUID, viscosity, damping)
         return tau + viscous_stress(c, viscosity)
 
     @ti.func
-    def gradient(self, s: ti.i32, p: ti.i32) -> ti.math.mat2:
+    def velocity_gradient(self, s: i32, p: i32) -> mat2:
         """Return C of a particle."""
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
-        return ti.Matrix([[slope_x[0], slope_y[0]], [slope_x[1], slope_y[1]]])
+        return mat2([slope_x[0], slope_y[0]], [slope_x[1], slope_y[1]])
 
     @ti.func
-    def prepare(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
+    def prepare(self, s: i32, p: i32, solid: Template) -> None:
         """Compute the stencil of a particle, and the slope A of what it carries."""
-        first, second, third = stencil(self.x[s, p], self.inv_dx, self.width)
-        self.rows[0][s, p] = first
-        self.rows[1][s, p] = second
-        self.rows[2][s, p] = third
-        c = self.gradient(s, p)
+        x = self.x[s, p]
+        first, second, third = stencil(x, self.inv_dx, self.width)
+        self.weight_rows[0][s, p] = first
+        self.weight_rows[1][s, p] = second
+        self.weight_rows[2][s, p] = third
+        c = self.velocity_gradient(s, p)
         tau = self.stress(s, p, c, solid)
-        a = self.dx * c - self.impulse * tau
+        a = self.dx * c - self.stress_factor * tau
 
-        v = self.carried[s, p]
-        seen = self.extremes[s, p]
-        slope_x = ti.abs(a[0, 0]) + ti.abs(a[0, 1])
-        slope_y = ti.abs(a[1, 0]) + ti.abs(a[1, 1])
-        reach_x = ti.abs(v[0]) + 1.5 * slope_x
-        reach_y = ti.abs(v[1]) + 1.5 * slope_y
-        reach = larger(largest_of(reach_x, reach_y), seen[3])
-        self.extremes[s, p] = ti.Vector([seen[0], seen[1], seen[2], reach])
+        # A node lies within 1.5 cells per axis.
+        speed = ti.abs(self.particle_state[s, p].xy)
+        slope = ti.abs(a)
+        reach_x = speed[0] + 1.5 * (slope[0, 0] + slope[0, 1])
+        reach_y = speed[1] + 1.5 * (slope[1, 0] + slope[1, 1])
+        extremes = self.extremes[s, p]
+        reach = largest_of(reach_x, reach_y)
+        extremes[3] = larger(reach, extremes[3])
+        self.extremes[s, p] = extremes
         scaled = self.velocity_scale * a
-        self.a_x[s, p] = ti.Vector([scaled[0, 0], scaled[1, 0], 0.0, 0.0])
-        self.a_y[s, p] = ti.Vector([scaled[0, 1], scaled[1, 1], 0.0, 0.0])
+        momentum_slope_x = vec4(scaled[0, 0], scaled[1, 0], 0.0, 0.0)
+        momentum_slope_y = vec4(scaled[0, 1], scaled[1, 1], 0.0, 0.0)
+        self.momentum_slope_x[s, p] = momentum_slope_x
+        self.momentum_slope_y[s, p] = momentum_slope_y
 
     @ti.func
-    def p2g(self, s: ti.i32, p: ti.i32) -> None:
+    def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.rows, s, p, self.node_count)
-        scale = ti.Vector(
-            [
-                self.velocity_scale,
-                self.velocity_scale,
-                self.count_scale,
-                self.count_scale,
-            ]
+        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        scale = vec4(
+            self.velocity_scale,
+            self.velocity_scale,
+            self.count_scale,
+            self.count_scale,
         )
-        a_x = self.a_x[s, p]
-        a_y = self.a_y[s, p]
-        middle = scale * self.carried[s, p] - offset[0] * a_x - offset[1] * a_y
+        step_x = self.momentum_slope_x[s, p]
+        step_y = self.momentum_slope_y[s, p]
+        at_particle = scale * self.particle_state[s, p]
+        at_middle = at_particle - offset[0] * step_x - offset[1] * step_y
         for i, j in ti.static(ti.ndrange(3, 3)):
-            column = stepped(middle, a_x, i - 1)
-            value = stepped(column, a_y, j - 1)
-            node = ti.Vector([s, base + i * self.width + j])
-            weight = self.rows[i][s, p][j]
-            accumulate(self.sums, node, weight * value, self.atomic)
+            at_column = stepped(at_middle, step_x, i - 1)
+            at_node = stepped(at_column, step_y, j - 1)
+            node = base + i * self.width + j
+            weight = self.weight_rows[i][s, p][j]
+            accumulate(self.sums, s, node, weight * at_node, self.atomic)
 
     @ti.func
-    def at(self, i: ti.i32, j: ti.i32) -> ti.i32:
-        """Return the index of a node."""
+    def at(self, i: i32, j: i32) -> i32:
+        """Return the number of a node."""
         return i * self.width + j
 
     @ti.func
-    def clear(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
+    def clear(self, s: i32, i: i32, j: i32) -> None:
         """Set the sums of a node of scenario s to zero, before P2G adds to them."""
-        self.sums[s, self.at(i, j)] = ti.Vector.zero(ti.i64, 4)
+        node = self.at(i, j)
+        self.sums[s, node] = ti.Vector.zero(i64, 4)
 
     @ti.func
     def update(
-        self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32, friction: ti.f32
+        self, s: i32, i: i32, j: i32, particle_volume: f32, friction: f32
     ) -> None:
         """Divide by n, add gravity, meet the walls; an empty node is at rest."""
-        total = self.sums[s, self.at(i, j)]
+        node = self.at(i, j)
+        total = self.sums[s, node]
         u = 0.0
         v = 0.0
         jacobian = 1.0
         if total[2] > 0:
-            n = from_fixed(total[2], self.count_unit)
-            u = from_fixed(total[0], self.velocity_unit) / n
-            v = from_fixed(total[1], self.velocity_unit) / n - self.fall
-            jacobian = from_fixed(total[3], self.count_unit) / n
+            count = from_fixed(total[2], self.count_unit)
+            momentum_x = from_fixed(total[0], self.velocity_unit)
+            momentum_y = from_fixed(total[1], self.velocity_unit)
+            jacobian_sum = from_fixed(total[3], self.count_unit)
+            u = momentum_x / count
+            v = momentum_y / count - self.gravity_gain
+            jacobian = jacobian_sum / count
             u, v = self.contact(i, u, v, friction)
             v, u = self.contact(j, v, u, friction)
-        count = self.mirrored_count(s, i, j)
-        density = from_fixed(count, self.count_unit) * fill
-        self.node[s, self.at(i, j)] = ti.Vector([u, v, density, jacobian])
+        mirrored = self.mirrored_count(s, i, j)
+        density = from_fixed(mirrored, self.count_unit) * particle_volume
+        self.node_state[s, node] = vec4(u, v, density, jacobian)
 
     @ti.func
-    def contact(
-        self, index: ti.i32, normal: ti.f32, tangential: ti.f32, friction: ti.f32
-    ) -> Value:
+    def contact(self, index: i32, normal: f32, tangential: f32, friction: f32) -> Value:
         """Return the normal and tangential velocity behind the contact with a wall.
 
         ``index`` counts nodes along the normal of the two walls across an axis.
@@ -206,89 +224,109 @@ class ParticleStress(FreeSurfaceKernels):
         new_normal = normal
         new_tangential = tangential
         if self.is_outward(index, normal):
-            loss = friction * ti.abs(normal) / larger(ti.abs(tangential), 1e-9)
+            sliding = larger(ti.abs(tangential), 1e-9)
+            loss = friction * ti.abs(normal) / sliding
             new_normal = 0.0
             new_tangential = tangential * larger(1.0 - loss, 0.0)
         return new_normal, new_tangential
 
     @ti.func
-    def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.i64:
+    def count_at(self, s: i32, i: i32, j: i32) -> i64:
+        """Return n of a node, without its mirror images."""
+        node = self.at(i, j)
+        return self.sums[s, node][2]
+
+    @ti.func
+    def mirrored_count(self, s: i32, i: i32, j: i32) -> i64:
         """Return n of a node with its mirror images.
 
         Without them a wall node would hold half a cell and a corner a quarter.
         """
-        count = self.sums[s, self.at(i, j)][2]
         image_i = self.image(i)
         image_j = self.image(j)
+        count = self.count_at(s, i, j)
         if image_i >= 0:
-            count += self.sums[s, self.at(image_i, j)][2]
+            count += self.count_at(s, image_i, j)
         if image_j >= 0:
-            count += self.sums[s, self.at(i, image_j)][2]
+            count += self.count_at(s, i, image_j)
             if image_i >= 0:
-                count += self.sums[s, self.at(image_i, image_j)][2]
+                count += self.count_at(s, image_i, image_j)
         return count
 
     @ti.func
-    def g2p(self, s: ti.i32, p: ti.i32) -> None:
+    def g2p(self, s: i32, p: i32) -> None:
         """Gather (v, r, Jbar) and their slopes."""
-        base, offset = base_node(self.rows, s, p, self.node_count)
-        here = ti.Vector.zero(ti.f32, 4)
-        slope_x = here
-        slope_y = here
+        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        state = vec4(0.0)
+        slope_x = vec4(0.0)
+        slope_y = vec4(0.0)
         for i, j in ti.static(ti.ndrange(3, 3)):
-            part = self.rows[i][s, p][j] * self.node[s, base + i * self.width + j]
-            here += part
-            slope_x += ((i - 1.0) - offset[0]) * part
-            slope_y += ((j - 1.0) - offset[1]) * part
-        self.slope_x[s, p] = (4.0 * self.inv_dx) * slope_x
-        self.slope_y[s, p] = (4.0 * self.inv_dx) * slope_y
-        self.here[s, p] = here
+            node = base + i * self.width + j
+            weight = self.weight_rows[i][s, p][j]
+            share = weight * self.node_state[s, node]
+            distance_x = (i - 1.0) - offset[0]
+            distance_y = (j - 1.0) - offset[1]
+            state += share
+            slope_x += distance_x * share
+            slope_y += distance_y * share
+        slope_factor = 4.0 * self.inv_dx
+        self.slope_x[s, p] = slope_factor * slope_x
+        self.slope_y[s, p] = slope_factor * slope_y
+        self.grid_state[s, p] = state
 
     @ti.func
-    def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
+    def flow(self, s: i32, p: i32, solid: Template) -> None:
         """Move a particle; update J of a liquid or F of a solid."""
-        here = self.here[s, p]
-        kind = self.matter[s, p][0]
-        old = self.matter[s, p][1]
-        lowest = self.matter[s, p][2]
-        highest = self.matter[s, p][3]
-        position = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
-        velocity = ti.Vector([here[0], here[1]])
-        x = bounded(position + self.dt * velocity, self.least, self.most)
-        self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
-        c = self.gradient(s, p)
-        j = old + self.dt * (c[0, 0] + c[1, 1]) * old
-        j += self.parameters.jacobian_relaxation * (here[3] - old)
-        j += self.parameters.density_coupling * (1.0 / larger(here[2], 1.0) - j)
+        grid_state = self.grid_state[s, p]
+        grid_jacobian = grid_state[3]
+        velocity = grid_state.xy
+        x = self.x[s, p].xy + self.dt * velocity
+        x = bounded(x, self.position_min, self.position_max)
+        self.x[s, p] = vec4(x[0], x[1], 0.0, 0.0)
+
+        matter = self.matter[s, p]
+        kind = matter[0]
+        old_ratio = matter[1]
+        c = self.velocity_gradient(s, p)
+        divergence = c[0, 0] + c[1, 1]
+        density = larger(grid_state[2], 1.0)
+        j = old_ratio + self.dt * divergence * old_ratio
+        j += self.parameters.jacobian_relaxation * (grid_jacobian - old_ratio)
+        j += self.parameters.density_coupling * (1.0 / density - j)
         j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
         ratio = j
         jacobian = j
-        spread = j
+        spread_jacobian = j
         if ti.static(solid):
-            resting = self.f[s, p]
-            f = resting + self.dt * (c @ resting)
+            # Chosen, not branched upon: else no vectors.
+            old_f = self.deformation[s, p]
+            f = old_f + self.dt * (c @ old_f)
             yielded, growth = plastic_return(f, self.yield_low, self.yield_high)
+            f = ti.select(kind == SNOW, yielded, f)
+            f = ti.select(kind == LIQUID, old_f, f)
+            self.deformation[s, p] = f
+
             jp_min = self.parameters.snow_jp_min
             jp_max = self.parameters.snow_jp_max
-            jp = bounded(old * growth, jp_min, jp_max)
-            # Chosen, not branched upon: else no vectors.
-            deformed = ti.select(kind == SNOW, yielded, f)
-            f = ti.select(kind == LIQUID, resting, deformed)
-            self.f[s, p] = f
-            plastic = ti.select(kind == SNOW, jp, old)
-            ratio = ti.select(kind == LIQUID, j, plastic)
-            determinant = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-            jacobian = ti.select(kind == LIQUID, j, determinant)
-            spread = ti.select(kind == LIQUID, j, 1.0)
-        lowest = -larger(-ratio, -lowest)
-        highest = larger(ratio, highest)
-        self.matter[s, p] = ti.Vector([kind, ratio, lowest, highest])
-        self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
-        seen = self.extremes[s, p]
-        speed = largest_of(ti.abs(here[0]), ti.abs(here[1]))
-        least = -larger(-jacobian, -seen[1])
-        most = larger(jacobian, seen[2])
-        self.extremes[s, p] = ti.Vector([larger(speed, seen[0]), least, most, seen[3]])
+            jp = bounded(old_ratio * growth, jp_min, jp_max)
+            solid_ratio = ti.select(kind == SNOW, jp, old_ratio)
+            ratio = ti.select(kind == LIQUID, j, solid_ratio)
+            jacobian = ti.select(kind == LIQUID, j, determinant(f))
+            spread_jacobian = ti.select(kind == LIQUID, j, 1.0)
+        new_state = vec4(velocity[0], velocity[1], 1.0, spread_jacobian)
+        self.particle_state[s, p] = new_state
+
+        matter[1] = ratio
+        matter[2] = -larger(-ratio, -matter[2])
+        matter[3] = larger(ratio, matter[3])
+        self.matter[s, p] = matter
+        speed = ti.abs(velocity)
+        extremes = self.extremes[s, p]
+        speed_max = largest_of(speed[0], speed[1])
+        extremes[0] = larger(speed_max, extremes[0])
+        extremes[1] = -larger(-jacobian, -extremes[1])
+        extremes[2] = larger(jacobian, extremes[2])
+        self.extremes[s, p] = extremes
 
     # The drivers: the same phases in the same order.
 
@@ -303,44 +341,47 @@ class ParticleStress(FreeSurfaceKernels):
         self._parallel_substep(self.solid)
 
     @ti.kernel
-    def _serial_substeps(self, substeps: ti.i32, solid: Template) -> Nothing:
+    def _serial_substeps(self, substeps: i32, solid: Template) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             # Read first, so that the address of the fields stays out of the loops: else
             # no vectors.
-            fill = self.fill[0]
+            particle_volume = self.particle_volume[0]
             friction = self.friction[0]
-            first, last = self.touched_nodes(self.parameters.particles)
+            first, last = self.touched_nodes(self.particles)
             for i in range(first[0], last[0]):
                 for j in range(first[1], last[1]):
                     self.clear(0, i, j)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.prepare(0, p, solid)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.p2g(0, p)
             for i in range(first[0], last[0]):
                 for j in range(first[1], last[1]):
-                    self.update(0, i, j, fill, friction)
-            for p in range(self.parameters.particles):
+                    self.update(0, i, j, particle_volume, friction)
+            for p in range(self.particles):
                 self.g2p(0, p)
-            for p in range(self.parameters.particles):
+            for p in range(self.particles):
                 self.flow(0, p, solid)
 
     @ti.kernel
     def _parallel_substep(self, solid: Template) -> Nothing:
+        # with the nodes behind the walls
         nodes = ti.static((self.low - 1, self.high + 2))
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
             self.clear(s, i, j)
         ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+        for s, p in ti.ndrange(self.scenarios, self.particles):
             self.prepare(s, p, solid)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
-            self.update(s, i, j, self.fill[s], self.friction[s])
+            particle_volume = self.particle_volume[s]
+            friction = self.friction[s]
+            self.update(s, i, j, particle_volume, friction)
         ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+        for s, p in ti.ndrange(self.scenarios, self.particles):
             self.g2p(s, p)
             self.flow(s, p, solid)
 
@@ -348,11 +389,12 @@ class ParticleStress(FreeSurfaceKernels):
     def restart_extremes(self) -> Nothing:
         """Start an advance: the extremes are those of the present state."""
         ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
-            v = self.carried[s, p]
-            f = self.f[s, p]
-            jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+        for s, p in ti.ndrange(self.scenarios, self.particles):
+            state = self.particle_state[s, p]
+            f = self.deformation[s, p]
+            jacobian = determinant(f)
             if self.matter[s, p][0] == LIQUID:
-                jacobian = v[3]
-            speed = largest_of(ti.abs(v[0]), ti.abs(v[1]))
-            self.extremes[s, p] = ti.Vector([speed, jacobian, jacobian, 0.0])
+                jacobian = state[3]
+            speed = ti.abs(state.xy)
+            speed_max = largest_of(speed[0], speed[1])
+            self.extremes[s, p] = vec4(speed_max, jacobian, jacobian, 0.0)

@@ -65,7 +65,9 @@ class Smooth:
         g = other.value[:, None]
         gradient = g * self.gradient + f * other.gradient
         # f'_i g'_j and its transpose, shape [point, axis, axis]
-        crossed = self.gradient[:, :, None] * other.gradient[:, None, :]
+        f_slope = self.gradient[:, :, None]
+        g_slope = other.gradient[:, None, :]
+        crossed = f_slope * g_slope
         both_crossed = crossed + crossed.transpose(0, 2, 1)
         f_curved = g[..., None] * self.hessian
         g_curved = f[..., None] * other.hessian
@@ -234,16 +236,20 @@ def rotated_gradient(psi: Smooth) -> Flow:
 
 def curl(potential: Sequence[Smooth]) -> Flow:
     """Return the flow that is the curl of a vector potential."""
-    velocity = []
-    affine = []
+    components = []
+    gradients = []
     for axis in range(3):
         first = (axis + 1) % 3
         second = (axis + 2) % 3
         a = potential[first]
         b = potential[second]
-        velocity.append(b.gradient[:, first] - a.gradient[:, second])
-        affine.append(b.hessian[:, first] - a.hessian[:, second])
-    return Flow(np.stack(velocity, axis=1), np.stack(affine, axis=1))
+        component = b.gradient[:, first] - a.gradient[:, second]
+        component_gradient = b.hessian[:, first] - a.hessian[:, second]
+        components.append(component)
+        gradients.append(component_gradient)
+    velocity = np.stack(components, axis=1)
+    affine = np.stack(gradients, axis=1)
+    return Flow(velocity, affine)
 
 
 def scaled_to(flow: Flow, speed_rms: float) -> Flow:

@@ -25,7 +25,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.layout import scenario_path
@@ -42,7 +41,7 @@ from .batch import (
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
 from .full_box_parameters import FullBoxParameters
-from .solver import Health
+from .solver import Health, Singles
 from .soundness import SoundnessRecorder
 from .split import (
     ClosedBoxParameters,
@@ -254,11 +253,13 @@ def _soundness_recorders(batch: ScenarioBatch) -> list[SoundnessRecorder]:
     return recorders
 
 
-def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:
+def _kinetic_energy(velocity: Singles, mass: float) -> float:
     """Return sum of m v^2 / 2 over particles of one mass [mass length^2/s^2]."""
-    speed = velocity.astype(np.float64).ravel()
+    components = velocity.astype(np.float64).ravel()
+    squares = components * components
     # An exact sum: which frames are active enters the content hash.
-    return 0.5 * mass * math.fsum((speed * speed).tolist())
+    square_sum = math.fsum(squares.tolist())
+    return 0.5 * mass * square_sum
 
 
 def _diagnose(
@@ -283,7 +284,7 @@ def _diagnose(
     )
 
 
-def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
+def draw_perturbation(size: Size, scenario: int) -> Singles:
     """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
     words = entropy(size.split, size.name, size.major, scenario, size.draw_seed)
@@ -338,9 +339,7 @@ def measure_predictability(
     }
 
 
-def _root_mean_square_error(
-    position: NDArray[np.float32], truth: NDArray[np.float32], box: Box
-) -> float:
+def _root_mean_square_error(position: Singles, truth: Singles, box: Box) -> float:
     exact_truth = truth.astype(np.float64)
     exact_position = position.astype(np.float64)
     error = box.displacement(exact_truth, exact_position)

@@ -129,7 +129,8 @@ class Rod:
         square = x * x + y * y + z * z - height * height
         # distances beyond the ends and beyond the side, negative between them
         along = np.abs(height) - 0.5 * self.length
-        across = np.sqrt(np.maximum(square, 0.0)) - self.radius
+        from_axis = np.sqrt(np.maximum(square, 0.0))
+        across = from_axis - self.radius
         farther = np.maximum(along, across)
         inside = np.minimum(farther, 0.0)
         along = np.maximum(along, 0.0)

@@ -23,6 +23,8 @@ from .split import (
     SolverParameters,
 )
 
+Singles = NDArray[np.float32]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
@@ -54,13 +56,13 @@ class Solver(Protocol):
         its number, from 1), the broken bounds and the values.
         """
 
-    def position(self) -> NDArray[np.float32]:
+    def position(self) -> Singles:
         """Particle positions [length], shape [scenario, particle, axis]."""
 
-    def velocity(self) -> NDArray[np.float32]:
+    def velocity(self) -> Singles:
         """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
 
-    def displace(self, offset: NDArray[np.float32]) -> None:
+    def displace(self, offset: Singles) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, axis];
         kept in the box.
         """

@@ -25,9 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .solver import Singles
 from .split import FreeSurfaceParameters, Material
-
-Singles = NDArray[np.float32]
 
 BIN = 1e-3
 """Width of the bins by which quantiles of Mach numbers and of J are counted [1]."""
@@ -106,7 +105,8 @@ class SoundnessRecorder:
         squares = np.square(velocity, dtype=np.float64)
         speed = np.sqrt(squares.sum(axis=-1))
         mach = speed / self._sound_speed
-        self._mach_max = max(self._mach_max, float(mach.max()))
+        frame_max = float(mach.max())
+        self._mach_max = max(self._mach_max, frame_max)
         self._mach_counts += _count_bins(mach)
         liquid_jacobian = ratio[self._is_liquid].astype(np.float64)
         self._jacobian_counts += _count_bins(liquid_jacobian)
@@ -138,13 +138,13 @@ class SoundnessRecorder:
     def _count_clamped(self, least: Singles, greatest: Singles) -> int:
         p = self._parameters
         # Jp at which the hardening factor meets its caps [1]
-        stiffest = 1.0 - math.log(p.snow_hardening_max) / p.snow_hardening
-        softest = 1.0 - math.log(p.snow_hardening_min) / p.snow_hardening
-        lowest_plastic = max(p.snow_jp_min, stiffest)
+        stiffest_jp = 1.0 - math.log(p.snow_hardening_max) / p.snow_hardening
+        softest_jp = 1.0 - math.log(p.snow_hardening_min) / p.snow_hardening
+        lowest_jp = max(p.snow_jp_min, stiffest_jp)
 
         is_thin = least <= np.float32(p.jacobian_min)
-        is_hard = least <= np.float32(lowest_plastic)
-        is_soft = greatest >= np.float32(softest)
+        is_hard = least <= np.float32(lowest_jp)
+        is_soft = greatest >= np.float32(softest_jp)
         is_clamped_liquid = self._is_liquid & is_thin
         is_clamped_snow = self._is_snow & (is_hard | is_soft)
         return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
@@ -166,8 +166,14 @@ def _quantile(counts: NDArray[np.int64], share: float) -> float:
 
 
 def _least(values: Singles) -> float:
-    return float(values.min()) if values.size else 1.0
+    """Return the smallest value, 1 without values."""
+    if not values.size:
+        return 1.0
+    return float(values.min())
 
 
 def _greatest(values: Singles) -> float:
-    return float(values.max()) if values.size else 1.0
+    """Return the largest value, 1 without values."""
+    if not values.size:
+        return 1.0
+    return float(values.max())

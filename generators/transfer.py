@@ -23,6 +23,8 @@ import math
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import taichi as ti
+from taichi import f32, f64, i32, i64
+from taichi.math import vec2, vec3, vec4
 
 if TYPE_CHECKING:
     Template: TypeAlias = Any
@@ -71,42 +73,45 @@ def spline_weights(f: Value) -> Value:
 
 
 @ti.func
-def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
+def stencil(x: vec4, inv_dx: f32, width: i32) -> Value:
     """Return three rows of weights w_i w_j, each with a fourth number.
 
     The fourth numbers are what else a transfer needs: the bits of the base node's index
     i width + j, and the offset f - 1 along x and along y.
     """
-    scaled = ti.Vector([x[0], x[1]]) * inv_dx
-    base = ti.cast(scaled - 0.5, ti.i32)
-    f = scaled - ti.cast(base, ti.f32)
+    scaled = x.xy * inv_dx
+    base = ti.cast(scaled - 0.5, i32)
+    f = scaled - ti.cast(base, f32)
+    offset = f - 1.0
+    node = base[0] * width + base[1]
+    node_bits = ti.bit_cast(node, f32)
     low, mid, high = spline_weights(f)
-    to_mid = f - 1.0
-    node = ti.bit_cast(base[0] * width + base[1], ti.f32)
-    weight = ti.Vector([low[1], mid[1], high[1]])  # along y
-    first = low[0] * weight
-    second = mid[0] * weight
-    third = high[0] * weight
+    along_y = vec3(low[1], mid[1], high[1])
+    first = low[0] * along_y
+    second = mid[0] * along_y
+    third = high[0] * along_y
     return (
-        ti.Vector([first[0], first[1], first[2], node]),
-        ti.Vector([second[0], second[1], second[2], to_mid[0]]),
-        ti.Vector([third[0], third[1], third[2], to_mid[1]]),
+        vec4(first[0], first[1], first[2], node_bits),
+        vec4(second[0], second[1], second[2], offset[0]),
+        vec4(third[0], third[1], third[2], offset[1]),
     )
 
 
 @ti.func
-def base_node(rows: Template, s: ti.i32, p: ti.i32, node_count: Template) -> Value:
+def base_node(rows: Template, s: i32, p: i32, node_count: Template) -> Value:
     """Return a particle's base node and its offset from the middle node [cells].
 
     Both stand in its stencil, see :func:`stencil`.
     """
-    base = node_number(rows[0][s, p][3], node_count)
-    offset = ti.Vector([rows[1][s, p][3], rows[2][s, p][3]])
-    return base, offset
+    node_bits = rows[0][s, p][3]
+    offset_x = rows[1][s, p][3]
+    offset_y = rows[2][s, p][3]
+    base = node_number(node_bits, node_count)
+    return base, vec2(offset_x, offset_y)
 
 
 @ti.func
-def node_number(bits: ti.f32, node_count: Template) -> Value:
+def node_number(bits: f32, node_count: Template) -> Value:
     """Return the number of a node, below ``node_count``, from a float with its bits.
 
     The mask changes no such number. It tells LLVM that the numbers of the neighbours do
@@ -114,7 +119,7 @@ def node_number(bits: ti.f32, node_count: Template) -> Value:
     each address is computed anew.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
-    return ti.bit_cast(bits, ti.i32) & mask
+    return ti.bit_cast(bits, i32) & mask
 
 
 @ti.func
@@ -124,25 +129,26 @@ def to_fixed(scaled: Value) -> Value:
     NaN and larger values give some integer, never a trap: the float's bits are only
     read.
     """
-    return shifted(scaled) - ti.i64(_SHIFT_BITS)
+    return shifted(scaled) - i64(_SHIFT_BITS)
 
 
 @ti.func
 def shifted(scaled: Value) -> Value:
     """Return :func:`to_fixed` plus the bits of the shift."""
-    precise = ti.cast(scaled, ti.f64)
-    return ti.bit_cast(precise + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64)
+    rounding_shift = ti.cast(_ROUNDING_SHIFT, f64)
+    moved = ti.cast(scaled, f64) + rounding_shift
+    return ti.bit_cast(moved, i64)
 
 
 @ti.func
-def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
+def from_fixed(total: Value, inverse_scale: f32) -> Value:
     """Return a sum of :func:`to_fixed` as float32, rounded once."""
-    return ti.cast(total, ti.f32) * inverse_scale
+    return ti.cast(total, f32) * inverse_scale
 
 
 @ti.func
 def accumulate(
-    sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template
+    sums: Template, s: i32, node: i32, scaled: vec4, atomic: Template
 ) -> None:
     """Add contributions, times their scales, to the sums of one node.
 
@@ -150,16 +156,17 @@ def accumulate(
     """
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):
-        ti.atomic_add(sums[node], to_fixed(scaled))
+        ti.atomic_add(sums[s, node], to_fixed(scaled))
     else:
         # The shift comes off the sum: off the contribution, LLVM finds vectors for two
         # lanes only.
-        sums[node] = (sums[node] - ti.i64(_SHIFT_BITS)) + shifted(scaled)
+        reduced = sums[s, node] - i64(_SHIFT_BITS)
+        sums[s, node] = reduced + shifted(scaled)
 
 
 @ti.func
 def add_shifted(
-    sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template
+    sums: Template, s: i32, node: i32, scaled: vec4, atomic: Template
 ) -> None:
     """Add contributions, times their scales, and the bits of the shift.
 
@@ -167,14 +174,14 @@ def add_shifted(
     each particle.
     """
     if ti.static(atomic):
-        ti.atomic_add(sums[node], shifted(scaled))
+        ti.atomic_add(sums[s, node], shifted(scaled))
     else:
         # Even in serial code `+=` is an atomic.
-        sums[node] = sums[node] + shifted(scaled)
+        sums[s, node] = sums[s, node] + shifted(scaled)
 
 
 @ti.func
-def row_count(rows: Template, s: ti.i32, n: ti.i32) -> Value:
+def row_count(rows: Template, s: i32, n: i32) -> Value:
     """Return the fixed-point sum of a node's weights, and the shifts in its sums.
 
     Particles add to ``rows`` at n + 2 the weights of three nodes in a row along the
@@ -185,7 +192,8 @@ def row_count(rows: Template, s: ti.i32, n: ti.i32) -> Value:
     second = rows[s, n + 1]
     third = rows[s, n]
     shifts = first[3] + second[3] + third[3]
-    return (first[0] + second[1] + third[2]) - shifts, shifts
+    shifted_sum = first[0] + second[1] + third[2]
+    return shifted_sum - shifts, shifts
 
 
 @ti.func
@@ -200,7 +208,7 @@ def stepped(value: Value, step: Value, count: Template) -> Value:
 
 
 @ti.func
-def bounded(value: Value, low: ti.f32, high: ti.f32) -> Value:
+def bounded(value: Value, low: f32, high: f32) -> Value:
     """Return the value kept in [low, high]; NaN becomes low."""
     raised = ti.select(value > low, value, low)
     return ti.select(raised < high, raised, high)

@@ -7,6 +7,8 @@ where it lets it slide. A ghost in a corner mirrors across both walls.
 """
 
 import taichi as ti
+from taichi import f32, i32
+from taichi.math import vec2, vec4
 
 from .transfer import Template, Value
 
@@ -20,6 +22,9 @@ class Walls:
         self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
         # low and high index of the interior nodes
         self.edge = (wall + 1, grid - wall - 1)
+        # the same as ranges along either axis: first index, and the one behind the last
+        self.all_nodes = (self.ghost[0], self.ghost[1] + 1)
+        self.interior_nodes = (self.edge[0], self.edge[1] + 1)
         self.span = grid - 2 * wall
         self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
         # sign with which a wall mirrors a tangential component
@@ -27,10 +32,10 @@ class Walls:
         if no_slip:
             self.tangential = -1
         # tangential velocity of each wall [length/s], order of WALLS; shape [scenario]
-        self.speed = ti.Vector.field(4, ti.f32)
+        self.speed = vec4.field()
 
     @ti.func
-    def beyond(self, i: ti.i32) -> ti.i32:
+    def beyond(self, i: i32) -> i32:
         """Return the ghost index next to an outermost interior index; others stay."""
         ghost = i
         if i == self.edge[0]:
@@ -40,7 +45,7 @@ class Walls:
         return ghost
 
     @ti.func
-    def doubled_speed(self, s: ti.i32, first: Template, ghost: ti.i32) -> ti.f32:
+    def doubled_speed(self, s: i32, first: Template, ghost: i32) -> f32:
         """Return 2 u_wall of the wall before a ghost node [length/s].
 
         ``first`` is the index of the low wall of the pair.
@@ -51,56 +56,66 @@ class Walls:
         return 2.0 * speed
 
     @ti.func
-    def source(self, i: ti.i32) -> ti.i32:
+    def source(self, i: i32) -> i32:
         """Return the interior index that a ghost index mirrors; interior ones stay."""
-        return ti.min(ti.max(i, self.edge[0]), self.edge[1])
+        raised = ti.max(i, self.edge[0])
+        return ti.min(raised, self.edge[1])
 
     @ti.func
-    def ring(self, k: ti.i32) -> Value:
+    def ring(self, k: i32) -> Value:
         """Return the k-th ghost node: once around, from the low left corner."""
         side = k // self.span
-        along = k % self.span
+        steps = k % self.span
         low = self.ghost[0]
         high = self.ghost[1]
+        forth = low + steps
+        back = high - steps
         i = low
-        j = low + along
+        j = forth
         if side == 1:
-            i = low + along
+            i = forth
             j = high
         if side == 2:
             i = high
-            j = high - along
+            j = back
         if side == 3:
-            i = high - along
+            i = back
             j = low
         return i, j
 
     @ti.func
-    def reflection(self, i: ti.i32, j: ti.i32) -> ti.math.vec2:
+    def reflection(self, i: i32, j: i32) -> vec2:
         """Return the signs with which a ghost node mirrors a vector."""
         tangential = float(self.tangential)
-        sign = ti.Vector([1.0, 1.0])
+        sign = vec2(1.0)
         if i != self.source(i):
-            sign = ti.Vector([-1.0, tangential])
+            sign = vec2(-1.0, tangential)
         if j != self.source(j):
-            sign = ti.Vector([sign[0] * tangential, -sign[1]])
+            sign = vec2(sign[0] * tangential, -sign[1])
         return sign
 
     @ti.func
-    def drive(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.math.vec2:
+    def drive(self, s: i32, i: i32, j: i32) -> vec2:
         """Return what moving walls add to a ghost's velocity [length/s].
 
         It is half as much in the last cells before a corner, and 0 in corners.
         """
-        velocity = ti.Vector([0.0, 0.0])
-        across_x = i != self.source(i)
-        across_y = j != self.source(j)
-        if across_x and not across_y:
-            velocity[1] = self.doubled_speed(s, 0, i)
-            if j == self.edge[0] or j == self.edge[1]:
-                velocity[1] = 0.5 * velocity[1]
-        if across_y and not across_x:
-            velocity[0] = self.doubled_speed(s, 2, j)
-            if i == self.edge[0] or i == self.edge[1]:
-                velocity[0] = 0.5 * velocity[0]
+        velocity = vec2(0.0)
+        is_beyond_x_wall = i != self.source(i)
+        is_beyond_y_wall = j != self.source(j)
+        if is_beyond_x_wall and not is_beyond_y_wall:
+            speed = self.doubled_speed(s, 0, i)
+            if self.is_edge(j):
+                speed = 0.5 * speed
+            velocity[1] = speed
+        if is_beyond_y_wall and not is_beyond_x_wall:
+            speed = self.doubled_speed(s, 2, j)
+            if self.is_edge(i):
+                speed = 0.5 * speed
+            velocity[0] = speed
         return velocity
+
+    @ti.func
+    def is_edge(self, i: i32) -> Value:
+        """Tell whether an index is that of an outermost interior node."""
+        return i == self.edge[0] or i == self.edge[1]

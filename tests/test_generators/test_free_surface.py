@@ -251,9 +251,9 @@ def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None
     """A corrupt velocity neither crashes the process nor passes unseen."""
     jelly = ball(Material.JELLY)
     solver = start(CONSTANTS, [jelly], device=device)
-    carried = solver._kernels.carried.to_numpy()
+    carried = solver._kernels.particle_state.to_numpy()
     carried[0, 7, :2] = poison
-    solver._kernels.carried.from_numpy(carried)
+    solver._kernels.particle_state.from_numpy(carried)
     with pytest.raises(WorkFailedError) as caught:
         solver.advance(20)
     assert caught.value.where == "scenario 0, substeps 0 to 20"

@@ -62,8 +62,7 @@ def count_weights(  # type: ignore[no-untyped-def] # noqa: ANN201
     ti.loop_config(serialize=True)
     for p in range(first.shape[0]):
         row = ti.Vector([weights[p, 0], weights[p, 1], weights[p, 2], 0.0])
-        node = ti.Vector([0, first[p] + 2])
-        transfer.add_shifted(rows, node, row, False)
+        transfer.add_shifted(rows, 0, first[p] + 2, row, False)
     ti.loop_config(serialize=True)
     for n in range(counts.shape[0]):
         counts[n] = transfer.row_count(rows, 0, n)[0]
