@@ -79,22 +79,28 @@ class NeuralMPM(Baseline):
             periodic=periodic,
         )
         cells_per_radius = self.grid.spacing / info.radius
-        unit = cells_per_radius**info.box.dimension
-        self.speed = _isotropic_std(info, "velocity_std")
-        # Deviation of the accelerations [length/frame^2]: the unit of the output.
-        self.change = _isotropic_std(info, "acceleration_std")
+        # sum of weights at a node among particles that lie a radius apart [1]
+        weight_unit = cells_per_radius**info.box.dimension
+        # The network reads velocities in units of their deviation [length/frame], and
+        # predicts accelerations in units of theirs [length/frame^2].
+        velocity_std = _isotropic_std(info, "velocity_std")
+        self.acceleration_std = _isotropic_std(info, "acceleration_std")
         self.encoder = FieldEncoder(
             self.grid,
             options,
-            unit=unit,
-            velocity_std=self.speed,
-            acceleration_std=self.change,
+            weight_unit=weight_unit,
+            velocity_std=velocity_std,
+            acceleration_std=self.acceleration_std,
         )
         self.decoder: Accelerations
         if options.conserve:
-            self.decoder = StressAccelerations(self.grid, options, unit=unit)
+            self.decoder = StressAccelerations(
+                self.grid, options, weight_unit=weight_unit
+            )
         else:
-            self.decoder = FieldAccelerations(self.grid, options, unit=unit)
+            self.decoder = FieldAccelerations(
+                self.grid, options, weight_unit=weight_unit
+            )
 
         self.context: ContextNetwork | None = None
         if options.context:
@@ -108,8 +114,8 @@ class NeuralMPM(Baseline):
             + options.viscosity
         )
         self.network = UNet(inputs, self.decoder.channels, options.width, periodic)
-        # Stresses conserve momentum, so a fall needs a weight of its own. Where all
-        # images of the square are as good, nothing falls.
+        # Stresses conserve momentum, so gravity needs a weight of its own. Where all
+        # mirror images of the square are equally likely, there is no gravity.
         self.fall: nn.Parameter | None = None
         if options.conserve and options.symmetry is not Symmetry.SQUARE:
             self.fall = nn.Parameter(torch.zeros(()))
@@ -176,10 +182,10 @@ class NeuralMPM(Baseline):
                 true_velocity = self.box.displacement(true_position, next_true_position)
                 gap = self.box.displacement(reached.detach(), true_position)
                 way_back = velocity_towards_path(
-                    gap, self.options.recovery, acceleration_std=self.change
+                    gap, self.options.recovery, acceleration_std=self.acceleration_std
                 )
                 target = true_velocity + way_back
-                error = (velocity - target) / self.change
+                error = (velocity - target) / self.acceleration_std
                 squared_error = error.square()
                 errors.append(squared_error.mean())
                 reached = position
@@ -344,7 +350,7 @@ class NeuralMPM(Baseline):
         else:
             output = self.network(inputs)
 
-        output = output * self.change
+        output = output * self.acceleration_std
         gathered_velocity, accelerations = self.decoder.decode(
             state, stencil, output, grid_velocity
         )
@@ -359,7 +365,7 @@ class NeuralMPM(Baseline):
         self, accelerations: Sequence[Tensor], fall: Tensor
     ) -> Sequence[Tensor]:
         """Return the accelerations of all frames with the fall g."""
-        unit = FALL_UNIT * self.change  # [length/frame^2]
+        unit = FALL_UNIT * self.acceleration_std  # [length/frame^2]
         direction = torch.stack([0.0 * fall, fall])
         without_fall = torch.stack(list(accelerations), dim=1)
         with_fall = without_fall + unit * direction

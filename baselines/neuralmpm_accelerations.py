@@ -37,14 +37,15 @@ class Accelerations(ABC):
     Args:
         grid: the U-Net's grid.
         options: options of the model.
-        unit: weight of particles a radius apart [1].
+        weight_unit: sum of weights at a node among particles that lie a radius
+            apart [1]; weights are divided by it.
     """
 
     def __init__(
-        self, grid: ParticleGrid, options: NeuralMPMOptions, *, unit: float
+        self, grid: ParticleGrid, options: NeuralMPMOptions, *, weight_unit: float
     ) -> None:
         self.grid = grid
-        self.unit = unit
+        self.weight_unit = weight_unit
         self.frames = options.bundle
         self.material_count = len(options.materials)
 
@@ -170,7 +171,7 @@ class StressAccelerations(Accelerations):
 
         The shape is [particle, 1].
         """
-        weight = self.grid.gather(shared, mass / self.unit)
+        weight = self.grid.gather(shared, mass / self.weight_unit)
         filled_share = weight / FULL_WEIGHT
         filled_share = filled_share.clamp(max=1.0)
         return filled_share.square()

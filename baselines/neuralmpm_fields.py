@@ -59,7 +59,8 @@ class FieldEncoder(nn.Module):
     Args:
         grid: the U-Net's grid.
         options: options of the model.
-        unit: weight of particles a radius apart [1].
+        weight_unit: sum of weights at a node among particles that lie a radius
+            apart [1]; weights are divided by it.
         velocity_std: deviation of velocities [length/frame].
         acceleration_std: deviation of accelerations [length/frame^2].
     """
@@ -73,14 +74,14 @@ class FieldEncoder(nn.Module):
         grid: ParticleGrid,
         options: NeuralMPMOptions,
         *,
-        unit: float,
+        weight_unit: float,
         velocity_std: float,
         acceleration_std: float,
     ) -> None:
         super().__init__()
         self.grid = grid
         self.options = options
-        self.unit = unit
+        self.weight_unit = weight_unit
         self.velocity_std = velocity_std
         self.acceleration_std = acceleration_std
         self.material_count = len(options.materials)
@@ -156,9 +157,9 @@ class FieldEncoder(nn.Module):
         value = torch.cat(carried, dim=1)
         sums = grid.spread(stencil, value, layers)
 
-        weight = sums[:, :1] / self.unit
+        weight = sums[:, :1] / self.weight_unit
         divisor = weight.clamp(min=EMPTY_WEIGHT)
-        means = sums[:, 1:] / self.unit / divisor
+        means = sums[:, 1:] / self.weight_unit / divisor
         velocity = means[:, :velocity_channels]
         velocity = velocity.reshape(layers, -1, axes, *grid.shape)
         mean_strain = means[:, velocity_channels:]
@@ -192,7 +193,7 @@ class FieldEncoder(nn.Module):
         channels = sums.shape[1]
         by_material = sums.view(-1, self.material_count, channels, *self.grid.shape)
         total = by_material.sum(dim=1)
-        total = total / self.unit
+        total = total / self.weight_unit
         weight = total[:, :1]
         last_momentum = total[:, -self.grid.dimension :]
         velocity = last_momentum / weight.clamp(min=EMPTY_WEIGHT)

@@ -86,9 +86,13 @@ def flow(psi: Jet) -> tuple[Array, Array]:
     """
     u = psi.y
     v = -psi.x
+    u_x = psi.xy
+    u_y = psi.yy
+    v_x = -psi.xx
+    v_y = -psi.xy
     velocity = np.stack([u, v], axis=-1)
-    gradient_of_u = np.stack([psi.xy, psi.yy], axis=-1)
-    gradient_of_v = np.stack([-psi.xx, -psi.xy], axis=-1)
+    gradient_of_u = np.stack([u_x, u_y], axis=-1)
+    gradient_of_v = np.stack([v_x, v_y], axis=-1)
     affine = np.stack([gradient_of_u, gradient_of_v], axis=1)
     return quantise(velocity), quantise(affine)
 

@@ -302,9 +302,11 @@ class NodalStressND:
         mask = np.empty((self.scenarios, len(places)), np.float32)
         discs = np.zeros((self.scenarios, LANES), np.float32)
         for s, obstacle in enumerate(obstacles):
-            mask[s] = ~is_inside(places, obstacle.centre, obstacle.radius)
+            least_distance = obstacle.radius + _INSET / self.inv_dx
+            is_solid = is_inside(places, obstacle.centre, obstacle.radius)
+            mask[s] = ~is_solid
             discs[s, : self.dimension] = obstacle.centre
-            discs[s, 3] = obstacle.radius + _INSET / self.inv_dx
+            discs[s, 3] = least_distance
         self.fluid_mask.from_numpy(mask)
         self.obstacle.from_numpy(discs)
 

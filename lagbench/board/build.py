@@ -896,6 +896,10 @@ def _names_of_curves(ranking: str) -> tuple[str, ...]:
 
 
 def _make_curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
+    """Return the curves over frames of an entry, by metric.
+
+    A metric without a value per frame has no curve.
+    """
     curves = {}
     for name in _names_of_curves(ranking):
         score = scores.get(name)

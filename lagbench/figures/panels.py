@@ -133,6 +133,27 @@ def draw(
         limit: top of the colour scale.
         detail: how dense and thick streamlines are, 0 to 1.
     """
+    _draw_box(axes, panel, scene)
+    scale = colour_scale(panel, limit, is_solid=scene.recording.is_solid)
+    if panel is Panel.MATERIAL:
+        colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
+        _draw_dots(axes, scene, colours, panel)
+    elif panel in OF_PARTICLES:
+        colours = scale.to_rgba(scene.speed)
+        _draw_dots(axes, scene, colours, panel)
+    elif panel is Panel.VORTICITY:
+        _draw_field(axes, scene, scene.vorticity, scale)
+    else:
+        # nodes that count too few particles show no speed
+        speed = np.where(scene.fields.counted, _grid_speed(scene), np.nan)
+        _draw_field(axes, scene, speed, scale)
+        _draw_streamlines(axes, scene, detail=detail)
+
+
+def _draw_box(axes: Axes, panel: Panel, scene: Scene) -> None:
+    """Draw the box of a panel: as seen from above, as a cube, cut by a plane, or as
+    seen from the front, where the plane of x and y is.
+    """
     recording = scene.recording
     if panel is Panel.ABOVE:
         draw_walls(axes, recording, scene.frame, plane=(0, 2))
@@ -143,19 +164,6 @@ def draw(
         draw_walls(axes, recording, scene.frame, cut=cut)
     else:
         draw_walls(axes, recording, scene.frame)
-    scale = colour_scale(panel, limit, is_solid=recording.is_solid)
-    if panel is Panel.MATERIAL:
-        colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
-        _draw_dots(axes, scene, colours, panel)
-    elif panel in OF_PARTICLES:
-        colours = scale.to_rgba(scene.speed)
-        _draw_dots(axes, scene, colours, panel)
-    elif panel is Panel.VORTICITY:
-        _draw_field(axes, scene, scene.vorticity, scale)
-    else:
-        speed = np.where(scene.fields.counted, _grid_speed(scene), np.nan)
-        _draw_field(axes, scene, speed, scale)
-        _draw_streamlines(axes, scene, detail=detail)
 
 
 def box_of(

@@ -378,10 +378,11 @@ def _scan_folder(
     if store:
         stored = store.stored_entries
     # All wanted ids that no store holds, and every file that the manifest belies.
-    suspects = _suspects(setup, old, stored, wanted_ids)
-    setup.meter.begin("checking", total=len(suspects), scenarios=len(suspects))
+    inspected_ids = _ids_to_inspect(setup, old, stored, wanted_ids)
+    inspected_count = len(inspected_ids)
+    setup.meter.begin("checking", total=inspected_count, scenarios=inspected_count)
     inspections = {}
-    for scenario in suspects:
+    for scenario in inspected_ids:
         inspections[f"scenario {scenario}"] = partial(
             inspect_scenario,
             setup.root,
@@ -391,11 +392,11 @@ def _scan_folder(
             quick=True,
             trusting=gathered is not None,
         )
-    paths = map(setup.path, suspects)
+    paths = map(setup.path, inspected_ids)
     results = setup.read_files(run_inspection, inspections, paths)
 
     hashed = []
-    bad_ids = set(suspects)  # until an inspection proves a file right
+    bad_ids = set(inspected_ids)  # until an inspection proves a file right
     for result in results:
         if result.entry:
             hashed.append(result.entry)
@@ -422,19 +423,22 @@ def _scan_folder(
     )
 
 
-def _suspects(
+def _ids_to_inspect(
     setup: _Setup,
     old: Manifest,
     stored: Collection[int],
     wanted_ids: Sequence[int],
 ) -> list[int]:
-    """Return the ids to inspect: those chosen, and those whose file came, went, or has
-    another length than the manifest says; what the store holds is right.
+    """Return the ids whose files must be read before anything is simulated.
+
+    These are the wanted ids, and the ids whose file has appeared, has vanished, or has
+    changed its length since the manifest was written. Files in the store are right, so
+    their ids are left out.
     """
     stated_lengths = {}
     for entry in old.files:
         stated_lengths[entry.scenario] = entry.bytes
-    suspects = []
+    ids = []
     for scenario in setup.size.scenarios:
         if scenario in stored:
             continue
@@ -442,9 +446,10 @@ def _suspects(
         path = setup.path(scenario)
         if path.exists():
             length = path.stat().st_size
-        if scenario in wanted_ids or length != stated_lengths.get(scenario):
-            suspects.append(scenario)
-    return suspects
+        has_changed = length != stated_lengths.get(scenario)
+        if scenario in wanted_ids or has_changed:
+            ids.append(scenario)
+    return ids
 
 
 def _simulate(

@@ -151,7 +151,7 @@ def test_the_u_net_sees_the_coming_force_at_its_nodes(root: Path, batch: Batch) 
     assert fields.shape == (2, 6, 12, 12)
     assert batch.body_force is not None
     square_interval = info.frame_interval**2
-    unit = square_interval / model.change
+    unit = square_interval / model.acceleration_std
     coming = unit * batch.body_force[:, GIVEN : GIVEN + 3]
     halves = [fields[..., :6], fields[..., 6:]]
     for layer, half in enumerate(halves):

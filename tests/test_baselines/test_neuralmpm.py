@@ -262,12 +262,12 @@ def test_recovery_asks_for_the_way_back(speed: float) -> None:
     model = surrogate(smoothing=0.0, recovery=4.0)
 
     lag = (speed - initial_speed) * np.arange(4.0)
-    most_recovery = 3.0 * model.change
+    most_recovery = 3.0 * model.acceleration_std
     recovery = np.minimum(lag / 4.0, most_recovery)
     target = speed + recovery
     # Nothing moves along y, so the mean over both axes is half of that along x.
     mean_square = (target - initial_speed) ** 2 / 2
-    expected = mean_square.mean() / model.change**2
+    expected = mean_square.mean() / model.acceleration_std**2
     with torch.no_grad():
         loss = float(model(window)["velocity"])
     assert loss == pytest.approx(expected, rel=1e-2)
@@ -297,7 +297,7 @@ def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> 
     window.material[::2] = 3
 
     velocity = roll_out_velocities(model, window, 4).double()
-    fall = -0.05 * 10.0 * model.change
+    fall = -0.05 * 10.0 * model.acceleration_std
     expected = np.array(
         [
             (2e-3, -1e-3 + fall * 2),
@@ -571,7 +571,7 @@ def test_a_known_network_has_a_known_rollout() -> None:
     """Drag takes a share of the velocity before a bundle in each of its frames."""
     model = surrogate(materials=[0], smoothing=0.0)
     rate = 0.1
-    drag_rate = rate * model.speed / model.change
+    drag_rate = rate * model.speed / model.acceleration_std
     model.network = Drag(drag_rate, 2)
     velocity = (4e-3, -2e-3)
     window = liquid(drift(velocity, 3))
@@ -599,7 +599,7 @@ def test_images_roll_out_as_images() -> None:
     The network of this test knows none either.
     """
     model = surrogate(materials=[0], smoothing=0.2)
-    drag_rate = -0.5 * model.speed / model.change
+    drag_rate = -0.5 * model.speed / model.acceleration_std
     model.network = Drag(drag_rate, 2)
     frames = swirl(0, 3, (0.2, 0.2))
     window = liquid(frames)
