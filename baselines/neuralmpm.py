@@ -83,13 +83,13 @@ class NeuralMPM(Baseline):
         weight_unit = cells_per_radius**info.box.dimension
         # The network reads velocities in units of their deviation [length/frame], and
         # predicts accelerations in units of theirs [length/frame^2].
-        velocity_std = _isotropic_std(info, "velocity_std")
+        self.velocity_std = _isotropic_std(info, "velocity_std")
         self.acceleration_std = _isotropic_std(info, "acceleration_std")
         self.encoder = FieldEncoder(
             self.grid,
             options,
             weight_unit=weight_unit,
-            velocity_std=velocity_std,
+            velocity_std=self.velocity_std,
             acceleration_std=self.acceleration_std,
         )
         self.decoder: Accelerations

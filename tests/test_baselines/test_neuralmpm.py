@@ -571,7 +571,7 @@ def test_a_known_network_has_a_known_rollout() -> None:
     """Drag takes a share of the velocity before a bundle in each of its frames."""
     model = surrogate(materials=[0], smoothing=0.0)
     rate = 0.1
-    drag_rate = rate * model.speed / model.acceleration_std
+    drag_rate = rate * model.velocity_std / model.acceleration_std
     model.network = Drag(drag_rate, 2)
     velocity = (4e-3, -2e-3)
     window = liquid(drift(velocity, 3))
@@ -599,7 +599,7 @@ def test_images_roll_out_as_images() -> None:
     The network of this test knows none either.
     """
     model = surrogate(materials=[0], smoothing=0.2)
-    drag_rate = -0.5 * model.speed / model.acceleration_std
+    drag_rate = -0.5 * model.velocity_std / model.acceleration_std
     model.network = Drag(drag_rate, 2)
     frames = swirl(0, 3, (0.2, 0.2))
     window = liquid(frames)
