@@ -270,21 +270,23 @@ class NodalStress:
         is_beside_x_wall = ghost_i != i
         is_beside_y_wall = ghost_j != j
         # Walls across x slide along y, and the other way round.
-        speed_y = self.walls.doubled_speed(s, 0, ghost_i)
-        speed_x = self.walls.doubled_speed(s, 2, ghost_j)
         if is_beside_x_wall:
             image = self.sums_at(s, ghost_i, j)
             count = from_fixed(image[2], self.count_unit)
+            speed_y = self.walls.doubled_speed(s, 0, ghost_i)
             total += ti.Vector([-1, tangential, 1, 1]) * image
             drag[1] += speed_y * count
         if is_beside_y_wall:
             image = self.sums_at(s, i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
+            speed_x = self.walls.doubled_speed(s, 2, ghost_j)
             total += ti.Vector([tangential, -1, 1, 1]) * image
             drag[0] += speed_x * count
         if is_beside_x_wall and is_beside_y_wall:
             image = self.sums_at(s, ghost_i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
+            speed_x = self.walls.doubled_speed(s, 2, ghost_j)
+            speed_y = self.walls.doubled_speed(s, 0, ghost_i)
             total += ti.Vector([-tangential, -tangential, 1, 1]) * image
             drag[0] += speed_x * count
             drag[1] += speed_y * count
