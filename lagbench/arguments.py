@@ -227,29 +227,39 @@ def _check_path(name: str, value: object, *, where: str) -> None:
     """Refuse the path of a file that no disk can hold; addresses have other limits.
 
     Raises:
-        UsageError: the path is too long, or has a zero character.
+        UsageError: the path is too long, or has a character that no name can have.
     """
     if not isinstance(value, str | os.PathLike):
         return
     path = os.fspath(value)
     if not isinstance(path, str) or "://" in path:
         return
-    try:
-        encoded = path.encode("utf-8", "surrogateescape")
-    except UnicodeEncodeError:
-        # half of a character: no name of a file, like the zero character
-        encoded = b"\0"
-    longest_name = max(len(part) for part in encoded.split(b"/"))
-    is_too_long = longest_name > MOST_NAME_BYTES or len(encoded) > MOST_PATH_BYTES
-    if is_too_long or b"\0" in encoded:
+    if not _can_name_file(path):
         raise UsageError(
             "no file can have that name",
             where=f"{where}, {name}",
             expected=f"names of at most {MOST_NAME_BYTES} bytes in a path of at most "
-            f"{MOST_PATH_BYTES}, without zero characters",
+            f"{MOST_PATH_BYTES}, without zero characters and halves of characters",
             got=f"{_shorten(path)}, {len(path)} characters",
             fix="use another name",
         )
+
+
+def _can_name_file(path: str) -> bool:
+    """Say whether a file on a disk can have a path.
+
+    >>> _can_name_file("runs/a.nc"), _can_name_file("a\\0.nc"), _can_name_file("\\ud83d")
+    (True, False, False)
+    """
+    if "\0" in path:
+        return False
+    try:
+        encoded = path.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:
+        # half of a character, which has no bytes
+        return False
+    longest_name = max(len(part) for part in encoded.split(b"/"))
+    return longest_name <= MOST_NAME_BYTES and len(encoded) <= MOST_PATH_BYTES
 
 
 def find_kinds(annotation: str) -> tuple[ArgumentKind, ...]:

@@ -9,6 +9,7 @@ import typer
 
 from lagbench.data.local import locate
 from lagbench.errors import UsageError
+from lagbench.figures.canvas import COARSEST, DPI, FINEST
 from lagbench.figures.pictures import (
     SCENARIO_ENDING,
     animate,
@@ -26,6 +27,8 @@ from .options import (
     option,
 )
 from .output import print_result
+
+LAST_FRAME = -1
 
 SourceArgument = Annotated[
     str | None,
@@ -48,8 +51,9 @@ def plot_command(
     size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
     frame: Annotated[
-        int, option("--frame", "Frame number; -1 is the last frame.")
-    ] = -1,
+        int | None,
+        option("--frame", "Frame number; -1, the default, is the last frame."),
+    ] = None,
     kind: Annotated[
         str,
         option(
@@ -63,20 +67,21 @@ def plot_command(
     ] = False,
     output: OutputOption = None,
     dpi: Annotated[
-        int,
+        float,
         option(
             "--dpi",
             "Pixels per inch of PNG files, and of particles in PDF files.",
-            min=32,
-            max=1200,
+            min=COARSEST,
+            max=FINEST,
         ),
-    ] = 128,
+    ] = DPI,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
     if sheet:
+        _refuse_choice_of_one(scenario, frame)
         split_name = choose_split(source, split)
         tier = locate(split_name, size, root=root).size
         page = output or Path(f"{tier.split}-{tier.name}-sheet.png")
@@ -87,13 +92,30 @@ def plot_command(
             _choose_source(source, split),
             size=size,
             scenario=scenario,
-            frame=frame,
+            frame=LAST_FRAME if frame is None else frame,
             kind=kind,
             output=output,
             dpi=dpi,
             root=root,
         )
     print_result({"output": path}, [str(path)], as_json=as_json, quiet=quiet)
+
+
+def _refuse_choice_of_one(scenario: int | None, frame: int | None) -> None:
+    """Refuse a scenario or a frame beside --sheet, which would be left out in silence.
+
+    Raises:
+        UsageError: one of them is given.
+    """
+    for name, number in (("--scenario", scenario), ("--frame", frame)):
+        if number is not None:
+            raise UsageError(
+                "a sheet shows many scenarios, at frames that suit the split",
+                where=f"--sheet and {name}",
+                expected="one of the two",
+                got=f"--sheet {name} {number}",
+                fix=f"leave {name} out, or leave --sheet out to draw one frame",
+            )
 
 
 def animate_command(

@@ -153,3 +153,30 @@ def test_whole_numbers_of_numpy_name_scenarios_and_steps(
         quiet=True,
     )
     assert film.is_file()
+
+
+@pytest.mark.parametrize(("option", "number"), [("--scenario", 4), ("--frame", 5)])
+def test_a_sheet_refuses_the_choice_of_one(
+    option: str, number: int, run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """A sheet shows all scenarios: the number would be left out in silence."""
+    sheet = tmp_path / "sheet.png"
+    words = ("plot", SPLIT, "--size", SIZE, "--root", generated.root, "--sheet")
+    result = run(*words, option, number, "-o", sheet)
+    assert result.exit_code == 2, result.output
+    assert option in result.stderr
+    assert not sheet.exists()
+
+
+def test_the_command_takes_fractions_of_pixels_per_inch_as_python_does(
+    run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    file = generated.folder / "test" / "0003.nc"
+    options = {"frame": 5, "kind": "speed"}
+    drawn = lagbench.plot(file, output=tmp_path / "python.png", dpi=72.5, **options)
+    typed = tmp_path / "command.png"
+    words = ("plot", file, "--frame", 5, "--kind", "speed", "-o", typed)
+    result = run(*words, "--dpi", 72.5)
+    assert result.exit_code == 0, result.output
+    assert typed.read_bytes() == drawn.read_bytes()
+    assert run(*words, "--dpi", "nan").exit_code == 2
