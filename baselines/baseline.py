@@ -127,7 +127,7 @@ class Baseline(nn.Module):
                 where=f"the box of {info.split} {info.size}",
                 expected="walls along every axis",
                 got=f"periodic along {', '.join(info.periodic)}",
-                fix="train neuralmpm, or a graph network such as gns",
+                fix=self._fix_box(),
             )
         if len(info.bounds) != 2 and not self.any_box:
             raise UsageError(
@@ -135,11 +135,22 @@ class Baseline(nn.Module):
                 where=f"the box of {info.split} {info.size}",
                 expected="bounds of x and y",
                 got=f"{len(info.bounds)} axes",
-                fix="train neuralmpm, or a graph network such as gns",
+                fix=self._fix_box(),
             )
         self.options = options
         self.info = info
         self.box = TensorBox(info.box)
+
+    def _fix_box(self) -> str:
+        """Return what helps where the model does not know a box."""
+        advice = "train neuralmpm, or a graph network such as gns"
+        package = type(self).__module__
+        if not package.startswith("lagbench."):
+            advice += (
+                f"; or, if {type(self).__name__} of {package} knows such boxes, state "
+                "any_box = True in its class"
+            )
+        return advice
 
     @classmethod
     def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:

@@ -10,6 +10,7 @@ Importing lagbench loads nothing else; each name below loads its module on first
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from lagbench.store.dataset import list_splits, load_manifest, open_split
     from lagbench.store.windows import windows
 
-    from . import submission
+    from . import errors, submission
     from .submission import template, validate
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "adopt",
     "animate",
     "compare",
+    "errors",
     "generate",
     "list_splits",
     "load_manifest",
@@ -69,14 +71,15 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         value = version("lagbench")
-    elif name == "submission":
-        value = importlib.import_module(".submission", __name__)
+    elif name in ("errors", "submission"):
+        value = importlib.import_module(f".{name}", __name__)
     elif name in _MODULES:
         module = importlib.import_module(f".{_MODULES[name]}", __name__)
         value = getattr(module, name)
     else:
         message = f"module {__name__!r} has no attribute {name!r}"
-        raise AttributeError(message)
+        # with name and module Python asks "Did you mean ...?"
+        raise AttributeError(message, name=name, obj=sys.modules[__name__])
     globals()[name] = value
     return value
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lagbench.data.box import Box
+from lagbench.data.summary import summarise_arrays
 from lagbench.errors import UsageError
 
 
@@ -114,8 +115,12 @@ class TensorWindow(NamedTuple):
     # Coulomb friction of the walls [1]; None where the file states none
     friction: float | None = None
 
+    def __repr__(self) -> str:
+        """Return the names and shapes of what the window holds."""
+        return summarise_arrays("Window", self._asdict())
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Batch:
     """Several windows of consecutive frames, their particles in one row."""
 
@@ -148,6 +153,10 @@ class Batch:
     # Coulomb friction of the walls in each window [1], float64, shape [window]; None
     # where the files state none
     friction: Tensor | None = None
+
+    def __repr__(self) -> str:
+        """Return the names and shapes of what the batch holds."""
+        return summarise_arrays("Batch", vars(self))
 
     @property
     def windows(self) -> int:

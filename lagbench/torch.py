@@ -170,6 +170,14 @@ class WindowSampler(Sampler[int]):
         self.epoch = 0  # the present epoch
         self.position = 0  # windows of its order that the ranks together have drawn
 
+    def __repr__(self) -> str:
+        """Return the windows, the seed, and the place in the order."""
+        return (
+            f"<WindowSampler: windows {len(self.data)}, seed {self.seed}, "
+            f"epoch {self.epoch}, position {self.position}, "
+            f"rank {self.rank} of {self.ranks}>"
+        )
+
     def __len__(self) -> int:
         """Return the windows of a whole epoch for one rank."""
         return len(self.data) // self.ranks

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter, ValidationError
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import subset_hash
@@ -311,7 +311,7 @@ def close(
     """
     folder = Folder(board)
     folder.require()
-    _check_options(name, scenarios)
+    _check_options(name, scenarios=scenarios, source=source, budget=budget)
     described = load_rooted_registry(resolve_root(root), registry)
     with board_lock(folder):
         _require_open(folder, name)
@@ -355,7 +355,14 @@ def close(
     return season
 
 
-def _check_options(name: str, scenarios: int) -> None:
+def _check_options(
+    name: str, *, scenarios: int, source: str, budget: float | None
+) -> None:
+    """Refuse options that a file of a season cannot hold, before models are hashed.
+
+    Raises:
+        UsageError: one of them does not fit.
+    """
     if not FEWEST_SCENARIOS <= scenarios <= MOST_SCENARIOS:
         raise UsageError(
             "this number of blind scenarios is not possible",
@@ -364,14 +371,26 @@ def _check_options(name: str, scenarios: int) -> None:
             got=scenarios,
             fix=f"give a number from {FEWEST_SCENARIOS} on",
         )
-    if Path(name).name != name or name.startswith("."):
+    name_rule = "small letters, digits and single hyphens, as in spring-2027"
+    _check_option(Name, name, where="NAME", expected=name_rule)
+    source_rule = "one line of printable text, of at most 200 characters"
+    _check_option(Line, source, where="--source", expected=source_rule)
+    if budget is not None:
+        budget_rule = "a number of seconds"
+        _check_option(Number, budget, where="--budget", expected=budget_rule)
+
+
+def _check_option(kind: object, value: object, *, where: str, expected: str) -> None:
+    try:
+        TypeAdapter(kind).validate_python(value)
+    except ValidationError:
         raise UsageError(
-            "this cannot be the name of a season",
-            where="NAME",
-            expected="small letters, digits and single hyphens, as in spring-2027",
-            got=ascii(name)[:80],
-            fix="name it otherwise",
-        )
+            "an option of the season does not fit",
+            where=where,
+            expected=expected,
+            got=ascii(value)[:80],
+            fix=f"give another {where}",
+        ) from None
 
 
 def _require_open(folder: Folder, name: str) -> None:

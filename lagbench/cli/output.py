@@ -182,13 +182,8 @@ def print_table(
     has two spaces between columns instead of three.
     """
     cells = [[str(cell) for cell in row] for row in rows]
-    table_title = None
-    if title:
-        table_title = Text(title)
     table = DrawnTable(
-        title=table_title,
         box=SIMPLE_HEAD,
-        title_justify="left",
         padding=(0, 1, 0, 0) if is_narrow else (0, 1),
         pad_edge=False,
         show_edge=False,
@@ -209,7 +204,11 @@ def print_table(
     gap = NARROW_GAP if is_narrow else GAP
     least_width = _least_width(columns, cells, gap=gap, last_column=last_column)
     width = max(_output_width(), least_width)
-    Console(width=width).print(table, "")
+    console = Console(width=width)
+    if title:
+        # beside the table, not in it: a table wraps its title to its own width
+        console.print(Text(title, style="table.title"))
+    console.print(table, "")
 
 
 def _output_width() -> int:

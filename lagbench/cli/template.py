@@ -37,8 +37,12 @@ def template_command(
     result = template(split, size, output=output, overwrite=overwrite, root=root)
     first, last = result.frames
     scenarios = format_count(len(result.scenarios), "scenario")
+    fewest, most = result.particle_range
+    particles = str(most)
+    if fewest < most:
+        particles = f"{fewest} to {most}"
     line = (
         f"{result.path}: {scenarios}, frames {first} to {last}, "
-        f"{result.particles} particles, {format_bytes(result.bytes)}"
+        f"{particles} particles, {format_bytes(result.bytes)}"
     )
     print_result(result, [line], as_json=as_json, quiet=quiet)

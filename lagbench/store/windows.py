@@ -26,6 +26,7 @@ from lagbench.data.local import locate, suggest_repair
 from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import damage_error, parse_viscosity
+from lagbench.data.summary import summarise_arrays
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
 from .copy import scenario_files
@@ -333,6 +334,10 @@ class Window(NamedTuple):
     body_force: NDArray[np.float32] | None = None
     # centre and radius of a fixed obstacle [length], shape [axis + 1]; None without one
     obstacle: NDArray[np.float32] | None = None
+
+    def __repr__(self) -> str:
+        """Return the names and shapes of what the window holds."""
+        return summarise_arrays("Window", self._asdict())
 
 
 def _check_bytes(value: float, name: str) -> None:

@@ -593,7 +593,9 @@ class TemplateResult:
     scenarios: tuple[int, ...]
     # absolute numbers of the first and the last frame to predict
     frames: tuple[int, int]
-    particles: int
+    particles: int  # of the scenario with the most
+    # least and greatest number of particles of a predicted scenario
+    particle_range: tuple[int, int]
     bytes: int
 
 
@@ -638,9 +640,11 @@ def template(
         registry=splits,
     )
     scenarios = tuple(sorted(entry.subsets["test"]))
+    particle_counts = []
     with writer:
         for scenario in scenarios:
             last_given = truth.given_frames(scenario)[-1]
+            particle_counts.append(len(last_given))
             writer.add(scenario, np.broadcast_to(last_given, writer.shape_of(scenario)))
     frames = frames_to_predict(entry)
     return TemplateResult(
@@ -650,6 +654,7 @@ def template(
         scenarios=scenarios,
         frames=(frames[0], frames[-1]),
         particles=entry.particles,
+        particle_range=(min(particle_counts), max(particle_counts)),
         bytes=writer.path.stat().st_size,
     )
 

@@ -314,6 +314,9 @@ def test_the_commands_say_what_is_wrong(
     for words in (
         ("season", "close", SEASON),
         ("season", "close", "../../x"),
+        ("season", "close", "Spring 2027"),
+        ("season", "close", "next", "--source", "two\nlines"),
+        ("season", "close", "next", "--budget", "nan"),
         ("season", "close", SEASON, "--value", "1"),
         ("season", "run", "nobody"),
         ("generate", "--season", "nobody"),

@@ -15,6 +15,7 @@ from typer.testing import CliRunner, Result
 
 import lagbench
 from lagbench.__main__ import app
+from lagbench.cli.output import print_table
 from lagbench.data.registry import default_path
 
 Run = Callable[..., Result]
@@ -298,3 +299,11 @@ def test_letters_that_a_stream_lacks_are_escaped() -> None:
     done = CliRunner(charset="ascii").invoke(app, line.split())
     assert done.exit_code == 0
     assert "\\xf7" in done.stdout
+
+
+def test_a_title_is_not_wrapped_to_the_width_of_its_table(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    title = "a title of many more characters than the table below it has"
+    print_table(title, ("a", "b"), [("1", "2")])
+    assert capsys.readouterr().out.splitlines()[0] == title

@@ -95,8 +95,9 @@ def test_the_public_names_are_described(site: Path) -> None:
     entry with its text.
     """
     text = (site / "api.html").read_text()
-    functions = set(lagbench.__all__) - {"__version__", "submission"}
+    functions = set(lagbench.__all__) - {"__version__", "errors", "submission"}
     names = {f"lagbench.{name}" for name in functions} | {"lagbench.submission.write"}
+    names |= {"lagbench.errors.LagbenchError", "lagbench.errors.DataError"}
     classes = (
         "WindowDataset",
         "WindowSampler",

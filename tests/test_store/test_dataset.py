@@ -17,7 +17,7 @@ import lagbench
 from lagbench.data import registry
 from lagbench.data.manifest import build_manifest, write_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.store.dataset import list_splits, load_manifest, open_split
 
 TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
@@ -264,5 +264,9 @@ def test_public_names_load_on_first_use() -> None:
     assert set(lagbench.__all__) <= set(dir(lagbench))
     assert lagbench.open_split is open_split
     assert lagbench.__version__[0].isdigit()
-    with pytest.raises(AttributeError):
+    assert lagbench.errors.LagbenchError is LagbenchError
+    with pytest.raises(AttributeError) as caught:
         lagbench.opensplit  # noqa: B018
+    # of these two Python forms "Did you mean: 'open_split'?"
+    assert caught.value.name == "opensplit"
+    assert caught.value.obj is lagbench

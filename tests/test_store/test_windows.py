@@ -191,6 +191,25 @@ def test_windows_say_what_they_hold(train: Open) -> None:
         assert "2 given + 1 to predict" in text
 
 
+def test_a_window_and_a_batch_say_what_they_hold(
+    train: Open, root: Path, registry: Registry
+) -> None:
+    """One line of names and shapes, however many particles there are."""
+    data = train(history=2, future=1)
+    batch = collate([data[0], data[1]])
+    particle_count = len(data[0].position)
+    assert f"position [{particle_count}, 3, 2]" in repr(data[0])
+    assert f"position [{2 * particle_count}, 3, 2]" in repr(batch)
+    sampler = WindowSampler(data, seed=7)
+    assert "seed 7" in repr(sampler)
+    arrays = lagbench.windows(
+        "cavity", size="tiny", root=root, registry=registry, history=2, future=1
+    )
+    for held in (data[0], batch, sampler, arrays[0]):
+        assert "\n" not in repr(held)
+        assert len(repr(held)) < 400
+
+
 def test_windows_have_the_first_frame_on_request(train: Open) -> None:
     data = train()
     with_origin = train(origin=True)
