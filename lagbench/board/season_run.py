@@ -28,6 +28,7 @@ from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
+from lagbench.scoring.boards import board_option
 from lagbench.scoring.references import check_train
 from lagbench.scoring.scenario import measure_rows, predict_reference
 from lagbench.scoring.score_file_checks import read_score_file
@@ -272,6 +273,7 @@ class _SeasonRun:
         fix = (
             f"lagbench generate --season {self.season.season} "
             f"--split {data_set.split} --size {data_set.size}"
+            f"{board_option(self.folder.path)}"
         )
         missing = []
         for scenario in data_set.ids:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
@@ -43,6 +43,19 @@ def choose_data_sets(
     )
 
 
+def _suggest_entry(name: str, known: Iterable[str]) -> str:
+    """Return a hint that names entries of a method, or the nearest entry.
+
+    >>> _suggest_entry("gns", ["cavity/mini/gns", "cavity/mini/gat"])
+    'name its data set too: cavity/mini/gns'
+    """
+    names = sorted(known)
+    of_method = [entry for entry in names if entry.rpartition("/")[2] == name]
+    if of_method:
+        return f"name its data set too: {', '.join(of_method)}"
+    return suggest_name(name, names)
+
+
 def choose_entries(
     folder: Folder,
     names: Sequence[str],
@@ -71,7 +84,7 @@ def choose_entries(
                     where=str(folder.path),
                     expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
                     got=name,
-                    fix=suggest_name(key, known),
+                    fix=_suggest_entry(key, known),
                 )
             entry = read_entry(folder.path / known[key])
             if not has_models(entry):

@@ -29,7 +29,7 @@ from lagbench.board.season_table import (
 )
 from lagbench.errors import ChecksFailedError, UsageError, format_count
 from lagbench.figures.tables import Table
-from lagbench.scoring.boards import find_board
+from lagbench.scoring.boards import board_option, find_board
 
 from .options import (
     DEFAULT_BOARD,
@@ -114,11 +114,11 @@ def close_command(
             lagbench=version("lagbench"),
         )
     path = board / season_path(name)
-    lines = _describe_season(season, path)
+    lines = _describe_season(season, path, board)
     print_result(season.model_dump(mode="json"), lines, as_json=as_json, quiet=quiet)
 
 
-def _describe_season(season: Season, path: Path) -> Iterator[str]:
+def _describe_season(season: Season, path: Path, board: Path) -> Iterator[str]:
     for data_set in season.data_sets:
         models = sum(len(entry.models) for entry in data_set.entries)
         seed = data_set.draw_seed or "none yet"
@@ -131,11 +131,13 @@ def _describe_season(season: Season, path: Path) -> Iterator[str]:
     if season.is_waiting:
         yield f"the seeds wait for: {season.source}"
     else:
-        yield (
-            "commit the file, then: "
-            f"lagbench generate --season {season.season}; "
-            f"lagbench season run {season.season}"
-        )
+        commands = _commands_after_close(season.season, board)
+        yield f"commit the file, then: {commands}"
+
+
+def _commands_after_close(name: str, board: Path) -> str:
+    place = f"{name}{board_option(board)}"
+    return f"lagbench generate --season {place}; lagbench season run {place}"
 
 
 def run_command(
@@ -234,7 +236,7 @@ def show_command(
             where=str(board / season_path(name, SEASON_SCORES)),
             expected="the scores of its run",
             got="no such file",
-            fix=f"lagbench generate --season {name}; lagbench season run {name}",
+            fix=_commands_after_close(name, board),
         )
     rows = season_rows(season, scores)
     if as_json:
@@ -242,7 +244,7 @@ def show_command(
     elif as_markdown:
         print_line(markdown_table(rows))
     else:
-        print_tables(_tables(name, rows))
+        print_tables(_tables(name, rows), is_narrow=True)
 
 
 def _tables(name: str, rows: tuple[SeasonRow, ...]) -> Iterator[Table]:
@@ -266,12 +268,7 @@ def _tables(name: str, rows: tuple[SeasonRow, ...]) -> Iterator[Table]:
                     str(row.blind_scenarios),
                 )
             )
-        columns = (
-            "entry",
-            "public skill",
-            "blind skill",
-            "gap [95 %]",
-            "seeds",
-            "blind scenarios",
-        )
-        yield Table(f"season {name}: {split} {size}", columns, tuple(cells))
+        # short headings: the table fits a terminal of 80 characters
+        columns = ("entry", "public", "blind", "gap [95 %]", "seeds", "scenarios")
+        title = f"season {name}: {split} {size}, public and blind skill"
+        yield Table(title, columns, tuple(cells))

@@ -129,6 +129,7 @@ class Recording:
         variables: set[str],
         read: Read,
         registry: Registry,
+        file: str | None = None,
     ) -> None:
         """Read what holds for all frames.
 
@@ -139,6 +140,10 @@ class Recording:
             variables: names of the recorded variables.
             read: returns a variable at one or several frames.
             registry: where the split is described.
+            file: path of the scenario file, for messages; None where it is not known.
+
+        Raises:
+            DataError: the obstacle has no place or no size.
         """
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
         self.title = registry.split(self.size.split).title
@@ -158,17 +163,19 @@ class Recording:
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         # centre and radius of a fixed obstacle [length]; None without one
-        self.obstacle = self._obstacle(read, variables)
+        self.obstacle = self._obstacle(read, variables, file)
         self._has_velocity = "velocity" in variables
         self._particle_mass = float(read("particle_mass", slice(None)))
 
-    def _obstacle(self, read: Read, variables: set[str]) -> NDArray[np.float32] | None:
+    def _obstacle(
+        self, read: Read, variables: set[str], file: str | None
+    ) -> NDArray[np.float32] | None:
         """Return centre and radius of the obstacle that a file or data set states."""
         if "obstacle" in variables:
             stated = read("obstacle", slice(None))
             return np.asarray(stated, np.float32)
         size = self.size
-        where = f"{size.split} {size.name}, scenario {self.scenario}"
+        where = file or f"{size.split} {size.name}, scenario {self.scenario}"
         return parse_obstacle(self.parameters, size.dimension, where=where)
 
     @property
@@ -293,6 +300,7 @@ def open_recording(
             variables={*file.variables},
             read=file.read,
             registry=_registry_around(source, registry),
+            file=str(source),
         )
 
 

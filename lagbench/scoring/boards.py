@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from difflib import get_close_matches
@@ -46,6 +47,18 @@ def find_board(board: str | Path | None = None, *, reads: bool = False) -> Path:
     if not defaults:
         raise no_board()
     return defaults[0]
+
+
+def board_option(board: str | Path) -> str:
+    """Return what a command needs to find a leaderboard: no text for the default one.
+
+    >>> board_option("elsewhere/a board")
+    " --board 'elsewhere/a board'"
+    """
+    defaults = [folder for folder in DEFAULT_BOARDS if is_board(folder)]
+    if defaults and Path(board).resolve() == defaults[0].resolve():
+        return ""
+    return f" --board {shlex.quote(str(board))}"
 
 
 def is_board(folder: Path) -> bool:

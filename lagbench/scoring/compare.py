@@ -7,10 +7,11 @@ are reported. With one seed of each method these weights are compared, not metho
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -463,6 +464,8 @@ def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -
         fix = f"{name} is a reference of other data sets; {fix}"
     elif others:
         fix = f"{name} is an entry of {', '.join(others)}; {fix}"
+    elif entries and "did you mean" not in fix:
+        fix = f"{_name_nearest_entry(name, entries)}{fix}"
     elif not entries:
         fix = f"no leaderboard is found: --board FOLDER names one; {fix}"
     raise UsageError(
@@ -472,6 +475,19 @@ def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -
         got=ascii(name),
         fix=fix,
     )
+
+
+def _name_nearest_entry(name: str, entries: Iterable[Place]) -> str:
+    """Return the beginning of a hint: a near name and its data sets; else no text."""
+    methods = {method for _, _, method in entries}
+    close_methods = difflib.get_close_matches(name, sorted(methods), n=1, cutoff=0.75)
+    if not close_methods:
+        return ""
+    data_sets = []
+    for split, size, method in entries:
+        if method == close_methods[0]:
+            data_sets.append(f"{split} {size}")
+    return f"did you mean {close_methods[0]}, an entry of {', '.join(data_sets)}? "
 
 
 def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> None:

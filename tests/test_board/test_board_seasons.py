@@ -326,3 +326,9 @@ def test_the_commands_say_what_is_wrong(
     shown = run("season", "show", SEASON, "--markdown", "--board", own.folder)
     assert shown.exit_code == 0
     assert "gns" in shown.stdout
+    table = run("season", "show", SEASON, "--board", own.folder)
+    assert table.stdout.count("entry") == 1
+    (own.folder / "seasons" / SEASON / "scores.yaml").unlink()
+    early = run("season", "show", SEASON, "--board", own.folder)
+    assert early.exit_code == 1
+    assert f"generate --season {SEASON} --board {own.folder}" in early.stderr

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
@@ -94,6 +96,23 @@ def test_a_named_file_that_cannot_be_read_exits_3(
         assert result.exit_code == 3, result.output
         assert name in result.stderr
         assert "lagbench plot cavity" in result.stderr
+
+
+def test_a_named_file_with_an_impossible_obstacle_exits_3(
+    run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """The message names the file, as for every other damage."""
+    file = tmp_path / "scene.nc"
+    shutil.copy(generated.folder / "test" / "0003.nc", file)
+    place = {"obstacle_x": 0.5, "obstacle_y": 0.5, "obstacle_diameter": 0.0}
+    with h5py.File(file, "r+") as scene:
+        names = [scene.attrs["hashed_parameters"].decode(), *place]
+        scene.attrs["hashed_parameters"] = np.bytes_(" ".join(names).encode())
+        for name, value in place.items():
+            scene.attrs[name] = value
+    result = run("plot", file, "-o", tmp_path / "a.png")
+    assert result.exit_code == 3, result.output
+    assert "scene.nc" in result.stderr
 
 
 @pytest.mark.parametrize(

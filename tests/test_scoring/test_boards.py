@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lagbench.errors import UsageError
-from lagbench.scoring.boards import find_board, require_board
+from lagbench.scoring.boards import board_option, find_board, require_board
 
 
 @pytest.fixture
@@ -45,3 +45,8 @@ def test_no_other_leaderboard_is_offered_to_write_into(board: str, here: Path) -
         with pytest.raises(UsageError) as caught:
             find(board)
         assert "root of the clone" in str(caught.value.fix)
+
+
+def test_a_command_names_a_board_that_is_not_the_default(here: Path) -> None:
+    assert board_option(here / "leaderboard") == ""
+    assert board_option("autumn-board") == " --board autumn-board"

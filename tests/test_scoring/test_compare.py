@@ -415,10 +415,13 @@ def test_only_references_of_the_data_set_are_offered(
     assert "ballistic" not in known
 
 
+@pytest.mark.parametrize("name", ["elsewhere", "elsewere"])
 def test_an_entry_of_another_data_set_is_named(
-    scored: Folders, entries: Path, bench: ScoreBench
+    name: str, scored: Folders, entries: Path, bench: ScoreBench
 ) -> None:
-    """The README's line, typed for another size, says where the entry stands."""
+    """The README's line, typed for another size, says where the entry stands; a
+    misspelt name does too.
+    """
     folder = entries / "scores" / "fluid" / "mini"
     folder.mkdir(parents=True)
     here = entries / "scores" / bench.size.split / bench.size.name / "moving.nc"
@@ -426,11 +429,12 @@ def test_an_entry_of_another_data_set_is_named(
     with pytest.raises(UsageError) as caught:
         compare(
             scored["still"] / "predictions.nc",
-            "elsewhere",
+            name,
             board=entries,
             root=bench.root,
             registry=bench.registry,
         )
+    assert "elsewhere" in str(caught.value.fix)
     assert "fluid mini" in str(caught.value.fix)
 
 
