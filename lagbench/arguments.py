@@ -246,10 +246,10 @@ def _check_path(name: str, value: object, *, where: str) -> None:
 
 
 def _can_name_file(path: str) -> bool:
-    """Say whether a file on a disk can have a path.
+    r"""Say whether a file on a disk can have a path.
 
-    >>> _can_name_file("runs/a.nc"), _can_name_file("a\\0.nc"), _can_name_file("\\ud83d")
-    (True, False, False)
+    >>> [_can_name_file(path) for path in ("runs/a.nc", "a\0.nc", "\ud83d")]
+    [True, False, False]
     """
     if "\0" in path:
         return False

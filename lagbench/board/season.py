@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -26,9 +27,9 @@ from lagbench.atomic import write_atomically
 from lagbench.data.checksums import subset_hash
 from lagbench.data.layout import SEASON_PREFIX
 from lagbench.data.local import load_rooted_registry, resolve_root
-from lagbench.data.registry import Measured, Registry, Size, Split
+from lagbench.data.registry import Measured, Registry, Size, Split, load
 from lagbench.errors import ChecksFailedError, UsageError, suggest_name
-from lagbench.metrics.table import ranking_metric
+from lagbench.metrics.table import RANKING, ranking_metric
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE
 from lagbench.scoring.skill import best_reference
@@ -229,8 +230,37 @@ def read_season(folder: Folder, name: str) -> Season:
             got=format_issues(issues),
             fix="restore the file that `lagbench season close` wrote",
         )
+    for data_set in season.data_sets:
+        _check_measures(data_set, file)
     _check_seeds(season, file, name)
     return season
+
+
+def _check_measures(data_set: SeasonDataSet, file: Path) -> None:
+    """Refuse a metric that does not rank, and a reference that is not naive.
+
+    Raises:
+        ChecksFailedError: one of them is not what closing a season writes.
+    """
+    ranking_metrics = sorted(RANKING.values())
+    with suppress(UsageError):
+        # the split is known: only its own metric ranks
+        size = load().size(data_set.split, data_set.size)
+        if is_same_data(data_set, size):
+            ranking_metrics = [ranking_metric(size)]
+    place = f"{file}, {data_set.split} {data_set.size}"
+    for key, value, known in (
+        ("metric", data_set.metric, ranking_metrics),
+        ("reference", data_set.reference, sorted(NAIVE)),
+    ):
+        if value not in known:
+            raise ChecksFailedError(
+                f"the {key} of a season is not one that `lagbench season close` writes",
+                where=f"{place}, key {key}",
+                expected=" or ".join(known),
+                got=ascii(value),
+                fix="restore the file that `lagbench season close` wrote",
+            )
 
 
 def _check_seeds(season: Season, file: Path, name: str) -> None:
@@ -380,7 +410,13 @@ def _check_options(
         _check_option(Number, budget, where="--budget", expected=budget_rule)
 
 
-def _check_option(kind: object, value: object, *, where: str, expected: str) -> None:
+def _check_option(
+    kind: Any,  # noqa: ANN401 (an annotated type)
+    value: object,
+    *,
+    where: str,
+    expected: str,
+) -> None:
     try:
         TypeAdapter(kind).validate_python(value)
     except ValidationError:

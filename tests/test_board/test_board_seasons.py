@@ -262,6 +262,9 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
     [
         ("season.yaml", "draw_seed: ", "draw_seed: 0"),
         ("season.yaml", "season: trial", "season: other"),
+        ("season.yaml", "metric: vorticity_nrmse", "metric: nonsense"),
+        ("season.yaml", "metric: vorticity_nrmse", "metric: cloud_distance"),
+        ("season.yaml", "reference: ", "reference: x"),
         ("scores.yaml", "1003:", "1004:"),
         ("scores.yaml", "seed: 0", "seed: 1"),
     ],
@@ -272,7 +275,9 @@ def test_an_edited_season_is_found(
     old: str,
     new: str,
 ) -> None:
-    """Seeds, names, scenarios and models follow from the frozen models."""
+    """Seeds, names, scenarios and models follow from the frozen models; metric and
+    reference from the data set.
+    """
     path = own.folder / "seasons" / SEASON / file
     text = path.read_text().replace(old, new)
     if new == "draw_seed: 0":
