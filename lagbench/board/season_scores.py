@@ -23,7 +23,8 @@ from .season import (
     season_path,
 )
 
-Values = Annotated[dict[int, Number], Field(max_length=1000)]
+# every metric that ranks is an error: not less than 0
+Values = Annotated[dict[int, Annotated[Number, Field(ge=0.0)]], Field(max_length=1000)]
 
 
 class ModelScores(Strict):

@@ -71,7 +71,7 @@ def dataset_lock(
     except OSError as error:
         raise WorkFailedError(
             "cannot write there, so the data set cannot be locked",
-            where=str(folder),
+            where=str(error.filename or folder),
             expected="a folder that can be written to",
             got=error.strerror or error,
             fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
@@ -85,7 +85,8 @@ def dataset_lock(
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())
         yield
     finally:
-        (folder / HOLDER_NAME).unlink(missing_ok=True)
+        with suppress(OSError):
+            (folder / HOLDER_NAME).unlink(missing_ok=True)
         lock.release()
 
 

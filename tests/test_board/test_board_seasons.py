@@ -266,6 +266,7 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
         ("season.yaml", "metric: vorticity_nrmse", "metric: cloud_distance"),
         ("season.yaml", "reference: ", "reference: x"),
         ("scores.yaml", "1003:", "1004:"),
+        ("scores.yaml", "1003: 0.0", "1003: -0.0"),
         ("scores.yaml", "seed: 0", "seed: 1"),
     ],
 )

@@ -130,3 +130,20 @@ def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
         assert read_holder(folder) is None
     with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
         pass
+
+
+@pytest.mark.parametrize("name", [".lock", ".lock.holder.json"])
+def test_a_folder_in_the_place_of_a_file_of_the_lock_is_told(
+    name: str, tmp_path: Path
+) -> None:
+    folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
+    (folder / name).mkdir(parents=True)
+    with (
+        pytest.raises(WorkFailedError) as caught,
+        dataset_lock(tmp_path, "cavity", "tiny", 1),
+    ):
+        pass
+    assert name in str(caught.value.where)
+    (folder / name).rmdir()
+    with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+        pass
