@@ -23,6 +23,7 @@ from lagbench.errors import (
     ChecksFailedError,
     UnreadableFileError,
     UsageError,
+    suggest_file,
     suggest_name,
 )
 from lagbench.submission.issues import quote
@@ -78,7 +79,7 @@ def load_plain(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: A
             where=str(path),
             expected="a file that can be read",
             got=error.strerror,
-            fix="check the path and that you may read the file",
+            fix=suggest_file(path) or "check the path and that you may read the file",
         ) from error
 
     if is_regular and length <= longest:

@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from lagbench.errors import UnreadableFileError, check_regular, suggest_file
+from lagbench.errors import UnreadableFileError, check_regular
 
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
@@ -117,15 +117,12 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
-        hint = None
-        if isinstance(error, FileNotFoundError):
-            hint = suggest_file(path)
         raise UnreadableFileError(
             "cannot read the YAML file",
             where=str(path),
             expected="a file that can be read",
             got=error.strerror or error,
-            fix=hint or "check the path and that you may read the file",
+            fix="check the path and that you may read the file",
         ) from error
     # PyYAML raises other types too, as for impossible dates.
     except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:

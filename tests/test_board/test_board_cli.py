@@ -158,6 +158,16 @@ def test_errors_have_their_codes(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_misspelt_description_of_an_entry_is_suggested(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("meta.yaml").write_text("method: small\n")
+    result = run("submit", "x.nc", "--from", "meta.yml")
+    assert result.exit_code == 3, result.output
+    assert "did you mean meta.yaml?" in result.stderr
+
+
 @pytest.fixture
 def clone_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The leaderboard of a clone, which is not the working folder."""

@@ -108,10 +108,3 @@ def test_text_stays_text(text: str, tmp_path: Path) -> None:
     path = tmp_path / "held.yaml"
     path.write_text(format_yaml({"held": [text, 1.5, 7]}), encoding="utf-8")
     assert read_yaml(path) == {"held": [text, 1.5, 7]}
-
-
-def test_the_file_with_the_nearest_name_is_suggested(tmp_path: Path) -> None:
-    (tmp_path / "meta.yaml").write_text("a: 1\n")
-    with pytest.raises(UnreadableFileError) as caught:
-        read_yaml(tmp_path / "meta.yml")
-    assert "meta.yaml" in str(caught.value.fix)
