@@ -159,22 +159,24 @@ class CoarseRollout:
         return self.position
 
 
-_idle_solver: dict[SolverParameters, Solver] = {}
-"""The solver that was used last, if it is free: to build one compiles it."""
+_idle_solvers: dict[SolverParameters, list[Solver]] = {}
+"""Free solvers with the constants that were used last: to build one compiles it."""
 
 
 def _borrow_solver(constants: SolverParameters) -> Solver:
     """Return a solver that no other rollout uses."""
-    solver = _idle_solver.pop(constants, None)
-    if solver is None:
-        solver = build(constants, threads=1)
-    return solver
+    idle = _idle_solvers.get(constants)
+    if idle:
+        return idle.pop()
+    return build(constants, threads=1)
 
 
 def _give_back(constants: SolverParameters, solver: Solver) -> None:
-    """Keep a solver for the next rollout, instead of the one that was kept."""
-    _idle_solver.clear()
-    _idle_solver[constants] = solver
+    """Keep a solver for the next rollout; those with other constants go."""
+    if constants not in _idle_solvers:
+        _idle_solvers.clear()
+    idle = _idle_solvers.setdefault(constants, [])
+    idle.append(solver)
 
 
 def spread_subset(
