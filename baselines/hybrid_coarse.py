@@ -226,20 +226,21 @@ class HybridCoarse(Baseline):
             count: is called with 1 after each evaluation.
 
         Raises:
-            UsageError: no scenario is longer than the given frames.
+            UsageError: no scenario moves in a frame that is compared.
         """
         true_rollouts: list[TrueRollout] = []
         for scenario in itertools.islice(scenarios, self.options.scenarios):
-            true_rollout = self._prepare(scenario)
+            true_rollout = self.prepare_truth(scenario)
             if true_rollout.true_frames:
                 true_rollouts.append(true_rollout)
         if not true_rollouts:
             raise UsageError(
                 "no scenario has frames to fit the constants to",
                 where="HybridCoarse.fit",
-                expected=f"more than {self.info.input_frames} frames in a scenario",
+                expected="a scenario in which matter still moves in frame "
+                f"{self._first_compared}",
                 got="none",
-                fix="train on a data set with longer scenarios",
+                fix="a smaller model.frame_step, or a data set with longer scenarios",
             )
         fitted = len(COEFFICIENTS)
         if not has_solids(self.size):
@@ -266,21 +267,27 @@ class HybridCoarse(Baseline):
         best = torch.zeros(len(COEFFICIENTS))
         if error < plain_error:
             best[:fitted] = torch.from_numpy(best_point).float()
+        error = min(error, plain_error)
         self.coefficients.copy_(best)
         numbers = dict(zip(COEFFICIENTS, best.tolist(), strict=True))
         return {"error_without": plain_error, "error": error, **numbers}
 
-    def _prepare(self, scenario: Batch) -> TrueRollout:
+    @property
+    def _first_compared(self) -> int:
+        """The first frame in which the fit compares a rollout with the truth."""
+        return self.info.input_frames + self.options.frame_step - 1
+
+    def prepare_truth(self, scenario: Batch) -> TrueRollout:
         """Return what a scenario gives, and the frames in which its truth moves."""
         given_frames = self.info.input_frames
-        positions = scenario.position.double().numpy().swapaxes(0, 1)
+        positions = scenario.position.numpy().swapaxes(0, 1)
         last = min(len(positions), given_frames + self.info.horizon)
-        first = given_frames + self.options.frame_step - 1
         true_frames = {}
-        for frame in range(first, last, self.options.frame_step):
+        for frame in range(self._first_compared, last, self.options.frame_step):
             step = np.abs(positions[frame] - positions[frame - 1]).max()
             if step > 0.0:
-                true_frames[frame] = positions[frame]
+                # A copy: a view would keep all frames of the scenario in memory.
+                true_frames[frame] = positions[frame].astype(np.float64)
         given = self._given(scenario.part(slice(given_frames)), 0)
         return TrueRollout(given=given, true_frames=true_frames)
 

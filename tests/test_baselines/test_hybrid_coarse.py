@@ -83,6 +83,23 @@ def test_without_changes_it_is_the_coarse_solver(
         np.testing.assert_array_equal(rollout.position.numpy(), positions)
 
 
+def test_rollouts_side_by_side_take_their_solvers_again(
+    root: Path, figures: DatasetInfo
+) -> None:
+    """Each has a solver of its own; the next rollouts compile none."""
+    paths = list(scenario_paths(SPLIT, subset="test", size=SIZE, root=root).values())
+    given = scenario_batch(paths[:2], slice(2))
+    model = HybridCoarse.build({}, figures)
+    state = model.start(given)
+    solvers = [rollout.solver for rollout in state.rollouts]
+    assert solvers[0] is not solvers[1]
+    del state
+    again = model.start(given)
+    for rollout in again.rollouts:
+        assert any(rollout.solver is solver for solver in solvers)
+    assert again.rollouts[0].solver is not again.rollouts[1].solver
+
+
 def with_coefficient(name: str, value: float) -> Size:
     """Return the coarse size with one coefficient that is not 0."""
     coefficients = np.zeros(len(COEFFICIENTS))
@@ -191,6 +208,47 @@ def test_the_fit_finds_a_flow_of_other_constants(
     (plain,) = roll_out(HybridCoarse.build({}, figures), given, size.task.horizon)
     plain_error = mean_distance(plain.position.numpy(), rollout.position.numpy())
     assert error < 0.5 * plain_error
+
+
+@pytest.mark.slow
+def test_coefficients_that_do_not_help_stay_0(root: Path, figures: DatasetInfo) -> None:
+    """The error that the fit returns is that of the weights it leaves."""
+    size = described()
+    (path, *_) = scenario_paths(SPLIT, subset="train", size=SIZE, root=root).values()
+    scenario = scenario_batch(path)
+    model = HybridCoarse.build({"evaluations": 1, "frame_step": 5}, figures)
+    given = scenario.part(slice(size.task.input_frames))
+    (rollout,) = roll_out(model, given, size.task.horizon)
+    future = rollout.position.transpose(0, 1)
+    made = replace(scenario, position=torch.cat([given.position, future], dim=1))
+    numbers = model.fit([made])
+    assert torch.equal(model.coefficients, torch.zeros(len(COEFFICIENTS)))
+    assert numbers["error"] == numbers["error_without"] < 1e-6
+
+
+def test_the_fit_keeps_only_the_frames_that_it_compares(
+    root: Path, figures: DatasetInfo
+) -> None:
+    """Whole scenarios in float64 would take gigabytes at full."""
+    (path, *_) = scenario_paths(SPLIT, subset="train", size=SIZE, root=root).values()
+    model = HybridCoarse.build({"frame_step": 5}, figures)
+    true_rollout = model.prepare_truth(scenario_batch(path))
+    assert true_rollout.true_frames
+    for position in true_rollout.true_frames.values():
+        assert position.base is None
+
+
+def test_a_fit_without_frames_to_compare_names_the_first(
+    root: Path, figures: DatasetInfo
+) -> None:
+    """A large step between frames is as good a reason as a short scenario."""
+    (path, *_) = scenario_paths(SPLIT, subset="train", size=SIZE, root=root).values()
+    model = HybridCoarse.build({"frame_step": 500}, figures)
+    with pytest.raises(UsageError) as caught:
+        model.fit([scenario_batch(path)])
+    first = figures.input_frames + 499
+    assert str(first) in caught.value.expected
+    assert "frame_step" in caught.value.fix
 
 
 def mean_distance(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
