@@ -2,9 +2,9 @@
 
     python benchmarks/free_flight.py --root FOLDER [--split NAME ...]
 
-Prints how much of the particles belongs to such bodies in the true data, and how far
-the mean acceleration of these bodies is from gravity, for several reaches of forces
-(``model.free_flight`` of graph networks).
+Prints which share of the particles belongs to such bodies in the true data, and how far
+the mean acceleration of these bodies is from gravity. Each row has another reach of the
+forces (``model.free_flight`` of graph networks).
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def find_flying(size: Size, path: Path, reach: float) -> Iterator[FlyingBody]:
             yield FlyingBody(len(members), float(error) / gravity)
 
 
-def count_measured(paths: Sequence[Path]) -> int:
-    """Return how many particle frames are looked at."""
+def count_particle_frames(paths: Sequence[Path]) -> int:
+    """Return the particles of all frames that are measured."""
     count = 0
     for path in paths:
         position = scenario_batch(path).position
@@ -92,11 +92,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("| --- | ---: | ---: | ---: |")
     for split in options.split:
         size = registry.size(split, options.size)
-        found = scenario_paths(
+        paths_by_id = scenario_paths(
             split, subset="train", size=options.size, root=Path(options.root)
         )
-        paths = list(found.values())[:SCENARIOS]
-        measured = count_measured(paths)
+        paths = list(paths_by_id.values())[:SCENARIOS]
+        particle_frames = count_particle_frames(paths)
         for reach in REACHES:
             flying = 0
             error_sum = 0.0
@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     flying += body.particles
                     error_sum += body.particles * body.error
             error = error_sum / max(flying, 1)
-            share = flying / measured
+            share = flying / particle_frames
             print(f"| {split} {options.size} | {reach:g} | {share:.3f} | {error:.1e} |")
     return 0
 

@@ -79,7 +79,7 @@ class ScenarioHeader:
     def friction(self) -> float | None:
         """Coulomb friction of the walls that the file states [1]; None without one."""
         stated = self.parameters.get("friction")
-        return _parse_positive(stated, "friction", unit="1", where=f"{self.key}")
+        return _parse_number(stated, "friction", unit="1", where=f"{self.key}")
 
 
 def parse_viscosity(stated: object, *, where: str) -> float | None:
@@ -92,12 +92,10 @@ def parse_viscosity(stated: object, *, where: str) -> float | None:
     Raises:
         DataError: it is no finite number from 0.
     """
-    return _parse_positive(stated, "viscosity", unit="length^2/s", where=where)
+    return _parse_number(stated, "viscosity", unit="length^2/s", where=where)
 
 
-def _parse_positive(
-    stated: object, name: str, *, unit: str, where: str
-) -> float | None:
+def _parse_number(stated: object, name: str, *, unit: str, where: str) -> float | None:
     """Return a number from 0 in a file's attribute; None without one."""
     if stated is None:
         return None
