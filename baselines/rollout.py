@@ -268,7 +268,7 @@ def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWi
             force = file.read("body_force", later_frames)
         particle_mass = None
         if "particle_mass" in file.variables:
-            particle_mass = float(file.read("particle_mass"))
+            particle_mass = file.read_particle_mass()
         scenario = file.header.key.scenario
         header = file.header
         stated = header.viscosity

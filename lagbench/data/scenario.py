@@ -167,6 +167,20 @@ class ScenarioFile:
                 return np.asarray(variable.asstr()[selection])
             return np.asarray(variable[selection])
 
+    def read_particle_mass(self) -> float:
+        """Return the mass of one particle [mass].
+
+        Raises:
+            DataError: the file is damaged, or the mass is no finite number above 0.
+        """
+        values = self.read("particle_mass")
+        is_number = values.size == 1 and values.dtype.kind in "iuf"
+        mass = float(values.item()) if is_number else math.nan
+        if not 0.0 < mass < math.inf:
+            got = f"no finite number above 0: {values!r}"[:200]
+            raise damage_error(self.path, got, "particle_mass")
+        return mass
+
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield a variable in order, in pieces of at most about 1 MiB."""
         with _damage_errors(self.path, name):

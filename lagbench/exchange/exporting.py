@@ -286,7 +286,7 @@ def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> N
 def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
     """Return the spacing of particles [length], and whether walls may move."""
     with read_scenario(path) as file:
-        mass = float(file.read("particle_mass"))
+        mass = file.read_particle_mass()
         has_moving_walls = "wall_velocity" in file.variables
     volume = mass / float(size.value("density"))
     if size.dimension == 2:

@@ -86,7 +86,7 @@ class ScoredTask:
         """Yield a scenario while its file is open."""
         with self.truth.open(scenario) as file:
             material = file.read("material")
-            mass = float(file.read("particle_mass"))
+            mass = file.read_particle_mass()
             input_frames = slice(0, self.config.input_frames)
             properties = Scenario(
                 config=self.config,
