@@ -488,7 +488,11 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
     if getattr(model, "fits_batches", False):
         evaluations = int(getattr(model, "evaluations", 0))
         scenarios = _read_scenarios(job, evaluations=evaluations)
-        numbers = model.fit(scenarios, count=job.meter.count)  # type: ignore[operator]
+
+        def count(evaluated: int) -> None:
+            job.meter.count(evaluated, scenarios=evaluated)
+
+        numbers = model.fit(scenarios, count=count)  # type: ignore[operator]
     else:
         positions = _positions(_read_scenarios(job))
         numbers = model.fit(positions)  # type: ignore[operator]
@@ -544,7 +548,8 @@ def _read_scenarios(job: TrainingJob, *, evaluations: int = 0) -> Iterator[Batch
         check_contents(size, job.root, files)
         paths += files.values()
     total = len(paths) + max(evaluations, 1)
-    job.meter.begin("fitting", total=total, scenarios=len(paths))
+    # The command line shows the steps of a training: each scenario and each evaluation.
+    job.meter.begin("fitting", total=total, scenarios=total)
     for path in paths:
         yield scenario_batch(path, viscosity=viscosity)
         job.meter.count(1, scenarios=1)

@@ -49,6 +49,7 @@ FORMAT = 1  # of gates.json
 BOARD_WEIGHTS = Path("leaderboard/weights")
 METHODS = (
     "gns",
+    "gns-free-flight",
     "gns-pushforward",
     "gns-spread",
     "supergat",
@@ -303,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--weights", type=Path, nargs="+", help="instead of the board's"
     )
-    parser.add_argument("--split", nargs="+", default=["cavity", "curl-noise"])
+    parser.add_argument("--split", nargs="+", default=["cavity", "curl-noise", "fluid"])
     parser.add_argument("--size", default="mini")
     parser.add_argument("--scenarios", type=int, default=8)
     parser.add_argument("--rollouts", type=int, default=4)

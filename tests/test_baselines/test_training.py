@@ -681,3 +681,21 @@ def test_other_files_among_the_logs_are_not_cleared(tmp_path: Path) -> None:
     RunFolder(tmp_path).clear()
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert files == [notes]
+
+
+def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
+    """A fit that measures rollouts takes minutes; each measurement is told."""
+    reports: list[Progress] = []
+    evaluations = 4
+    run(
+        "hybrid-projection",
+        f"model.evaluations={evaluations}",
+        "model.frames=3",
+        progress=reports.append,
+    )
+    fitting = [report for report in reports if report.stage == "fitting"]
+    scenarios = 2  # of train at size tiny
+    assert fitting[0].total == fitting[0].scenarios == scenarios + evaluations + 1
+    assert fitting[0].done == 0
+    last = fitting[-1]
+    assert scenarios + evaluations <= last.done <= last.total
