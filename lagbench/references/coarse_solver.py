@@ -159,8 +159,11 @@ class CoarseRollout:
         return self.position
 
 
+MOST_KEPT = 4
+"""Sets of constants of which free solvers are kept, at most."""
+
 _idle_solvers: dict[SolverParameters, list[Solver]] = {}
-"""Free solvers with the constants that were used last: to build one compiles it."""
+"""Free solvers by their constants, last used ones last: to build one compiles it."""
 
 
 def _borrow_solver(constants: SolverParameters) -> Solver:
@@ -172,11 +175,13 @@ def _borrow_solver(constants: SolverParameters) -> Solver:
 
 
 def _give_back(constants: SolverParameters, solver: Solver) -> None:
-    """Keep a solver for the next rollout; those with other constants go."""
-    if constants not in _idle_solvers:
-        _idle_solvers.clear()
-    idle = _idle_solvers.setdefault(constants, [])
+    """Keep a solver for the next rollout; where there are many, the oldest go."""
+    idle = _idle_solvers.pop(constants, [])
     idle.append(solver)
+    _idle_solvers[constants] = idle
+    while len(_idle_solvers) > MOST_KEPT:
+        oldest = next(iter(_idle_solvers))
+        del _idle_solvers[oldest]
 
 
 def spread_subset(

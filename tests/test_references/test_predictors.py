@@ -24,7 +24,8 @@ from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.generators.constants import solver_constants
-from lagbench.generators.split import InitialState
+from lagbench.generators.solver import Solver, build
+from lagbench.generators.split import FreeSurfaceParameters, InitialState
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import (
     REFERENCES,
@@ -51,7 +52,12 @@ from lagbench.references.ballistic_analog import (
     label_bodies,
     predict_positions,
 )
-from lagbench.references.coarse_solver import coarser, predict_with, spread_subset
+from lagbench.references.coarse_solver import (
+    CoarseRollout,
+    coarser,
+    predict_with,
+    spread_subset,
+)
 from lagbench.references.frozen_field import decay
 from lagbench.references.predictor import linear_field, with_wall_images
 from lagbench.references.shipped import FOLDER, shipped_path
@@ -329,7 +335,7 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
 @pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the coarse solver take the solver that is there."""
-    coarse_solver._idle_solver.clear()
+    coarse_solver._idle_solvers.clear()
     monkeypatch.setattr("lagbench.generators.solver.build", compiled)
 
 
@@ -568,6 +574,40 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
         solver.advance(size.substeps_per_frame)
         np.testing.assert_array_equal(expected, solver.position()[0])
     assert len(positions) == len(wall_velocities)
+
+
+def test_rollouts_that_take_turns_compile_each_solver_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Costs are measured so: what a solver's compilation takes is not one of them.
+
+    Solvers of many other constants are not kept for ever.
+    """
+    built: list[int] = []
+
+    def counted(parameters: FreeSurfaceParameters, **options: Any) -> Solver:
+        built.append(parameters.grid)
+        return build(parameters, **options)
+
+    monkeypatch.setattr(coarse_solver, "build", counted)
+    size = load().size("fluid", "mini")
+    coarse = coarser(size, 2)
+    assert coarse is not None
+    block = lattice(25) / 120 + np.array([0.4, 0.6])
+    frames = np.stack([block, block])
+    scenario = given("fluid", frames, size="mini", area=(25 / 120) ** 2)
+    for _ in range(3):
+        for constants in (coarse, size):
+            next(predict_with(scenario, constants))
+    assert built == [coarse.grid, size.grid]
+
+    for number in range(coarse_solver.MOST_KEPT):
+        gravity = size.parameters["gravity"].model_copy(update={"value": 1.0 + number})
+        parameters = {**coarse.parameters, "gravity": gravity}
+        other = coarse.model_copy(update={"parameters": parameters})
+        CoarseRollout(scenario, other)
+    CoarseRollout(scenario, coarse)
+    assert built.count(coarse.grid) == coarse_solver.MOST_KEPT + 2
 
 
 def test_the_coarse_solver_moves_all_particles() -> None:
