@@ -486,8 +486,11 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         )
 
     if getattr(model, "fits_batches", False):
-        evaluations = int(getattr(model, "evaluations", 0))
-        scenarios = _read_scenarios(job, evaluations=evaluations)
+        scenarios = _read_scenarios(
+            job,
+            most=getattr(model.options, "scenarios", None),
+            evaluations=int(getattr(model, "evaluations", 0)),
+        )
 
         def count(evaluated: int) -> None:
             job.meter.count(evaluated, scenarios=evaluated)
@@ -527,11 +530,14 @@ def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
         yield scenario.position.transpose(0, 1).numpy()
 
 
-def _read_scenarios(job: TrainingJob, *, evaluations: int = 0) -> Iterator[Batch]:
+def _read_scenarios(
+    job: TrainingJob, *, most: int | None = None, evaluations: int = 0
+) -> Iterator[Batch]:
     """Yield each training scenario as a batch of one window.
 
     Args:
         job: the training.
+        most: scenarios to read, the first ones; all when None.
         evaluations: units of work that the fit counts after the reading.
     """
     size = job.registry.size(job.info.split, job.info.size)
@@ -547,9 +553,11 @@ def _read_scenarios(job: TrainingJob, *, evaluations: int = 0) -> Iterator[Batch
         )
         check_contents(size, job.root, files)
         paths += files.values()
+    paths = paths[:most]
     total = len(paths) + max(evaluations, 1)
     # The command line shows the steps of a training: each scenario and each evaluation.
     job.meter.begin("fitting", total=total, scenarios=total)
     for path in paths:
-        yield scenario_batch(path, viscosity=viscosity)
+        scenario = scenario_batch(path, viscosity=viscosity)
         job.meter.count(1, scenarios=1)
+        yield scenario

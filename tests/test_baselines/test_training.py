@@ -691,10 +691,11 @@ def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
         "hybrid-projection",
         f"model.evaluations={evaluations}",
         "model.frames=3",
+        "model.scenarios=1",
         progress=reports.append,
     )
     fitting = [report for report in reports if report.stage == "fitting"]
-    scenarios = 2  # of train at size tiny
+    scenarios = 1  # of two in train
     assert fitting[0].total == fitting[0].scenarios == scenarios + evaluations + 1
     assert fitting[0].done == 0
     last = fitting[-1]
