@@ -26,8 +26,8 @@ from lagbench.figures.tables import markdown
 from .panels import join_charts
 
 KINDS = ("naive", "classical", "learned", "hybrid")
-HEIGHT = 300
-SIDES = AxisScale(-0.2, 1.75, False, 0, (Tick(0.0, "test"), Tick(1.0, "shift")))
+HEIGHT = 420
+SIDES = AxisScale(-0.2, 2.2, False, 0, (Tick(0.0, "test"), Tick(1.0, "shift")))
 """Test and shift side by side; the names of the methods stand to the right."""
 
 
