@@ -29,7 +29,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -46,7 +45,8 @@ from lagbench.metrics.transport import sliced_wasserstein2
 from lagbench.references.coarse_solver import SOLVED, CoarseRollout, coarser
 from lagbench.references.predictor import Given
 
-from .baseline import Baseline, Batch, DatasetInfo, Options
+from .baseline import Batch, DatasetInfo, Options
+from .hybrid import Hybrid
 
 Floats = NDArray[np.float64]
 
@@ -100,17 +100,14 @@ class HybridCoarseOptions(Options):
     evaluations: int = Field(default=96, ge=1)  # points at which the error is measured
 
 
-class HybridCoarse(Baseline):
+class HybridCoarse(Hybrid):
     """The coarse solver with learned constants."""
 
     method = "hybrid coarse solver"
-    closed_form: ClassVar[bool] = True
-    fits_batches: ClassVar[bool] = True
-    any_box: ClassVar[bool] = True
+    largest = LARGEST
 
     Options = HybridCoarseOptions
     options: HybridCoarseOptions
-    coefficients: Tensor
 
     def __init__(self, options: HybridCoarseOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
@@ -127,25 +124,6 @@ class HybridCoarse(Baseline):
         self.coarse = coarse
         self.register_buffer("coefficients", torch.zeros(len(COEFFICIENTS)))
 
-    @property
-    def history(self) -> int:
-        """Given frames that the solver reads: the last two."""
-        return 2
-
-    def forward(
-        self, batch: Batch, generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
-        """Refuse: the coefficients are fitted as a whole, without steps.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(
-            f"{self.method} takes no training steps",
-            where="HybridCoarse.forward",
-            fix="train it with `lagbench train`",
-        )
-
     # --- the solver ---------------------------------------------------------------
 
     def start(self, given: Batch) -> CoarseFlows:
@@ -154,15 +132,7 @@ class HybridCoarse(Baseline):
         Raises:
             DataError: the mass is not known, or a coefficient is out of range.
         """
-        values = self.coefficients.double().cpu().numpy()
-        if not np.abs(values).max() <= LARGEST:
-            raise DataError(
-                "the constants of the hybrid are out of range",
-                where="coefficients of the weights",
-                expected=f"numbers from -{LARGEST:g} to {LARGEST:g}",
-                got=values.tolist(),
-                fix="train the model with `lagbench train`",
-            )
+        values = self.checked_coefficients()
         changed = change_constants(self.coarse, values)
         rollouts = []
         for window in range(given.windows):

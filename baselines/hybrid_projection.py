@@ -22,7 +22,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -35,7 +34,8 @@ from lagbench.data.box import Box
 from lagbench.errors import DataError, UsageError
 from lagbench.references.staggered import StaggeredGrid, Velocity
 
-from .baseline import Baseline, Batch, DatasetInfo, Options
+from .baseline import Batch, DatasetInfo, Options
+from .hybrid import Hybrid
 
 Floats = NDArray[np.float64]
 
@@ -267,17 +267,14 @@ class HybridOptions(Options):
     evaluations: int = Field(default=45, ge=1)  # of the fit, at most
 
 
-class HybridProjection(Baseline):
+class HybridProjection(Hybrid):
     """The projection solver with a learned viscous closure."""
 
     method = "hybrid projection"
-    closed_form: ClassVar[bool] = True
-    fits_batches: ClassVar[bool] = True
-    any_box: ClassVar[bool] = True
+    largest = LARGEST
 
     Options = HybridOptions
     options: HybridOptions
-    coefficients: Tensor
 
     def __init__(self, options: HybridOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
@@ -288,25 +285,6 @@ class HybridProjection(Baseline):
         """The force that drives the flow; no obstacle."""
         return frozenset({"body_force"})
 
-    @property
-    def history(self) -> int:
-        """Given frames that the solver reads: the last two."""
-        return 2
-
-    def forward(
-        self, batch: Batch, generator: torch.Generator | None = None
-    ) -> dict[str, Tensor]:
-        """Refuse: the coefficients are fitted as a whole, without steps.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(
-            f"{self.method} takes no training steps",
-            where="HybridProjection.forward",
-            fix="train it with `lagbench train`",
-        )
-
     # --- the solver ---------------------------------------------------------------
 
     def start(self, given: Batch) -> Flows:
@@ -315,15 +293,7 @@ class HybridProjection(Baseline):
         Raises:
             DataError: the viscosity is not known, or a coefficient is out of range.
         """
-        values = self.coefficients.double().cpu().numpy()
-        if not np.abs(values).max() <= LARGEST:
-            raise DataError(
-                "the damping of the hybrid is out of range",
-                where="coefficients of the weights",
-                expected=f"numbers from -{LARGEST:g} to {LARGEST:g}",
-                got=values.tolist(),
-                fix="train the model with `lagbench train`",
-            )
+        values = self.checked_coefficients()
         flows = []
         for window in range(given.windows):
             is_inside = given.sample == window

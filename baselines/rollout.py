@@ -99,42 +99,28 @@ def select_window(batch: Batch, window: int) -> Batch:
     """Return one window of a batch as a batch of its own."""
     is_inside = batch.sample == window
     row = slice(window, window + 1)
-    walls = batch.wall_velocity
-    if walls is not None:
-        walls = walls[row]
-    force = batch.body_force
-    if force is not None:
-        force = force[row]
-    origin = batch.origin
-    if origin is not None:
-        origin = origin[is_inside]
-    viscosity = batch.viscosity
-    if viscosity is not None:
-        viscosity = viscosity[row]
-    obstacle = batch.obstacle
-    if obstacle is not None:
-        obstacle = obstacle[row]
-    particle_mass = batch.particle_mass
-    if particle_mass is not None:
-        particle_mass = particle_mass[row]
-    friction = batch.friction
-    if friction is not None:
-        friction = friction[row]
     sample = batch.sample[is_inside]
     return Batch(
         position=batch.position[is_inside],
         sample=torch.zeros_like(sample),
         material=batch.material[is_inside],
-        wall_velocity=walls,
+        wall_velocity=_rows(batch.wall_velocity, row),
         scenario=batch.scenario[row],
         frame=batch.frame[row],
-        origin=origin,
-        viscosity=viscosity,
-        body_force=force,
-        obstacle=obstacle,
-        particle_mass=particle_mass,
-        friction=friction,
+        origin=_rows(batch.origin, is_inside),
+        viscosity=_rows(batch.viscosity, row),
+        body_force=_rows(batch.body_force, row),
+        obstacle=_rows(batch.obstacle, row),
+        particle_mass=_rows(batch.particle_mass, row),
+        friction=_rows(batch.friction, row),
     )
+
+
+def _rows(values: Tensor | None, rows: slice | Tensor) -> Tensor | None:
+    """Return some rows of what a batch may hold; None where it does not."""
+    if values is None:
+        return None
+    return values[rows]
 
 
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:

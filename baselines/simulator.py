@@ -339,39 +339,7 @@ class GraphNetwork(Baseline):
 
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        check_moving_walls(options.wall_velocity, info)
-        if options.noise_spread and options.noise_std == 0.0:
-            raise UsageError(
-                "there is no noise to spread",
-                where="model.noise_spread",
-                expected="model.noise_std above 0, the largest deviation",
-                got=f"model.noise_std={options.noise_std}",
-                fix="--set model.noise_std=1e-3, or leave model.noise_spread out",
-            )
-        if options.compression > 0.0 and options.recovery is None:
-            raise UsageError(
-                "displaced particles have no way back to the true path",
-                where="model.compression",
-                expected="model.recovery, a number of frames",
-                got="model.recovery=null",
-                fix="--set model.recovery=8, or leave model.compression out",
-            )
-        if options.free_flight is not None and (options.body_force or options.obstacle):
-            raise UsageError(
-                "a body in free flight meets no force but gravity",
-                where="model.free_flight",
-                expected="null, beside model.body_force or model.obstacle",
-                got=options.free_flight,
-                fix="leave the option out",
-            )
-        if options.link_weight is not None and "link" not in self.operator.weights:
-            raise UsageError(
-                f"{self.method} predicts no links",
-                where="model.link_weight",
-                expected="null",
-                got=options.link_weight,
-                fix="leave the option out, or train supergat",
-            )
+        self._check_options()
         self.radius = info.radius
         if options.radius is not None:
             self.radius = options.radius
@@ -418,6 +386,47 @@ class GraphNetwork(Baseline):
         last_layer = self.network.decoder[-1]
         for parameter in last_layer.parameters():
             nn.init.zeros_(parameter)
+
+    def _check_options(self) -> None:
+        """Refuse options that contradict each other, the data or the operator.
+
+        Raises:
+            UsageError: they do; it names the option.
+        """
+        options = self.options
+        check_moving_walls(options.wall_velocity, self.info)
+        if options.noise_spread and options.noise_std == 0.0:
+            raise UsageError(
+                "there is no noise to spread",
+                where="model.noise_spread",
+                expected="model.noise_std above 0, the largest deviation",
+                got=f"model.noise_std={options.noise_std}",
+                fix="--set model.noise_std=1e-3, or leave model.noise_spread out",
+            )
+        if options.compression > 0.0 and options.recovery is None:
+            raise UsageError(
+                "displaced particles have no way back to the true path",
+                where="model.compression",
+                expected="model.recovery, a number of frames",
+                got="model.recovery=null",
+                fix="--set model.recovery=8, or leave model.compression out",
+            )
+        if options.free_flight is not None and (options.body_force or options.obstacle):
+            raise UsageError(
+                "a body in free flight meets no force but gravity",
+                where="model.free_flight",
+                expected="null, beside model.body_force or model.obstacle",
+                got=options.free_flight,
+                fix="leave the option out",
+            )
+        if options.link_weight is not None and "link" not in self.operator.weights:
+            raise UsageError(
+                f"{self.method} predicts no links",
+                where="model.link_weight",
+                expected="null",
+                got=options.link_weight,
+                fix="leave the option out, or train supergat",
+            )
 
     def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
