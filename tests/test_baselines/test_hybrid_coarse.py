@@ -186,7 +186,11 @@ def test_the_surface_finds_the_bottom_of_a_bowl() -> None:
 def test_the_fit_finds_a_flow_of_other_constants(
     root: Path, figures: DatasetInfo
 ) -> None:
-    """From positions that a softer coarse solver made it comes close to that one."""
+    """From positions that a softer coarse solver made it comes close to that one.
+
+    Of the points that it tries, all softer too, it keeps the best: rollouts have the
+    error of that one.
+    """
     size = described()
     (path, *_) = scenario_paths(SPLIT, subset="train", size=SIZE, root=root).values()
     scenario = scenario_batch(path)
@@ -199,15 +203,19 @@ def test_the_fit_finds_a_flow_of_other_constants(
     whole = torch.cat([given.position, future], dim=1)
     made = replace(scenario, position=whole)
 
-    model = HybridCoarse.build({"evaluations": 12, "frame_step": 5}, figures)
+    frame_step = 5
+    model = HybridCoarse.build({"evaluations": 2, "frame_step": frame_step}, figures)
     numbers = model.fit([made])
     assert numbers["error_without"] > 1e-4
     assert numbers["error"] < 0.5 * numbers["error_without"]
     (fitted,) = roll_out(model, given, size.task.horizon)
-    error = mean_distance(fitted.position.numpy(), rollout.position.numpy())
-    (plain,) = roll_out(HybridCoarse.build({}, figures), given, size.task.horizon)
-    plain_error = mean_distance(plain.position.numpy(), rollout.position.numpy())
-    assert error < 0.5 * plain_error
+    compared = slice(frame_step - 1, None, frame_step)
+    error = mean_distance(
+        fitted.position.numpy()[compared],
+        rollout.position.numpy()[compared],
+        scenario.material.numpy(),
+    )
+    assert error == pytest.approx(numbers["error"], rel=1e-3)
 
 
 @pytest.mark.slow
@@ -251,10 +259,22 @@ def test_a_fit_without_frames_to_compare_names_the_first(
     assert "frame_step" in caught.value.fix
 
 
-def mean_distance(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    """Return the mean distance of the clouds of all frames [length]."""
-    distances = [sliced_wasserstein2(x, y) for x, y in zip(first, second, strict=True)]
-    return float(np.mean(distances))
+def mean_distance(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    material: NDArray[np.integer],
+) -> float:
+    """Return the mean distance of the clouds of each material in all frames [length].
+
+    A material counts by its share of the particles.
+    """
+    distances = []
+    for kind in np.unique(material):
+        members = material == kind
+        share = float(members.mean())
+        for x, y in zip(first[:, members], second[:, members], strict=True):
+            distances.append(share * sliced_wasserstein2(x, y))
+    return float(np.sum(distances)) / len(first)
 
 
 def test_a_solver_that_breaks_down_ends_the_rollout(
