@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.addresses import ARCHIVES, describe
 from lagbench.arguments import check_arguments
-from lagbench.data.layout import MANIFEST_NAME, format_ids, scenario_path
+from lagbench.data.layout import (
+    MANIFEST_NAME,
+    format_ids,
+    scenario_path,
+    url_of,
+)
 from lagbench.data.local import locate_new, suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -128,10 +133,14 @@ def download(
     selected = select(entry, subset=subset, scenarios=scenarios)
     description = splits.split(entry.split)
     urls = _list_stores(mirror, description, entry)
-    with (
-        dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait),
-        publish(entry, folder) as store,
-    ):
+    with ExitStack() as stack:
+        stack.enter_context(
+            dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait)
+        )
+        store = None
+        own_url = url_of(folder)
+        if own_url is not None:
+            store = stack.enter_context(publish(entry, folder, own_url))
         published = set(selected).intersection(store.stored_entries if store else ())
         job = DownloadJob(
             entry,

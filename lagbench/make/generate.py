@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,8 +22,8 @@ from typing import Any, TypeVar
 from lagbench.arguments import check_arguments
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids
-from lagbench.data.local import locate_new
+from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids, url_of
+from lagbench.data.local import locate_new, root_url
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
@@ -49,12 +50,7 @@ from lagbench.generators.simulate import (
 from lagbench.generators.split import Device
 from lagbench.store.copy import gather as gather_files
 from lagbench.store.copy import list_gatherable
-from lagbench.store.publication import (
-    Publication,
-    check_address,
-    inspect_store,
-    publish,
-)
+from lagbench.store.publication import Publication, check_address, publish
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import describe_machine, promises_bits, worker_count
 from lagbench.work.pool import Event, Pool, Report, WorkItem
@@ -159,7 +155,9 @@ def generate(
             bucket.
     """
     started = time.monotonic()
-    check_address(root)
+    address = root_url(root)
+    if address is not None:
+        check_address(address)
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted_ids = select(tier, subset=subset, scenarios=scenarios)
     target = _find_device(device)
@@ -185,7 +183,7 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-            publish(tier, folder) as store,
+            _open_store(setup) as store,
         ):
             keeper = _ManifestKeeper(setup, store)
             scan = _simulate_missing(setup, keeper, wanted_ids, sources, force=force)
@@ -321,6 +319,14 @@ class _ManifestKeeper:
             self.store.fetch(scenarios)
 
 
+def _open_store(setup: _Setup) -> AbstractContextManager[Publication | None]:
+    """Return the store that the root folder is a working copy of; None if plain."""
+    url = url_of(setup.root)
+    if url is None:
+        return nullcontext()
+    return publish(setup.size, setup.root, url)
+
+
 def _plan_only(
     setup: _Setup, wanted_ids: Sequence[int], sources: Sequence[Path], *, force: bool
 ) -> _Scan:
@@ -328,7 +334,10 @@ def _plan_only(
     gathered: set[int] = set()
     for source in sources:
         gathered.update(list_gatherable(setup.size, setup.root, source))
-    store = inspect_store(setup.size, setup.root)
+    store = None
+    url = url_of(setup.root)
+    if url is not None:
+        store = Publication(setup.size, setup.root, url)
     return _scan_folder(setup, store, wanted_ids, force=force, gathered=gathered)
 
 

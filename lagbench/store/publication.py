@@ -15,8 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import MANIFEST_NAME, url_of
-from lagbench.data.local import root_url
+from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.manifest import FileEntry, Manifest, merge_entries, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
@@ -180,37 +179,29 @@ class Publication:
         return manifest or merge_entries(self._size, None)
 
 
-def check_address(root: str | Path | None) -> None:
+def check_address(url: str) -> None:
     """Refuse an address where nothing can be written, before its copy is made."""
-    url = root_url(root)
-    if url is not None:
-        Objects(url, "")
-
-
-def inspect_store(size: Size, root: Path) -> Publication | None:
-    """Return the state of a data set in its store; None for a plain folder."""
-    url = url_of(root)
-    if url is None:
-        return None
-    return Publication(size, root, url)
+    Objects(url, "")
 
 
 @contextmanager
-def publish(size: Size, root: Path) -> Iterator[Publication | None]:
-    """Write a data set to a store; yield None for a root that is a plain folder.
+def publish(size: Size, root: Path, url: str) -> Iterator[Publication]:
+    """Write a data set to a store.
 
     Hold the lock of the working copy. Until the end nothing is fetched into it
     unasked.
+
+    Args:
+        size: the data set.
+        root: working copy of the store.
+        url: address of the store.
 
     Raises:
         DataError: the bucket does not exist.
         WorkFailedError: the store refuses or does not answer.
         UsageError: the package for this kind of address is not installed.
     """
-    state = inspect_store(size, root)
-    if state is None:
-        yield None
-        return
+    state = Publication(size, root, url)
     with suspend_fetching(root):
         try:
             state.prepare()

@@ -338,8 +338,7 @@ def test_what_was_made_anew_is_not_fetched_back(
     path = root / FOLDER / "train/0000.nc"
     path.write_bytes(path.read_bytes() + b"\0")
     manifest = read_manifest(root, SPLIT, SIZE, 2)
-    with publication.publish(size, root) as store:
-        assert store is not None
+    with publication.publish(size, root, full) as store:
         assert manifest is not None
         first = manifest.files[0]
         new = first.model_copy(
