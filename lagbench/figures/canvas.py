@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.errors import UsageError, require
 
-from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL, parse_rgb
+from .colours import (
+    INK,
+    MATERIAL_RGB,
+    MOVING,
+    MUTED,
+    PAPER,
+    PAPER_RGB,
+    WALL,
+    parse_rgb,
+)
 
 if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -40,11 +49,11 @@ PALETTE_SIZE = 256
 
 # flat colours, each with the number of blends with paper that smooth its edges
 BLENDS = (
-    (INK, 8),
-    (MUTED, 6),
-    (MOVING, 4),
-    (WALL, 3),
-    *((colour, 4) for colour in MATERIAL_COLOURS),
+    (parse_rgb(INK), 8),
+    (parse_rgb(MUTED), 6),
+    (parse_rgb(MOVING), 4),
+    (parse_rgb(WALL), 3),
+    *((colour, 4) for colour in MATERIAL_RGB),
 )
 
 FADES = (0.85, 0.7, 0.55, 0.4)
@@ -97,7 +106,7 @@ def _cut_map(name: str, *, low: float, high: float, levels: int) -> ListedColorm
 @functools.cache
 def build_palette() -> NDArray[np.uint8]:
     """Return the 256 colours of every file, paper first, shape [256, 3]."""
-    paper = parse_rgb(PAPER).astype(float)
+    paper = PAPER_RGB.astype(float)
     speeds = _exact_colours(build_speed_map())
     vorticities = _exact_colours(build_vorticity_map())
     tables = [paper[None], speeds, vorticities]
@@ -109,7 +118,7 @@ def build_palette() -> NDArray[np.uint8]:
     tables.append(_blend(every_fifth, paper, share=0.3))
 
     for colour, blend_count in BLENDS:
-        pure = parse_rgb(colour).astype(float)
+        pure = colour.astype(float)
         for number in range(1, blend_count + 1):
             share = number / blend_count
             blended = _blend(pure[None], paper, share=share)
@@ -132,14 +141,14 @@ def build_solid_palette() -> NDArray[np.uint8]:
 
     Particles by speed are paler the farther they are. No vorticity has a sign there.
     """
-    paper = parse_rgb(PAPER).astype(float)
+    paper = PAPER_RGB.astype(float)
     speeds = _exact_colours(build_speed_map())
     tables = [paper[None], speeds]
     for share in FADES:
         faded = _blend(speeds[::2], paper, share=share)
         tables.append(faded)
     for colour, blend_count in BLENDS[:2]:
-        pure = parse_rgb(colour).astype(float)
+        pure = colour.astype(float)
         for number in range(1, blend_count + 1):
             share = number / blend_count
             blended = _blend(pure[None], paper, share=share)

@@ -101,6 +101,13 @@ def parse_rgb(colour: str) -> NDArray[np.uint8]:
     return np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8)
 
 
+PAPER_RGB = parse_rgb(PAPER)
+"""Bytes of the background."""
+
+MATERIAL_RGB = tuple(parse_rgb(colour) for colour in MATERIAL_COLOURS)
+"""Bytes of each material."""
+
+
 def format_variables(colours: Mapping[str, str]) -> str:
     """Return declarations of CSS variables.
 

@@ -18,7 +18,7 @@ from .canvas import (
     figure,
     pixels_of,
 )
-from .colours import MATERIAL_COLOURS, PAPER, parse_rgb
+from .colours import MATERIAL_RGB, PAPER_RGB
 from .panels import Panel, box_of, draw_cube, draw_walls, place_of_slice
 from .particles import DOT_DIAMETER, DOT_DIAMETER_SOLID, paint_particles
 from .recording import Recording, Scene
@@ -97,8 +97,7 @@ class Painter:
         self._diameter = dot_diameter * spacing * self._side  # [pixel]
         self._walls_by_direction: dict[bytes, Packed] = {}
 
-        material_colours = [parse_rgb(colour) for colour in MATERIAL_COLOURS]
-        palette = pack(np.array(material_colours))
+        palette = pack(np.array(MATERIAL_RGB))
         self._material_pixels = palette[recording.material]
         self._is_signed = panel is Panel.VORTICITY and not recording.is_solid
         if self._is_signed:
@@ -162,7 +161,7 @@ class Painter:
             order = np.argsort(-depth, kind="stable")
             position = self._view.place(position[order])
             rgb = unpack(colours[order]).astype(np.float64)
-            paper = parse_rgb(PAPER).astype(np.float64)
+            paper = PAPER_RGB.astype(np.float64)
             colours = pack(shade(rgb, depth[order], paper).round().astype(np.uint8))
         return paint_particles(
             walls,

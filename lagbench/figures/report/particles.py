@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.figures.colours import MATERIAL_COLOURS, parse_rgb
+from lagbench.figures.colours import MATERIAL_RGB
 from lagbench.figures.html import (
     Markup,
     ReportFigure,
@@ -158,8 +158,8 @@ def _build_palette() -> NDArray[np.uint8]:
     """Return nothing, then each material in each opacity, shape [entry, 4]."""
     nothing = (0, 0, 0, 0)
     entries = [nothing]
-    for colour in MATERIAL_COLOURS:
-        rgb = parse_rgb(colour).tolist()
+    for colour in MATERIAL_RGB:
+        rgb = colour.tolist()
         for shade in range(1, SHADES + 1):
             opacity = round(255 * shade / SHADES)
             entries.append((*rgb, opacity))
