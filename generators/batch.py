@@ -46,6 +46,9 @@ KEPT_PARTICLES = 1 << 17
 # of a whole number in an attribute of a file, its sign left out
 MOST_BITS = 63
 
+# drawn parameters that files call by their CF-like long name
+_FILE_NAMES = {"reynolds": "reynolds_number"}
+
 Report = Callable[[int], None]
 """Called with the substeps done since the last call, summed over scenarios."""
 
@@ -145,6 +148,25 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             "returns the start_frame of its initial state",
         )
     return state
+
+
+def file_parameters(
+    size: Size, scenario: int, state: InitialState
+) -> dict[str, object]:
+    """Return what a scenario's file states and hashes: constants, then what was
+    drawn.
+
+    Constants of one subset stand in its files only.
+    """
+    subset = size.subset_of(scenario)
+    parameters: dict[str, object] = {}
+    for name, parameter in size.parameters.items():
+        if parameter.subset in (None, subset):
+            parameters[name] = parameter.value
+    for name, value in state.parameters.items():
+        parameters[_FILE_NAMES.get(name, name)] = value
+    parameters["start_frame"] = state.start_frame
+    return parameters
 
 
 def _check_values(state: InitialState, where: str) -> None:

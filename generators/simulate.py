@@ -37,6 +37,7 @@ from .batch import (
     ScenarioBatch,
     SimulationJob,
     SimulationPace,
+    file_parameters,
 )
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
@@ -61,8 +62,6 @@ OUTCOMES = ("active_frames",)
 # frames on the way to which kernels are compiled: the first is read out, the solver
 # advances to the second
 COMPILING = 2
-# drawn parameters that files call by their CF-like long name
-_FILE_NAMES = {"reynolds": "reynolds_number"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,25 +92,6 @@ class SimulatedScenario:
 
 def _particle_mass(size: Size, state: InitialState) -> float:
     return float(size.value("density")) * state.area / size.particles
-
-
-def file_parameters(
-    size: Size, scenario: int, state: InitialState
-) -> dict[str, object]:
-    """Return what a scenario's file states and hashes: constants, then what was
-    drawn.
-
-    Constants of one subset stand in its files only.
-    """
-    subset = size.subset_of(scenario)
-    parameters: dict[str, object] = {}
-    for name, parameter in size.parameters.items():
-        if parameter.subset in (None, subset):
-            parameters[name] = parameter.value
-    for name, value in state.parameters.items():
-        parameters[_FILE_NAMES.get(name, name)] = value
-    parameters["start_frame"] = state.start_frame
-    return parameters
 
 
 def scenario_writer(

@@ -33,8 +33,8 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
-from lagbench.generators.batch import draw_initial_state
-from lagbench.generators.simulate import OUTCOMES, file_parameters
+from lagbench.generators.batch import draw_initial_state, file_parameters
+from lagbench.generators.simulate import OUTCOMES
 from lagbench.work.machine import available_cores, may_differ
 
 from .plan import estimate
