@@ -18,11 +18,10 @@ from typing import Any
 
 import torch
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_output_file, write_atomically
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
-from lagbench.submission.predictions import open_predictions
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -89,6 +88,7 @@ def predict(
     checkpoint: str | Path,
     output: str | Path = "predictions.nc",
     *,
+    overwrite: bool = False,
     root: str | Path | None = None,
     size: str | None = None,
     subset: str = "test",
@@ -114,6 +114,8 @@ def predict(
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
+        overwrite: whether to replace predictions of that name; files of another kind
+            are never replaced.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         size: size of the split to predict; that of the training when None.
@@ -136,11 +138,13 @@ def predict(
             the training.
         UsageError: the baseline is not installed, there is no such device, the weights
             cannot be run at that size or with those settings, or the output would
-            replace another file, such as the weights or another method's predictions.
+            replace predictions without ``overwrite``, or a file of another kind, such
+            as the weights.
         WorkFailedError: out of memory, or the disk is full.
     """
     output_path = Path(output)
     check_replaceable(output_path)
+    check_output_file(output_path, overwrite=overwrite)
     checkpoint_path = Path(checkpoint)
     trained = load(checkpoint)
     warn_of_last_state(trained, checkpoint_path)
@@ -171,7 +175,6 @@ def predict(
             model, info, paths, side_by_side, machine, viscosity=viscosity
         )
         label = method or model.method
-        _check_method(output_path, label)
         hardware_label = _describe_hardware(machine)
         writer = PredictionsWriter(
             output,
@@ -264,31 +267,6 @@ def _write_rollouts(
         if solver_seconds_per_frame is not None:
             writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
     return solver_seconds_per_frame
-
-
-def _check_method(output: Path, method: str) -> None:
-    """Refuse to write over the predictions of another method.
-
-    Raises:
-        UsageError: such predictions lie there.
-    """
-    if not output.is_file():
-        return
-    try:
-        with open_predictions(output) as predictions:
-            present = predictions.header.method
-    except LagbenchError:  # an earlier version, or cut short
-        return
-    if present == method:
-        return
-    raise UsageError(
-        "the output would replace the predictions of another method",
-        where="--output",
-        expected=f"no such file, or predictions of {method}",
-        got=f"{output}: predictions of {present}",
-        fix="name another file, as in -o "
-        f"{output.with_name(output.stem + '-2' + output.suffix)}",
-    )
 
 
 def _warn_of_unfinished(checkpoint: Checkpoint, path: Path) -> None:

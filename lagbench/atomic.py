@@ -6,11 +6,12 @@ import errno
 import functools
 import os
 import secrets
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import LagbenchError, WorkFailedError
+from .errors import LagbenchError, UsageError, WorkFailedError
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
@@ -74,6 +75,46 @@ def refuse_folders(paths: Iterable[Path]) -> None:
     for path in paths:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+
+
+def check_output_file(output: Path, *, overwrite: bool) -> None:
+    """Refuse, before the work, a file to write that must not be replaced.
+
+    Args:
+        output: the file that ``--output`` names.
+        overwrite: whether the user allows to replace a file of that name.
+
+    Raises:
+        UsageError: it is a folder or a device, or there is such a file.
+    """
+    if not os.path.lexists(output):
+        return
+    if output.is_dir():
+        raise UsageError(
+            "the output is a folder",
+            where="--output",
+            expected="the name of a file",
+            got=str(output),
+            fix="name a file, also one in that folder",
+        )
+    if output.exists() and not output.is_file():
+        raise UsageError(
+            "the output is no file",
+            where="--output",
+            expected="the name of a file",
+            got=f"{output}, a device, socket or pipe",
+            fix="name a file",
+        )
+    if not overwrite:
+        other = output.with_name(f"{output.stem}-2{output.suffix}")
+        raise UsageError(
+            "there is such a file already",
+            where="--output",
+            expected="a file that is not there yet",
+            got=str(output),
+            fix="replace it: --overwrite; or write elsewhere, as in -o "
+            f"{shlex.quote(str(other))}",
+        )
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:

@@ -242,6 +242,7 @@ def demo_model(
     prediction = predict(
         training.weights,
         run_folder / "predictions.nc",
+        overwrite=True,
         method=MODEL,
         root=folder,
         device="cpu",

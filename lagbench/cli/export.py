@@ -51,7 +51,9 @@ def export_command(
             "in two dimensions that fluid fills.",
         ),
     ] = False,
-    force: Annotated[bool, option("--force", "Replace an earlier export.")] = False,
+    overwrite: Annotated[
+        bool, option("--overwrite --force", "Replace an earlier export.")
+    ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -70,7 +72,7 @@ def export_command(
             root=root,
             from_walls=from_walls,
             wall_particles=wall_particles,
-            force=force,
+            force=overwrite,
             progress=progress,
         )
     print_result(result, _describe(result), as_json=as_json, quiet=quiet)

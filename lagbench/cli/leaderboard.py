@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_output_file, write_atomically
 from lagbench.board.build import build, collect
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
@@ -40,6 +40,7 @@ from .options import (
     FoundBoardOption,
     JsonFlag,
     NewSizeOption,
+    OverwriteFlag,
     QuietFlag,
     RootOption,
     SplitArgument,
@@ -242,6 +243,7 @@ def picture_command(
     output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path(
         "cost.svg"
     ),
+    overwrite: OverwriteFlag = False,
     board: FoundBoardOption = None,
     quiet: QuietFlag = False,
 ) -> None:
@@ -255,6 +257,7 @@ def picture_command(
             got=output,
             fix=f"-o {output.stem or 'cost'}.svg",
         )
+    check_output_file(output, overwrite=overwrite)
     folder = find_board(board, reads=True)
     if not shipped(tier):
         # without references the picture of no entry would be empty

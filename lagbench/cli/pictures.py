@@ -14,12 +14,13 @@ from lagbench.figures.pictures import (
     SCENARIO_ENDING,
     animate,
     plot,
-    require_folder_of,
+    require_place,
 )
 from lagbench.figures.plot import contact_sheet
 
 from .options import (
     JsonFlag,
+    OverwriteFlag,
     PresentSizeOption,
     QuietFlag,
     RootOption,
@@ -66,6 +67,7 @@ def plot_command(
         bool, option("--sheet", "Draw many scenarios of the split on one page instead.")
     ] = False,
     output: OutputOption = None,
+    overwrite: OverwriteFlag = False,
     dpi: Annotated[
         float,
         option(
@@ -85,7 +87,7 @@ def plot_command(
         split_name = choose_split(source, split)
         tier = locate(split_name, size, root=root).size
         page = output or Path(f"{tier.split}-{tier.name}-sheet.png")
-        require_folder_of(page)
+        require_place(page, overwrite=overwrite)
         path = contact_sheet(split_name, tier.name, page, root=root, kind=kind, dpi=dpi)
     else:
         path = plot(
@@ -95,6 +97,7 @@ def plot_command(
             frame=LAST_FRAME if frame is None else frame,
             kind=kind,
             output=output,
+            overwrite=overwrite,
             dpi=dpi,
             root=root,
         )
@@ -139,6 +142,7 @@ def animate_command(
     fps: Annotated[float, option("--fps", "Frames shown per second.")] = 30.0,
     every: Annotated[int, option("--every", "Show every n-th frame.", min=1)] = 1,
     output: OutputOption = None,
+    overwrite: OverwriteFlag = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -161,6 +165,7 @@ def animate_command(
         frames_per_second=fps,
         every=every,
         output=output,
+        overwrite=overwrite,
         root=root,
         quiet=quiet or as_json,
     )

@@ -20,7 +20,7 @@ from .model_options import (
     ThreadsOption,
     require_libraries,
 )
-from .options import JsonFlag, QuietFlag, RootOption, option
+from .options import JsonFlag, OverwriteFlag, QuietFlag, RootOption, option
 from .output import print_result, print_warning
 from .progress import progress_bar
 from .solver_bench import SolverBench, bench_apart
@@ -75,6 +75,7 @@ BenchFlag = Annotated[
 def predict_command(
     checkpoint: WeightsArgument,
     output: PredictionsOption = Path("predictions.nc"),
+    overwrite: OverwriteFlag = False,
     split: OnnxSplitOption = None,
     size: PredictedSizeOption = None,
     subset: SubsetOption = "test",
@@ -96,6 +97,7 @@ def predict_command(
         _predict_onnx(
             checkpoint,
             output,
+            overwrite=overwrite,
             split=split,
             size=size,
             method=method,
@@ -129,6 +131,7 @@ def predict_command(
         result = predict(
             checkpoint,
             output,
+            overwrite=overwrite,
             root=root,
             size=size,
             subset=subset,
@@ -149,6 +152,7 @@ def _predict_onnx(
     model: Path,
     output: Path,
     *,
+    overwrite: bool,
     split: str | None,
     size: str | None,
     method: str | None,
@@ -172,6 +176,7 @@ def _predict_onnx(
         result = predict_onnx(
             model,
             output,
+            overwrite=overwrite,
             split=split,
             size=size,
             method=method,

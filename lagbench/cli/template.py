@@ -10,6 +10,7 @@ from lagbench.submission.writer import template
 
 from .options import (
     JsonFlag,
+    OverwriteFlag,
     PresentSizeOption,
     QuietFlag,
     RootOption,
@@ -26,9 +27,7 @@ def template_command(
     output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
         "predictions.nc"
     ),
-    overwrite: Annotated[
-        bool, option("--overwrite", "Replace a file of that name.")
-    ] = False,
+    overwrite: OverwriteFlag = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,

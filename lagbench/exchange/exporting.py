@@ -259,7 +259,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
             where=str(folder),
             expected="a folder without files of these names",
             got=", ".join(existing),
-            fix="name another folder, or write over them: --force",
+            fix="replace them: --overwrite; or name another folder: --output",
         )
 
 

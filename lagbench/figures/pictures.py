@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.arguments import check_arguments
+from lagbench.atomic import check_output_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
@@ -36,6 +37,7 @@ def plot(
     frame: int = -1,
     kind: str = ALL,
     output: str | Path | None = None,
+    overwrite: bool = True,
     dpi: float = DPI,
     root: str | Path | None = None,
     registry: Registry | None = None,
@@ -53,13 +55,14 @@ def plot(
             two.
         output: file to write, ending in .png, .pdf or .svg; named after the data in the
             working folder when None.
+        overwrite: whether to replace a file of that name.
         dpi: pixels per inch.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown split, size, scenario, kind or frame, another ending, no
-            such folder, no matplotlib.
+            such folder, a file that must not be replaced, no matplotlib.
         DataError: the scenario is not on this machine, or damaged.
         UnreadableFileError: the named file is no scenario file.
     """
@@ -70,7 +73,7 @@ def plot(
     with _blame_named_files(source):
         if output is None:
             output = _frame_path(file, frame)
-        require_folder_of(Path(output))
+        require_place(Path(output), overwrite=overwrite)
         return plot_frame(file, frame, output, kind=kind, dpi=dpi, registry=registry)
 
 
@@ -85,6 +88,7 @@ def animate(
     frames_per_second: float = 30.0,
     every: int = 1,
     output: str | Path | None = None,
+    overwrite: bool = True,
     root: str | Path | None = None,
     quiet: bool = False,
     registry: Registry | None = None,
@@ -103,13 +107,14 @@ def animate(
         every: show every n-th frame.
         output: file to write, ending in .mp4 or .gif; named after the data in the
             working folder when None.
+        overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         quiet: show no progress; without a terminal on stderr none is shown anyway.
         registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown split, size, scenario or kind, another ending, a rate out of
-            bounds, no such folder, no matplotlib.
+            bounds, no such folder, a file that must not be replaced, no matplotlib.
         DataError: a scenario is not on this machine, or damaged.
         UnreadableFileError: a named file is no scenario file.
         WorkFailedError: the video cannot be encoded or written.
@@ -134,7 +139,7 @@ def animate(
         )
     if output is None:
         output = f"{_data_name(file)}.mp4"
-    require_folder_of(Path(output))
+    require_place(Path(output), overwrite=overwrite)
     with _blame_named_files(*named_files):
         return films.animate(
             file,
@@ -218,11 +223,11 @@ def _blame_named_files(*names: str | Path) -> Iterator[None]:
         ) from error
 
 
-def require_folder_of(path: Path) -> None:
-    """Refuse a path whose folder does not exist.
+def require_place(path: Path, *, overwrite: bool) -> None:
+    """Refuse a path whose folder does not exist, or whose file must not be replaced.
 
     Raises:
-        UsageError: there is no such folder.
+        UsageError: there is no such folder, or there is such a file.
     """
     if not path.parent.is_dir():
         raise UsageError(
@@ -232,6 +237,7 @@ def require_folder_of(path: Path) -> None:
             got=path.parent,
             fix="create it first",
         )
+    check_output_file(path, overwrite=overwrite)
 
 
 def _frame_path(file: Path, frame: int) -> Path:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.atomic import check_output_file
 from lagbench.data.local import load_rooted_registry, locate, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.store.copy import scenario_files
@@ -34,6 +35,7 @@ def predict_onnx(
     model: str | Path,
     output: str | Path = "predictions.nc",
     *,
+    overwrite: bool = False,
     split: str,
     size: str | None = None,
     method: str | None = None,
@@ -47,6 +49,7 @@ def predict_onnx(
     Args:
         model: the ONNX file, docs/submitting.md describes it.
         output: the predictions.nc to write.
+        overwrite: whether to replace a file of that name.
         split: name of the split.
         size: name of the size; the only one that is there when None.
         method: name of the method; by default the stem of the file.
@@ -56,11 +59,13 @@ def predict_onnx(
         progress: called as the work advances.
 
     Raises:
-        UsageError: no such split or size, or onnx is not installed.
+        UsageError: no such split or size, there is such a file, or onnx is not
+            installed.
         UnreadableFileError: the model is refused, or cannot be run.
         DataError: the test subset is missing.
         WorkFailedError: the model needs more time or memory than allowed.
     """
+    check_output_file(Path(output), overwrite=overwrite)
     root_folder = resolve_root(root)
     known = load_rooted_registry(root_folder, registry)
     tier, folder, _ = locate(split, size, root=root, registry=known)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.arguments import check_arguments
-from lagbench.atomic import atomic_path
+from lagbench.atomic import atomic_path, check_output_file
 from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
@@ -627,7 +627,7 @@ def template(
         WorkFailedError: the disk is full or not writable.
     """
     entry, folder, splits = locate(split, size, root=root, registry=registry)
-    _check_output(Path(output), overwrite=overwrite)
+    check_output_file(Path(output), overwrite=overwrite)
     update_working_copy(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
@@ -657,23 +657,3 @@ def template(
         particle_range=(min(particle_counts), max(particle_counts)),
         bytes=writer.path.stat().st_size,
     )
-
-
-def _check_output(output: Path, *, overwrite: bool) -> None:
-    """Refuse a folder, or a file that may not be replaced."""
-    if output.is_dir():
-        raise UsageError(
-            "the output is a folder",
-            where=str(output),
-            expected="the name of a file",
-            got="a folder",
-            fix="write elsewhere: -o template.nc",
-        )
-    if output.exists() and not overwrite:
-        raise UsageError(
-            "there is such a file already",
-            where=str(output),
-            expected="a file that is not there yet",
-            got="a file of that name",
-            fix="write elsewhere: -o template.nc; or replace it: --overwrite",
-        )

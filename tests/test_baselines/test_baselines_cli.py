@@ -136,11 +136,14 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
         assert "model.clamp=false" in data.getncattr("training")
     assert "without the neighbour search" in predicted.stdout
     assert "in place of" not in predicted.stdout
-    assert "in place of" in lagbench(*predict).stdout
+    refused = lagbench(*predict)
+    assert refused.exit_code == 2
+    assert "--overwrite" in refused.stderr
+    assert "in place of" in lagbench(*predict, "--overwrite").stdout
     assert "next: lagbench score predictions.nc" in predicted.stdout
     scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
     assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]
-    silent = ("--no-bench", "--quiet", "--threads", "1")
+    silent = ("--no-bench", "--quiet", "--threads", "1", "--overwrite")
     assert (
         lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", *silent).stdout
         == ""
@@ -237,7 +240,10 @@ def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) ->
     lagbench(
         "train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run"
     )
-    early = ("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json")
+    early = (
+        *("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json"),
+        "--overwrite",
+    )
     assert lagbench(*early).stderr == ""
     told = (tmp_path / "run/training.json").read_text()
     unfinished = json.loads(told) | {"state": "interrupted", "step": 1}
@@ -254,6 +260,7 @@ def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) ->
         "1",
         "--no-bench",
         "--quiet",
+        "--overwrite",
     )
     more = ("train", "--baseline", "mlp", *TINY, "--set", "training.steps=1", "--quiet")
     for words in (predict, (*more, "--start", "run/checkpoint.pt", "-o", "more")):

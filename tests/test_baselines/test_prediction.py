@@ -691,26 +691,26 @@ def test_the_current_folder_is_not_replaced(
         check_replaceable(Path())
 
 
-def test_predictions_are_replaced_while_their_cost_is_beside_them(
+def test_predictions_are_replaced_on_request_while_their_cost_is_beside_them(
     run: Predict, tmp_path: Path
 ) -> None:
     """Another JSON file with a cost, as scores have it, is not replaced."""
-    run(name="predictions.nc")
-    run(name="predictions.nc")
+    run(name="predictions.nc", method="mine")
+    run(name="predictions.nc", method="other", overwrite=True)
+    with netCDF4.Dataset(tmp_path / "predictions.nc") as data:
+        assert data.getncattr("method") == "other"
     (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')
     with pytest.raises(UsageError):
-        run(name="predictions.nc")
+        run(name="predictions.nc", overwrite=True)
 
 
-def test_predictions_of_another_method_are_not_replaced(
-    run: Predict, tmp_path: Path
-) -> None:
-    """The user may name another file."""
-    run(name="predictions.nc", method="mine")
+def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -> None:
+    """The same method would lose its predictions too, as where weights changed."""
+    run(name="predictions.nc")
     before = (tmp_path / "predictions.nc").read_bytes()
     with pytest.raises(UsageError) as caught:
-        run(name="predictions.nc", method="other")
-    assert "mine" in str(caught.value.got)
+        run(name="predictions.nc", start=2.0)
+    assert "--overwrite" in str(caught.value.fix)
     assert (tmp_path / "predictions.nc").read_bytes() == before
 
 

@@ -155,6 +155,7 @@ def test_it_goes_on_where_the_weights_are(
         "registry": unmeasured,
         "threads": 1,
         "size": "tiny",
+        "overwrite": True,
     }
     positions = []
     for weights in (start, result.weights):

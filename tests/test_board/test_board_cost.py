@@ -241,6 +241,11 @@ def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
     options = ["--board", str(board), "-o", str(target)]
     result = CliRunner().invoke(app, [*words, *options])
     assert result.exit_code == 0, result.output
+    refused = CliRunner().invoke(app, [*words, *options])
+    assert refused.exit_code == 2
+    assert "--overwrite" in refused.output
+    replaced = CliRunner().invoke(app, [*words, *options, "--overwrite"])
+    assert replaced.exit_code == 0, replaced.output
     svg = target.read_text()
     ElementTree.fromstring(svg)
     size = load().size("cavity", "mini")

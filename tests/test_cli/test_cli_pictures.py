@@ -60,6 +60,46 @@ def test_python_draws_the_same_picture(
         lagbench.animate(file, beside=4, output=tmp_path / "none" / "film.gif")
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("plot", "--kind", "speed", "--frame", 5), "curl-noise-tiny-0003-frame5.png"),
+        (("plot", "-o", "a.png"), "a.png"),
+        (("plot", "--sheet", "-o", "a.png"), "a.png"),
+        (("animate", "--every", 13, "-o", "a.gif"), "a.gif"),
+    ],
+)
+def test_a_file_is_replaced_only_on_request(
+    words: tuple[str, ...],
+    name: str,
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A picture that is named after its data is a file like any other."""
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(b"the work of a week")
+    data_set = (SPLIT, "--size", SIZE, "--root", generated.root)
+    refused = run(*words, *data_set)
+    assert refused.exit_code == 2, refused.output
+    assert "--overwrite" in refused.stderr
+    assert Path(name).read_bytes() == b"the work of a week"
+    replaced = run(*words, *data_set, "--overwrite")
+    assert replaced.exit_code == 0, replaced.output
+    assert Path(name).read_bytes()[:3] in {b"\x89PN", b"GIF"}
+
+
+def test_a_device_is_no_place_for_a_picture(
+    run: Run, generated: GenerationResult
+) -> None:
+    """It would be replaced by a file."""
+    file = generated.folder / "test" / "0003.nc"
+    result = run("plot", file, "-o", "/dev/null", "--overwrite")
+    assert result.exit_code == 2, result.output
+    assert Path("/dev/null").is_char_device()
+
+
 def test_two_files_become_one_film(
     run: Run,
     generated: GenerationResult,

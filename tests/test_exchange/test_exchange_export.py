@@ -318,8 +318,8 @@ def test_an_export_that_breaks_off_is_not_whole(
 def test_the_same_data_give_the_same_bytes(
     mixed: LocalSplit, tmp_path: Path, form: str
 ) -> None:
-    """Two exports are equal byte for byte; a second one needs --force where the first
-    is.
+    """Two exports are equal byte for byte; a second one needs --overwrite where
+    the first is.
     """
     one, two = (
         export(str(mixed.folder), format=form, output=tmp_path / name) for name in "ab"

@@ -405,6 +405,9 @@ def test_an_entry_carries_an_onnx_model(
         root=generated.root,
     )
     assert prediction.method == "lines"
+    with pytest.raises(UsageError) as caught:
+        predict_onnx(path, path, split=SIZE.split, size=SIZE.name, root=generated.root)
+    assert "--overwrite" in str(caught.value.fix)
     board = tmp_path / "board"
     meta = Meta(authors=("A. Author",), command="make")
     options: dict[str, Any] = {
