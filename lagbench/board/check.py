@@ -30,6 +30,7 @@ from .folder import Folder
 from .folder_checks import FolderChecks
 from .issues import issue_from_error, make_issue
 from .rescoring import Confirmation, Rescoring
+from .season_checks import check_seasons
 from .verified import record_verified
 
 MOST_METRICS = 3  # metrics that an issue names
@@ -107,6 +108,12 @@ def check_board(
     )
     checks.run()
     issues = checks.issues
+    issues += check_seasons(
+        folder,
+        checks.entries,
+        readable_score_files=checks.readable_score_files,
+        registry=described,
+    )
     if base is not None:
         issues += check_base(folder, base, own)
 

@@ -23,12 +23,10 @@ from lagbench.submission.issues import ValidationIssue
 from .entry import Entry, EntryBudget, Prediction, Status, Summary, Verification
 from .entry_file import examine, load_plain
 from .fields import latest_date
-from .folder import SEASONS, VERIFIED, Folder, Place, entry_path
+from .folder import VERIFIED, Folder, Place, entry_path
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
 from .ranking import TOLERANCE, combine, dataset_of, summarise
-from .season import read_season
-from .season_scores import read_scores
 from .selection import is_current
 from .shift import check_shift
 from .verified import read_verified, verification_of
@@ -74,7 +72,6 @@ class FolderChecks:
         self._check_stray_score_files()
         self._check_verified()
         self.issues += check_shift(self.folder, self.entries, self.registry)
-        self._check_seasons()
 
     def _add(
         self,
@@ -457,18 +454,6 @@ class FolderChecks:
                 what="other numbers of scenarios than the test subset has",
                 expected=f"at most {test_count} of {test_count}",
             )
-
-    def _check_seasons(self) -> None:
-        """Check that seeds and scores of seasons follow from their frozen models."""
-        names = {path.parts[1] for path in self.folder.season_files()}
-        for name in sorted(names):
-            try:
-                season = read_season(self.folder, name)
-                read_scores(self.folder, season)
-            except LagbenchError as error:
-                self.issues.append(
-                    issue_from_error("season", error, error.where or SEASONS)
-                )
 
 
 def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:

@@ -166,8 +166,9 @@ CHECKS: Mapping[str, BoardCheck] = {
         "remove the line, and score anew: lagbench leaderboard shift ENTRY",
     ),
     "season": BoardCheck(
-        "a file of a blind season that cannot be read, or whose seeds, scenarios or "
-        "models are not those that were frozen",
+        "a file of a blind season that cannot be read, whose seeds, scenarios or "
+        "models are not those that were frozen, or whose public scores are not those "
+        "of the score files",
         "a season is not the one that was closed",
         "what `lagbench season close` and `lagbench season run` wrote",
         "restore the files of the commit that closed the season",

@@ -22,7 +22,7 @@ from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
-from lagbench.metrics.aggregate import Score, Tally, score
+from lagbench.metrics.aggregate import Tally, score
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import given_in
@@ -57,8 +57,10 @@ from .season_scores import (
     DataSetScores,
     ModelScores,
     SeasonScores,
+    find_prediction,
     frozen_models,
     read_scores,
+    values_of,
 )
 
 SAVED = "scores.json"
@@ -193,15 +195,6 @@ def _values_of(scores: SeasonScores) -> Iterable[float]:
         for model in data_set.models:
             yield from model.public.values()
             yield from model.blind.values()
-
-
-def values_of(scores: Score) -> dict[int, float]:
-    """Return the value of a metric in each scenario that has one, nine digits."""
-    values = {}
-    for scenario, value in zip(scores.scenarios, scores.values.tolist(), strict=True):
-        if np.isfinite(value):
-            values[scenario] = round_digits(value, DIGITS)
-    return values
 
 
 @dataclass(kw_only=True)
@@ -426,12 +419,9 @@ class _SeasonRun:
         except UnreadableFileError:
             entry = None
         if entry is not None:
-            for index, prediction in enumerate(entry.predictions):
-                weights = prediction.weights
-                if weights is None or prediction.seed != model.seed:
-                    continue
-                if weights.sha256 == model.sha256:
-                    return entry, index
+            index = find_prediction(entry, model)
+            if index is not None:
+                return entry, index
         raise ChecksFailedError(
             "the frozen model is no longer on the board",
             where=str(path),

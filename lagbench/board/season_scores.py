@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
+from lagbench.data.checksums import round_digits
 from lagbench.errors import ChecksFailedError
+from lagbench.metrics.aggregate import Score
 
-from .entry import Strict
+from .entry import Entry, Strict
 from .entry_file import examine, format_issues, load_plain
 from .fields import Hash, Name, Number, Seed
 from .folder import SEASON_SCORES, Folder
+from .scores_compared import DIGITS
 from .season import (
     MOST_SEASON_BYTES,
     FrozenEntry,
@@ -125,6 +129,26 @@ def _find_mismatch(season: Season, scores: SeasonScores) -> str | None:
             found.append((one.method, one.seed, one.model, count))
         if found != expected:
             return f"{place}: other models"
+    return None
+
+
+def values_of(scores: Score) -> dict[int, float]:
+    """Return the value of a metric in each scenario that has one, nine digits."""
+    values = {}
+    for scenario, value in zip(scores.scenarios, scores.values.tolist(), strict=True):
+        if np.isfinite(value):
+            values[scenario] = round_digits(value, DIGITS)
+    return values
+
+
+def find_prediction(entry: Entry, model: FrozenModel) -> int | None:
+    """Return the number of the prediction that a frozen model made, None without it."""
+    for index, prediction in enumerate(entry.predictions):
+        weights = prediction.weights
+        if weights is None or prediction.seed != model.seed:
+            continue
+        if weights.sha256 == model.sha256:
+            return index
     return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -289,6 +290,41 @@ def test_an_edited_season_is_found(
     path.write_text(text)
     checks = [issue.check for issue in own.find().findings]
     assert checks == ["season"]
+
+
+@pytest.mark.parametrize("place", ["public_reference", "public"])
+def test_public_values_are_those_of_the_score_files(
+    own: ModelBoard, place: str
+) -> None:
+    """An edited one would change the gap to the blind values in silence."""
+    path = own.folder / "seasons" / SEASON / "scores.yaml"
+    assert own.find().findings == ()
+    old = re.search(rf" {place}: {{(\d+): ([\d.]+)", path.read_text())
+    assert old is not None
+    new = old[0][: -len(old[2])] + "0.25"
+    path.write_text(path.read_text().replace(old[0], new))
+    (issue,) = own.find().findings
+    assert issue.check == "season"
+    assert f"scenario {old[1]}: 0.25" in str(issue.got)
+    assert f"scenario {old[1]}: {old[2]}" in str(issue.expected)
+    run_season(own.folder, SEASON, root=own.root)
+    assert own.find().findings == ()
+
+
+def test_a_missing_public_value_is_found(own: ModelBoard) -> None:
+    path = own.folder / "seasons" / SEASON / "scores.yaml"
+    public = re.compile(r" public: {\d+: [\d.]+, ")
+    path.write_text(public.sub(" public: {", path.read_text()))
+    (issue,) = own.find().findings
+    assert issue.check == "season"
+
+
+def test_a_removed_entry_leaves_its_season_alone(own: ModelBoard) -> None:
+    """Its score files are gone, and the frozen values stay."""
+    for room in ("submissions", "scores", "weights"):
+        shutil.rmtree(own.folder / room / "curl-noise")
+    (own.folder / "submissions/curl-noise/tiny").mkdir(parents=True)
+    assert own.find().findings == ()
 
 
 def test_other_models_and_other_scenarios_are_refused(
