@@ -49,6 +49,19 @@ CHUNK_CACHE = 1 << 20
 MAX_FACTS_LENGTH = 4096
 """Characters of ``facts``, which no hash covers and the manifest repeats."""
 
+STATED_NAMES = frozenset(
+    (
+        "active_frames",
+        "friction",
+        "obstacle_diameter",
+        "obstacle_x",
+        "obstacle_y",
+        "obstacle_z",
+        "viscosity",
+    )
+)
+"""Parameters that lagbench or a user reads from the file, if the file states them."""
+
 _FACT_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
@@ -80,6 +93,35 @@ class ScenarioHeader:
         """Coulomb friction of the walls that the file states [1]; None without one."""
         stated = self.parameters.get("friction")
         return _parse_number(stated, "friction", unit="1", where=f"{self.key}")
+
+
+def select_parameters(
+    attributes: Mapping[str, object], *, where: str
+) -> dict[str, object]:
+    """Return those attributes of a file that its content hash covers, by name.
+
+    Args:
+        attributes: all attributes of the file.
+        where: the file.
+
+    Raises:
+        DataError: a parameter is missing that the file names as hashed.
+    """
+    names = attributes.get("hashed_parameters", "")
+    if isinstance(names, bytes):
+        names = names.decode("utf-8", "replace")
+    parameters = {}
+    for name in str(names).split():
+        if name not in attributes:
+            raise DataError(
+                "a parameter is missing",
+                where=f"{where}, attribute {name}",
+                expected="a value, as hashed_parameters names it",
+                got="no such attribute",
+                fix="make the file again",
+            )
+        parameters[name] = attributes[name]
+    return parameters
 
 
 def parse_viscosity(stated: object, *, where: str) -> float | None:
@@ -196,6 +238,17 @@ class ScenarioFile:
 
     def check_attributes(self) -> None:
         """Refuse attributes that make other readers read other values."""
+        with _damage_errors(self.path):
+            names = read_attributes(self._file).keys()
+        unhashed = sorted((STATED_NAMES & names) - self.header.parameters.keys())
+        if unhashed:
+            raise DataError(
+                "the file states parameters that no hash covers",
+                where=f"{self.path}, attributes",
+                expected="each of them in hashed_parameters",
+                got=", ".join(unhashed),
+                fix=_repair_hint(self.path),
+            )
         for name, variable in sorted(self._variables.items()):
             with _damage_errors(self.path, name):
                 attributes = read_attributes(variable)

@@ -16,7 +16,7 @@ from lagbench.data.box import AXES
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.obstacle import parse_obstacle
-from lagbench.data.scenario import damage_error, parse_viscosity
+from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
 from lagbench.errors import DataError
 
 from .copy import scenario_files, update_working_copy
@@ -113,8 +113,9 @@ def open_split(
         for scenario, path in paths.items():
             file = _open_scenario(path, tier.key(scenario), hint)
             scenarios.append(open_files.enter_context(file))
-            viscosities.append(_read_viscosity(file, tier, path))
-            obstacle = parse_obstacle(file.attrs, tier.dimension, where=str(path))
+            parameters = select_parameters(file.attrs, where=str(path))
+            viscosities.append(_read_viscosity(parameters, tier, path))
+            obstacle = parse_obstacle(parameters, tier.dimension, where=str(path))
             if obstacle is not None:
                 obstacles.append(obstacle)
         joined = _join_scenarios(scenarios, list(paths))
@@ -175,9 +176,9 @@ def _join_scenarios(
     return joined
 
 
-def _read_viscosity(file: xr.Dataset, tier: Size, path: Path) -> float:
+def _read_viscosity(parameters: Mapping[str, object], tier: Size, path: Path) -> float:
     """Return the given viscosity of a scenario [length^2/s], NaN where unknown."""
-    stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
+    stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
     viscosity = tier.viscosity(stated)
     if viscosity is None:
         return math.nan

@@ -25,7 +25,7 @@ from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import damage_error, parse_viscosity
+from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
 from lagbench.data.summary import summarise_arrays
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
@@ -227,9 +227,10 @@ class FrameStore:
         body_force = None
         if "body_force" in variables:
             body_force = variables["body_force"][...]
-        stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
+        parameters = select_parameters(file.attrs, where=str(path))
+        stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
         viscosity = self._size.viscosity(stated)
-        obstacle = parse_obstacle(file.attrs, self._size.dimension, where=str(path))
+        obstacle = parse_obstacle(parameters, self._size.dimension, where=str(path))
         return _OpenScenario(
             file, position, material, wall_velocity, body_force, viscosity, obstacle
         )

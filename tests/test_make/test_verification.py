@@ -438,3 +438,38 @@ def test_regeneration_needs_taichi(
     with pytest.raises(UsageError) as caught:
         verify("fluid", "tiny", root=tmp_path, regenerate=1)
     assert caught.value.where == "this needs the extra 'generate'"
+
+
+@pytest.mark.parametrize("name", ["obstacle_x", "obstacle_y", "obstacle_diameter"])
+def test_a_changed_obstacle_is_named(
+    name: str, tiny_split: Callable[..., GenerationResult], tmp_path: Path
+) -> None:
+    """Its place and its size are hashed parameters of a file."""
+    size = load().size("cylinder", "tiny")
+    scenario = size.subsets["test"][0]
+    source = tiny_split("cylinder").root
+    path = size.path(tmp_path, scenario)
+    path.parent.mkdir(parents=True)
+    shutil.copy(size.path(source, scenario), path)
+    verify("cylinder", "tiny", root=tmp_path, scenarios=[scenario]).check()
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = 0.999 * file.attrs[name]
+    result = verify("cylinder", "tiny", root=tmp_path, scenarios=[scenario])
+    (problem,) = result.problems
+    assert name in problem
+
+
+def test_an_obstacle_that_no_hash_covers_is_named(
+    copied: Copy, measured: Registry
+) -> None:
+    """All values have their hashes, and yet readers would see an obstacle."""
+    root = copied()
+    place = {"obstacle_x": 0.5, "obstacle_y": 0.5, "obstacle_diameter": 0.2}
+    with h5py.File(file_of(root), "r+") as file:
+        for name, value in place.items():
+            file.attrs[name] = value
+    result = verify_tiny(root, measured)
+    (problem,) = result.problems
+    assert "obstacle_diameter, obstacle_x, obstacle_y" in problem
+    with pytest.raises(DataError):
+        result.check()

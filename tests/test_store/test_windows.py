@@ -8,6 +8,7 @@ import math
 import os
 import pickle
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import SIZE, SPLIT
 from numpy.testing import assert_array_equal
 from scenario_factory import frames_of, make_key, write_scenario
 from torch.utils.data import DataLoader
@@ -453,6 +455,28 @@ def test_a_viscosity_that_is_none_is_damage(
     with pytest.raises(DataError) as caught:
         data[0]
     assert path.name in (caught.value.where or "")
+
+
+def test_parameters_that_no_hash_covers_are_not_read(
+    generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Anybody can add an attribute to a file, and its content hash stays."""
+    root = tmp_path / "data"
+    shutil.copytree(generated.root, root)
+    size = load().size(SPLIT, SIZE)
+    expected = lagbench.windows(SPLIT, size=SIZE, subset="test", root=root)[0]
+    for scenario in size.subsets["test"]:
+        with h5py.File(size.path(root, scenario), "r+") as file:
+            file.attrs["obstacle_x"] = 0.5
+            file.attrs["obstacle_y"] = 0.5
+            file.attrs["obstacle_diameter"] = 0.2
+            file.attrs["viscosity"] = 0.125
+    window = lagbench.windows(SPLIT, size=SIZE, subset="test", root=root)[0]
+    assert window.obstacle is None
+    assert window.viscosity == expected.viscosity
+    with lagbench.open_split(SPLIT, subset="test", size=SIZE, root=root) as data:
+        assert "obstacle" not in data.coords
+        assert set(data.viscosity.values) == {expected.viscosity}
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
