@@ -618,12 +618,13 @@ def validate_options(
     if detail["type"] == "extra_forbidden":
         *parents, unknown_key = location
         known_keys = _known_keys(options, parents)
+        prefix = "".join(f"{part}." for part in path[:-1])
         raise error_class(
             f"unknown key {key!r}",
             where=where,
             expected="a key of a recipe",
             got=repr(key),
-            fix=suggest_name(str(unknown_key), known_keys),
+            fix=suggest_name(str(unknown_key), known_keys, prefix=prefix),
         )
 
     value = detail["input"]

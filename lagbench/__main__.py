@@ -42,6 +42,9 @@ from .errors import (
     find_place_in_extension,
 )
 
+PROGRAM = "lagbench"
+"""The word that begins each command line."""
+
 INTERRUPTED = 130
 FAILED = 5
 PIPE_CLOSED = 141
@@ -221,6 +224,15 @@ def _translate_click_error(error: Any) -> LagbenchError:  # noqa: ANN401 (two co
     extra_words = _EXTRA_WORDS.search(message)
     if extra_words is not None and context is not None:
         return _extra_words_error(context, command, extra_words[1])
+    if sys.argv[1:2] == [PROGRAM]:
+        words = " ".join(map(shorten_word, sys.argv[2:]))
+        return UsageError(
+            "the name of the program is typed twice",
+            where=PROGRAM,
+            expected="the name of a command",
+            got=f"{PROGRAM} {_typed_words()}",
+            fix=f"write it once: {PROGRAM} {words or '--help'}",
+        )
     return UsageError(
         message[:1].lower() + message[1:],
         where=command,

@@ -367,14 +367,20 @@ def format_count(number: int, noun: str) -> str:
     return f"{number} {noun}s"
 
 
-def suggest_name(name: str, known_names: Iterable[str]) -> str:
+def suggest_name(name: str, known_names: Iterable[str], *, prefix: str = "") -> str:
     """Return a hint that names the known word nearest to a wrong one.
+
+    ``prefix`` stands before each word as a user writes it; it makes no words alike.
 
     >>> suggest_name("cavty", ["fluid", "cavity"])
     "did you mean 'cavity'? known: cavity, fluid"
+    >>> suggest_name("latant", ["latent"], prefix="model.")
+    "did you mean 'model.latent'? known: model.latent"
     """
-    words = sorted(known_names)
-    close_words = difflib.get_close_matches(name, words, n=5, cutoff=0.5)
+    names = sorted(known_names)
+    close_names = difflib.get_close_matches(name, names, n=5, cutoff=0.5)
+    words = [f"{prefix}{known}" for known in names]
+    close_words = [f"{prefix}{close}" for close in close_names]
     listing = f"known: {', '.join(words) or 'none'}"
     if len(words) > MOST_NAMES:
         if close_words:

@@ -184,7 +184,7 @@ def test_the_speed_up_needs_the_solver(
         (
             ("--baseline", "gns", *TINY, "--set", "model.latant=3"),
             2,
-            "did you mean 'latent'",
+            "did you mean 'model.latent'",
         ),
         (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
         (("--baseline", "gns", *TINY, *HUGE), 2, "training.steps"),
