@@ -108,6 +108,19 @@ class Baseline(nn.Module):
             particles and other distances.
         any_box: whether the model knows periodic boxes as well as walls, and three
             dimensions as well as two.
+        computes_on_cpu: whether its rollouts compute on the CPU, on whatever device the
+            batch lies, as solvers in NumPy do. Predictions then stay on the CPU.
+        closed_form: whether the model is fitted as a whole instead of trained step by
+            step. It then has a method ``fit`` beside the contract. ``fit(scenarios)``
+            gets an iterator over the positions of each scenario of train [length],
+            shape [frame, particle, axis], as NumPy arrays. It sets buffers of the model
+            and returns numbers to log, by name. Nothing calls :meth:`forward`.
+        fits_batches: whether a closed form is called as ``fit(scenarios, *, count)``,
+            with batches. Each batch is a whole scenario, a single window of all its
+            frames, with what its file states beside the positions. ``count(n)`` reports
+            n units of work after the reading, for the progress bar; the attribute or
+            property ``evaluations`` states their number beforehand. An option
+            ``scenarios`` of the model bounds how many scenarios are read.
 
     Args:
         options: the model's options.
@@ -118,6 +131,9 @@ class Baseline(nn.Module):
     method: ClassVar[str]
     any_size: ClassVar[bool] = False
     any_box: ClassVar[bool] = False
+    computes_on_cpu: ClassVar[bool] = False
+    closed_form: ClassVar[bool] = False
+    fits_batches: ClassVar[bool] = False
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
@@ -247,7 +263,7 @@ def count_parameters(model: Baseline) -> int:
     These are its parameters, or the coefficients of a closed form.
     """
     count = 0
-    if getattr(model, "closed_form", False):
+    if model.closed_form:
         for tensor in model.state_dict().values():
             if tensor.is_floating_point():
                 count += tensor.numel()

@@ -39,6 +39,7 @@ from .augmentation import (
 )
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
 from .forcing import require_force, skip_frames
+from .free_flight import FALL_UNIT
 from .neuralmpm_accelerations import (
     Accelerations,
     FieldAccelerations,
@@ -54,7 +55,6 @@ from .unet import NODES_PER_COARSE_NODE, ContextNetwork, UNet
 LIQUID = 0  # material without a shape to come back to
 VISCOSITY_UNIT = 1e-3  # viscosity whose channel is 0 [length^2/s]
 LEAST_VISCOSITY = 1e-6  # lower ones look like it: they act on no grid of ours
-FALL_UNIT = 10.0  # fall by a learned number of 1, in deviations of accelerations
 
 Frame = tuple[Tensor, Tensor]  # position [length] and velocity [length/frame]
 

@@ -113,7 +113,7 @@ def start_from(
         UnreadableFileError: the file is no checkpoint, or changed while it was read.
         DataError: the data set is missing, or of another version than the weights'.
     """
-    if getattr(entry.model, "closed_form", False):
+    if entry.model.closed_form:
         raise UsageError(
             f"{entry.model.method} is fitted as a whole, without steps",
             where=WHERE,

@@ -223,7 +223,7 @@ def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
     """Fit a model or descend on its loss, in a folder without an earlier training."""
     if job.earlier is None and not is_helper():
         job.folder.clear()
-    if getattr(model, "closed_form", False):
+    if model.closed_form:
         log, steps = fit(job, model)
     else:
         log, steps = descend(job, model)
@@ -463,11 +463,7 @@ def _make_loader(
 def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
     """Fit a model to every scenario; return the log and its one step.
 
-    A baseline with ``closed_form = True`` has a method ``fit`` beside the contract. It
-    sets the coefficients from positions of each scenario, shape [frame, particle, 2],
-    and returns numbers to log. With ``fits_batches = True`` it gets each scenario as a
-    batch of one window, with walls and viscosity, and a function to call after each of
-    its ``evaluations``.
+    :class:`Baseline` describes what the method ``fit`` of the model gets and returns.
     """
     log = job.start_log()
     if job.earlier is not None:
@@ -485,7 +481,7 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
             fix="leave the option out",
         )
 
-    if getattr(model, "fits_batches", False):
+    if model.fits_batches:
         scenarios = _read_scenarios(
             job,
             most=getattr(model.options, "scenarios", None),

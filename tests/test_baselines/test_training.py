@@ -7,11 +7,11 @@ import random
 import re
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import netCDF4
@@ -53,6 +53,7 @@ def run(
         monkeypatch,
         drift=Drift,
         wrong=Wrong,
+        fitted=FittedDrift,
     )
 
 
@@ -681,6 +682,58 @@ def test_other_files_among_the_logs_are_not_cleared(tmp_path: Path) -> None:
     RunFolder(tmp_path).clear()
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert files == [notes]
+
+
+class FittedDrift(Drift):
+    """The Drift that docs/baselines.md fits as a whole; it keeps what it has seen."""
+
+    closed_form = True
+    fits_batches = True
+    evaluations = 3
+    seen: ClassVar[list[Batch]] = []
+
+    def fit(
+        self, scenarios: Iterable[Batch], *, count: Callable[[int], None]
+    ) -> dict[str, float]:
+        """Set a to a quotient of sums over all particles and frames."""
+        products = 0.0
+        squares = 0.0
+        for batch in scenarios:
+            self.seen.append(batch)
+            step = batch.position.double().diff(dim=1)
+            products += float((step[:, 1:] * step[:, :-1]).sum())
+            squares += float(step[:, :-1].square().sum())
+        for _ in range(self.evaluations):
+            count(1)
+        self.a.data.fill_(products / squares)
+        return {"best": products / squares}
+
+
+def test_a_users_fit_gets_whole_scenarios_as_batches(
+    run: Run, generated: GenerationResult
+) -> None:
+    """Each has all frames and what its file states; the numbers are logged."""
+    FittedDrift.seen.clear()
+    reports: list[Progress] = []
+    result = run("fitted", progress=reports.append)
+    products = 0.0
+    squares = 0.0
+    paths = sorted(generated.folder.glob("train/*.nc"))
+    for path, batch in zip(paths, FittedDrift.seen, strict=True):
+        with netCDF4.Dataset(path) as data:
+            position = np.asarray(data["position"][:], np.float64)
+        assert batch.windows == 1
+        assert batch.position.shape[:2] == (position.shape[1], position.shape[0])
+        assert batch.particle_mass is not None
+        step = np.diff(position, axis=0)
+        products += float((step[1:] * step[:-1]).sum())
+        squares += float((step[:-1] ** 2).sum())
+    best = products / squares
+    assert read_training_log(result.folder)["loss"]["best"] == pytest.approx(best)
+    exact = load(result.folder / "checkpoint.pt").weights["a"]
+    assert float(exact) == pytest.approx(best)
+    fitting = [report for report in reports if report.stage == "fitting"]
+    assert fitting[-1].total == fitting[-1].done == len(paths) + 3
 
 
 def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
