@@ -24,6 +24,7 @@ class Hybrid(Baseline):
     closed_form: ClassVar[bool] = True
     fits_batches: ClassVar[bool] = True
     any_box: ClassVar[bool] = True
+    computes_on_cpu: ClassVar[bool] = True
     largest: ClassVar[float]
 
     coefficients: Tensor

@@ -121,7 +121,8 @@ def predict(
         size: size of the split to predict; that of the training when None.
         subset: the subset to predict: test, or shift, which lies outside train.
         settings: changes of options that have no weights, as in ``model.average=true``.
-        device: ``cpu``, ``cuda`` or ``auto``.
+        device: ``cpu``, ``cuda`` or ``auto``; a model that computes on the CPU alone
+            stays there.
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
         method: name of the method; the model's own by default.
@@ -165,11 +166,13 @@ def predict(
         registry=known_splits,
     )
     paths = list(tests.values())
-    side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
 
     with use_threads(threads), explain_memory_errors("lower --batch"):
         model = restore_for_size(trained, info, settings, known_splits, where=where)
+        if model.computes_on_cpu:
+            machine = "cpu"
         model = model.to(machine)
+        side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
         viscosity = known_splits.size(info.split, info.size).viscosity()
         rollouts = _TimedRollouts(
             model, info, paths, side_by_side, machine, viscosity=viscosity

@@ -197,6 +197,18 @@ def test_the_file_describes_method_and_cost(run: Predict) -> None:
     assert cost["seconds_without_search"] == result.seconds_per_frame
 
 
+def test_a_model_that_computes_on_the_cpu_stays_there(
+    run: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Scenarios side by side gain it nothing, and the time is that of the CPU."""
+    monkeypatch.setattr(prediction, "choose_device", lambda device: "cuda")
+    monkeypatch.setattr(Drift, "computes_on_cpu", True)
+    result = run(device="cuda")
+    assert result.batch == 1
+    assert result.clock == "processor"
+    assert "thread" in result.device
+
+
 def test_batches_do_not_matter(run: Predict) -> None:
     """Scenarios side by side are predicted as one by one."""
     alone = run(name="alone.nc", batch=1)
