@@ -143,11 +143,11 @@ def predict(
             as the weights.
         WorkFailedError: out of memory, or the disk is full.
     """
+    checkpoint_path = Path(checkpoint)
+    trained = load(checkpoint)
     output_path = Path(output)
     check_replaceable(output_path)
     check_output_file(output_path, overwrite=overwrite)
-    checkpoint_path = Path(checkpoint)
-    trained = load(checkpoint)
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = resolve_root(root)

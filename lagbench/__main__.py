@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar
@@ -29,6 +29,7 @@ from .cli.commands import (
 )
 from .cli.typed_settings import (
     NEGATIVE_NUMBER,
+    advise_on_baselines,
     advise_on_lists,
     advise_on_settings,
     shorten_word,
@@ -233,6 +234,9 @@ def _translate_click_error(error: Any) -> LagbenchError:  # noqa: ANN401 (two co
             got=f"{PROGRAM} {_typed_words()}",
             fix=f"write it once: {PROGRAM} {words or '--help'}",
         )
+    typed_command = _find_command(sys.argv[2:3])
+    if sys.argv[1:2] == ["help"] and typed_command is not None:
+        command = f"{PROGRAM} {typed_command}"
     return UsageError(
         message[:1].lower() + message[1:],
         where=command,
@@ -264,6 +268,19 @@ def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN4
             "the size and write it into predictions",
         )
     fix = _name_help(command)
+    single_hyphen = _find_single_hyphen(error)
+    if single_hyphen is not None:
+        return UsageError(
+            "no such option",
+            where=command,
+            expected="a long option with two hyphens",
+            got=shorten_word(single_hyphen),
+            fix=f"write two hyphens: -{single_hyphen.partition('=')[0]}",
+        )
+    typed_command = _find_command(sys.argv[1:])
+    if command == PROGRAM and typed_command is not None:
+        fix = f"write options behind the command: {PROGRAM} {typed_command} ... "
+        fix += error.option_name
     options = error.possibilities or ()
     if options:
         fix = f"did you mean {', '.join(options)}? {fix}"
@@ -283,6 +300,29 @@ def _unknown_option_error(error: Any, command: str) -> UsageError:  # noqa: ANN4
         got=error.option_name,
         fix=fix,
     )
+
+
+def _find_single_hyphen(error: Any) -> str | None:  # noqa: ANN401 (two copies of click)
+    """Return a word such as -split or -split=cavity, for which there is --split."""
+    if error.ctx is None:
+        return None
+    options = set()
+    for parameter in error.ctx.command.params:
+        options.update(parameter.opts)
+    for word in sys.argv[1:]:
+        name = word.partition("=")[0]
+        if word.startswith(error.option_name) and f"-{name}" in options:
+            return word
+    return None
+
+
+def _find_command(words: Sequence[str]) -> str | None:
+    """Return the first word that is the name of a command or a group."""
+    names = {entry.name for entry in COMMANDS}.union(GROUPS)
+    for word in words:
+        if word in names:
+            return word
+    return None
 
 
 def _missing_parameter_error(error: Any, command: str) -> UsageError:  # noqa: ANN401
@@ -362,6 +402,7 @@ def _extra_words_error(
         fix = (
             advise_on_lists(sys.argv)
             or advise_on_settings(sys.argv)
+            or advise_on_baselines(sys.argv)
             or "leave them out, or put quotes around a text with blanks; "
             f"`{command} --help`"
         )

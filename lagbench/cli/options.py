@@ -13,7 +13,11 @@ import typer
 
 from lagbench.errors import SPLIT_NAMED, UsageError
 
-from .typed_settings import advise_on_settings, check_typed_settings
+from .typed_settings import (
+    advise_on_baselines,
+    advise_on_settings,
+    check_typed_settings,
+)
 
 
 def parse_root(text: str) -> Path:
@@ -125,7 +129,7 @@ def choose_split(argument: str | None, option: str | None) -> str:
             where=SPLIT_NAMED,
             expected="one split: by SPLIT, by --split, or twice the same",
             got=" and ".join(sorted(names)),
-            fix=advise_on_settings(sys.argv) or fix,
+            fix=advise_on_settings(sys.argv) or advise_on_baselines(sys.argv) or fix,
         )
     return names.pop()
 

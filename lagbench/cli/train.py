@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +36,7 @@ from .options import (
 )
 from .output import format_seconds, print_result, print_warning
 from .progress import progress_bar
+from .typed_settings import advise_on_baselines
 
 if TYPE_CHECKING:
     from lagbench.baselines.train import TrainingResult
@@ -113,7 +115,7 @@ def train_command(
             where="--baseline",
             expected="the name of a reference model; docs/baselines.md lists them",
             got="nothing",
-            fix="name one, as in --baseline gns",
+            fix=advise_on_baselines(sys.argv) or "name one, as in --baseline gns",
         )
     require_libraries(TRAINING_LIBRARIES)
     # Torch takes seconds to load, so the data are looked for before. Of several

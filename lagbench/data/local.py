@@ -29,7 +29,6 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     check_regular,
-    suggest_name,
 )
 
 from .layout import (
@@ -42,7 +41,15 @@ from .layout import (
     url_of,
     working_copy_of,
 )
-from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
+from .registry import (
+    NO_GENERATOR,
+    Measured,
+    Registry,
+    Size,
+    Split,
+    load,
+    suggest_split,
+)
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"
 """Environment variable that names the root folder."""
@@ -179,7 +186,7 @@ class RootedRegistry(Registry):
                 where=SPLIT_NAMED,
                 expected="the name of a split, or the folder of a local one",
                 got=ascii(name),
-                fix=suggest_name(name, known_names),
+                fix=suggest_split(name, known_names),
             )
         return self.splits[name]
 

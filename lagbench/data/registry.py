@@ -77,6 +77,18 @@ def package_of(point: EntryPoint) -> str:
     return module.partition(".")[0]
 
 
+def suggest_split(name: str, known_names: Collection[str]) -> str:
+    """Return a hint for the name of a split that is not there.
+
+    >>> suggest_split("cavity,fluid", ["cavity", "fluid"])
+    'name one split in each command, as in --split cavity'
+    """
+    names = name.split(",")
+    if len(names) > 1 and set(names) <= {*known_names}:
+        return f"name one split in each command, as in --split {names[0]}"
+    return suggest_name(name, known_names)
+
+
 def list_entry_points(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, of the packages that are installed now.
 
@@ -518,7 +530,7 @@ class Registry:
                 where=SPLIT_NAMED,
                 expected="the name of a split; `lagbench list` shows all",
                 got=ascii(name),
-                fix=suggest_name(name, self.splits),
+                fix=suggest_split(name, self.splits),
             )
         return self.splits[name]
 
