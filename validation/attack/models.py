@@ -281,6 +281,19 @@ def wrong_tensor(path: Path, rng: np.random.Generator) -> None:
     _edit_weights(path, edit)
 
 
+def extreme_tensor(path: Path, rng: np.random.Generator) -> None:
+    """Fill a tensor with numbers near the ends of what may be accepted."""
+    values = (3.0, -3.0, 2.0, -2.0, 2.999, 1e-30, 3.001, 1e30)
+    value = values[rng.integers(len(values))]
+
+    def edit(content: Content) -> None:
+        tensors = content["weights"]
+        name = _choose(rng, tensors)
+        tensors[name] = torch.full_like(tensors[name], value)
+
+    _edit_weights(path, edit)
+
+
 def other_baseline(path: Path, rng: np.random.Generator) -> None:
     """Claim to be another model."""
     names = ("gns", "mlp", "var", "neuralmpm", "../x", "", "os.system", "\u202e")

@@ -36,7 +36,7 @@ from .arrays import (
     write_trajectories,
     write_walled_trajectories,
 )
-from .models import ONNX, write_straight_on
+from .models import ONNX, extreme_tensor, write_straight_on
 from .models import WEIGHTS as WEIGHT_MUTATIONS
 from .modules import GRAPH_SETTINGS, MODULES, SETTINGS
 from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
@@ -44,7 +44,7 @@ from .obstacles import OBSTACLES, write_scenario
 from .running import run_command
 from .safetensors_files import SAFETENSORS, write_small_network
 
-SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise")
+SPLITS = ("decaying-vortices", "curl-noise-3d", "curl-noise", "multimaterial")
 """Splits of which ``tiny`` is generated below the root where it is missing."""
 
 COMMITTED_ENTRIES = ("gns", "hybrid-projection")
@@ -205,13 +205,18 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
     models.mkdir()
     write_straight_on(models / "model.onnx")
     write_small_network(models / "model.safetensors", root)
-    run(
-        *("train", "--baseline", "hybrid-projection", "--split", "curl-noise"),
-        *("--size", "tiny", "-o", "run", "--device", "cpu", "-q"),
-        at="models",
-    )
-    shutil.copy(models / "run/weights.pt", models / "weights.pt")
-    shutil.rmtree(models / "run")
+    quick_fit = ("--set", "model.scenarios=1", "--set", "model.evaluations=1")
+    for baseline, split, name, settings in (
+        ("hybrid-projection", "curl-noise", "weights.pt", ()),
+        ("hybrid-coarse", "multimaterial", "coarse.pt", quick_fit),
+    ):
+        run(
+            *("train", "--baseline", baseline, "--split", split, "--size", "tiny"),
+            *("-o", "run", "--device", "cpu", "-q", *settings),
+            at="models",
+        )
+        shutil.copy(models / "run/weights.pt", models / name)
+        shutil.rmtree(models / "run")
     (models / "recipe.yaml").write_text(RECIPE)
 
     for split in ("decaying-vortices", "curl-noise-3d"):
@@ -322,6 +327,7 @@ def list_targets(folder: Path) -> list[Target]:
     """Return all targets; the valid files lie in a folder."""
     predict_model = ("predict", "model.onnx", "--split", "decaying-vortices")
     predict_weights = ("predict", "weights.pt", "-o", "p.nc", "--no-bench", "-q")
+    predict_coarse = ("predict", "coarse.pt", *predict_weights[2:])
     predict_network = ("predict", "model.safetensors", *predict_weights[2:])
     train = ("train", "--baseline", "hybrid-projection", "--split", "curl-noise")
     targets = [
@@ -342,6 +348,20 @@ def list_targets(folder: Path) -> list[Target]:
             victim="weights.pt",
             mutations=(*WEIGHT_MUTATIONS, *BYTES, *WEIGHT_MUTATIONS, *PLACES),
             commands=[predict_weights],
+            weight=12,
+        ),
+        Target(
+            name="hybrid-coarse: weights",
+            source="models",
+            victim="coarse.pt",
+            mutations=(
+                *WEIGHT_MUTATIONS,
+                *BYTES,
+                *[extreme_tensor] * 4,
+                *WEIGHT_MUTATIONS,
+                *PLACES,
+            ),
+            commands=[predict_coarse],
             weight=12,
         ),
         Target(
