@@ -8,9 +8,9 @@ own, films and maps are noise, so that nothing compresses away because two entri
 alike. Every fifth has three seeds, some are superseded, withdrawn or flagged, and their
 texts hold markup. The same call gives the same bytes. Exit code 1 if
 `lagbench leaderboard check` finds anything, a page built again with other bytes
-included, if the page of 150 entries has more than 2 MB, or if `build` or `show` takes
-more than 500 MB of memory or too much processor time: 10 s with 150 entries, 60 s with
-1,000.
+included, if the page of 150 entries has more than 2 MB, or if `build`, `show` or
+`check` takes more than 500 MB of memory or too much processor time: 10 s with 150
+entries, 60 s with 1,000. Child processes count in the time, not in the memory.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ from lagbench.submission.task_checks import frames_to_predict
 
 MOST_BYTES = 2_000_000
 MOST_ENTRIES_OF_A_PAGE = 150  # more may make a longer page
-MOST_MEMORY = 500_000_000  # of build and show [bytes]
-# processor time of build or show [s], up to that many entries and beyond
+MOST_MEMORY = 500_000_000  # of a command [bytes]
+# processor time of a command [s], up to that many entries and beyond
 MOST_SECONDS = 10.0
 MOST_SECONDS_BEYOND = 60.0
 
@@ -118,11 +118,11 @@ def _measure(target: Path, entries: int) -> int:
         make_entry(size, target, number, first=split_number)
 
     times = {}
-    memory = 0
-    for command in ("build", "show"):
+    memory = {}  # [bytes]
+    for command in ("build", "show", "check"):
         cpu, wall, peak = _measure_command(command, target)
         times[command] = (cpu, wall)
-        memory = max(memory, peak)
+        memory[command] = peak
     result = build(target)
     findings = check_board(target, page=True).findings
     for finding in findings:
@@ -146,12 +146,12 @@ def _measure(target: Path, entries: int) -> int:
             is_fast = False
         print(
             f"{command:12s} {cpu:.1f} s of processor time (limit {most_seconds:.0f} "
-            f"s), {wall:.1f} s"
+            f"s), {wall:.1f} s, {format_bytes(memory[command])}"
         )
-    print(f"memory       {format_bytes(memory)}, limit {format_bytes(MOST_MEMORY)}")
-    print(f"check        {len(findings)} findings")
+    print(f"memory       limit {format_bytes(MOST_MEMORY)}")
+    print(f"findings     {len(findings)}")
     is_short = result.bytes <= MOST_BYTES or is_beyond
-    is_small = memory <= MOST_MEMORY
+    is_small = max(memory.values()) <= MOST_MEMORY
     if not findings and is_short and is_fast and is_small:
         return 0
     return 1
@@ -166,7 +166,7 @@ def _measure_command(command: str, target: Path) -> tuple[float, float, int]:
     wall_start = time.perf_counter()
     done = subprocess.run(
         [*words, "--board", str(target)],
-        check=True,
+        check=command != "check",  # a check that finds something ends with 1
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -29,7 +29,7 @@ from lagbench.metrics.aggregate import (
     Score,
     bootstrap_interval,
     mean_over_seeds,
-    quantile,
+    quantiles,
     resample,
     student_quantile,
 )
@@ -350,8 +350,8 @@ def skill_gap(
         stretch = student / normal
         first_ratio = ratios[0] * np.exp(stretch * deviations[0])
         second_ratio = ratios[1] * np.exp(stretch * deviations[1])
-        ordered = np.sort(second_ratio - first_ratio)
-        interval = (quantile(ordered, 0.025), quantile(ordered, 0.975))
+        low, high = quantiles(second_ratio - first_ratio, (0.025, 0.975))
+        interval = (low, high)
     return SkillGap(first=1.0 - ratios[0], second=1.0 - ratios[1], interval=interval)
 
 
