@@ -10,7 +10,8 @@ texts hold markup. The same call gives the same bytes. Exit code 1 if
 `lagbench leaderboard check` finds anything, a page built again with other bytes
 included, if the page of 150 entries has more than 2 MB, or if `build`, `show` or
 `check` takes more than 500 MB of memory or too much processor time: 10 s with 150
-entries, 60 s with 1,000. Child processes count in the time, not in the memory.
+entries and 60 s with 1,000, three times as much for `check`, which forms all scores of
+all entries again. Child processes count in the time, not in the memory.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ MOST_MEMORY = 500_000_000  # of a command [bytes]
 # processor time of a command [s], up to that many entries and beyond
 MOST_SECONDS = 10.0
 MOST_SECONDS_BEYOND = 60.0
+MOST_TIMES_AS_LONG = {"build": 1.0, "show": 1.0, "check": 3.0}
 
 # The greatest memory that the system counts for children contains that of this process
 # before the child's program began, so the child states its own.
@@ -119,7 +121,7 @@ def _measure(target: Path, entries: int) -> int:
 
     times = {}
     memory = {}  # [bytes]
-    for command in ("build", "show", "check"):
+    for command in MOST_TIMES_AS_LONG:
         cpu, wall, peak = _measure_command(command, target)
         times[command] = (cpu, wall)
         memory[command] = peak
@@ -142,11 +144,12 @@ def _measure(target: Path, entries: int) -> int:
         most_seconds = MOST_SECONDS_BEYOND
     is_fast = True
     for command, (cpu, wall) in times.items():
-        if cpu > most_seconds:
+        limit = MOST_TIMES_AS_LONG[command] * most_seconds
+        if cpu > limit:
             is_fast = False
         print(
-            f"{command:12s} {cpu:.1f} s of processor time (limit {most_seconds:.0f} "
-            f"s), {wall:.1f} s, {format_bytes(memory[command])}"
+            f"{command:12s} {cpu:.1f} s of processor time (limit {limit:.0f} s), "
+            f"{wall:.1f} s, {format_bytes(memory[command])}"
         )
     print(f"memory       limit {format_bytes(MOST_MEMORY)}")
     print(f"findings     {len(findings)}")
