@@ -48,24 +48,30 @@ class ConventionalSquare(ConventionalFluid):
     """
 
     def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
-        """Take the memory and load the particles."""
-        # numbers of the nodes on the walls, and of those beside them in the box
-        self.low = parameters.wall
-        self.high = parameters.grid - parameters.wall
-        self.first = self.low + 1
-        self.last = self.high - 1
-        self.inside = (self.first, self.high)
+        """Number the nodes at the walls, take the memory and load the particles."""
+        # The walls lie half-way between two nodes. The ghost nodes lie half a cell
+        # outside the walls, the first and the last node half a cell inside.
+        self.low_ghost = parameters.wall
+        self.high_ghost = parameters.grid - parameters.wall
+        self.first = self.low_ghost + 1
+        self.last = self.high_ghost - 1
+        self.inside = (self.first, self.last + 1)
+
         top = WALLS.index("top")
-        self.lid = float(state.wall_velocity[top, 0])
-        side = parameters.grid + 1
+        self.lid_speed = float(state.wall_velocity[top, 0])
+
+        node_count = parameters.grid + 1  # along each axis
         fluid_mass = parameters.density * state.area
         super().__init__(
             parameters,
             state,
-            nodes=(side, side),
+            nodes=(node_count, node_count),
             mass=fluid_mass / parameters.particles,
         )
-        inset_cells = self.low + 0.5 + 1e-3
+
+        # Particles stay a thousandth of a cell inside the walls.
+        wall_cells = self.low_ghost + 0.5  # place of the low walls [cell]
+        inset_cells = wall_cells + 1e-3
         self.inset = inset_cells * self.dx
 
     @ti.func
@@ -79,18 +85,18 @@ class ConventionalSquare(ConventionalFluid):
     @ti.func
     def ends_of_row(self, k):
         """Return the left ghost node, the node beside it, and both on the right."""
-        left = ti.Vector([self.low, k])
+        left = ti.Vector([self.low_ghost, k])
         inside_left = ti.Vector([self.first, k])
-        right = ti.Vector([self.high, k])
+        right = ti.Vector([self.high_ghost, k])
         inside_right = ti.Vector([self.last, k])
         return (left, inside_left, right, inside_right)
 
     @ti.func
     def ends_of_column(self, i):
         """Return the lowest ghost node, the node beside it, and both at the top."""
-        bottom = ti.Vector([i, self.low])
+        bottom = ti.Vector([i, self.low_ghost])
         inside_bottom = ti.Vector([i, self.first])
-        top = ti.Vector([i, self.high])
+        top = ti.Vector([i, self.high_ghost])
         inside_top = ti.Vector([i, self.last])
         return (bottom, inside_bottom, top, inside_top)
 
@@ -126,14 +132,14 @@ class ConventionalSquare(ConventionalFluid):
 
         # The ghost nodes give their sums to the nodes inside the walls.
         flip = ti.Vector([-1.0, -1.0])
-        for k in range(self.low, self.high + 1):
+        for k in range(self.low_ghost, self.high_ghost + 1):
             left, inside_left, right, inside_right = self.ends_of_row(k)
             self.fold(inside_left, left, flip, 0.0)
             self.fold(inside_right, right, flip, 0.0)
-        for i in range(self.first, self.high):
+        for i in range(self.first, self.high_ghost):
             bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.fold(inside_bottom, bottom, flip, 0.0)
-            self.fold(inside_top, top, flip, self.lid)
+            self.fold(inside_top, top, flip, self.lid_speed)
 
         # Momentum becomes velocity, mass density.
         for i, k in ti.ndrange(self.inside, self.inside):
@@ -145,11 +151,11 @@ class ConventionalSquare(ConventionalFluid):
                 self.m[i, k] = mass / rest_mass
             else:
                 self.q[i, k] = 1.0
-        for k in range(self.first, self.high):
+        for k in range(self.first, self.high_ghost):
             left, inside_left, right, inside_right = self.ends_of_row(k)
             self.mirror(left, inside_left, 0.0)
             self.mirror(right, inside_right, 0.0)
-        for i in range(self.low, self.high + 1):
+        for i in range(self.low_ghost, self.high_ghost + 1):
             bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.mirror(bottom, inside_bottom, 0.0)
             self.mirror(top, inside_top, self.lid_at(i))
@@ -174,11 +180,11 @@ class ConventionalSquare(ConventionalFluid):
             self.ga[i, k] = push + drag
         for i, k in ti.ndrange(self.inside, self.inside):
             self.gv[i, k] += self.ga[i, k]
-        for k in range(self.first, self.high):
+        for k in range(self.first, self.high_ghost):
             left, inside_left, right, inside_right = self.ends_of_row(k)
             self.mirror_velocity(left, inside_left, 0.0)
             self.mirror_velocity(right, inside_right, 0.0)
-        for i in range(self.low, self.high + 1):
+        for i in range(self.low_ghost, self.high_ghost + 1):
             bottom, inside_bottom, top, inside_top = self.ends_of_column(i)
             self.mirror_velocity(bottom, inside_bottom, 0.0)
             self.mirror_velocity(top, inside_top, self.lid_at(i))
@@ -191,10 +197,10 @@ class ConventionalSquare(ConventionalFluid):
         """Return the lid speed that the ghost fill sees: halved in the last cells, 0 in
         the corners.
         """
-        speed = self.lid
+        speed = self.lid_speed
         if i == self.first or i == self.last:
-            speed = 0.5 * self.lid
-        if i == self.low or i == self.high:
+            speed = 0.5 * self.lid_speed
+        if i == self.low_ghost or i == self.high_ghost:
             speed = 0.0
         return speed
 

@@ -168,11 +168,16 @@ def main() -> int:
             exponents.append(f"{slope:.2f}")
         lines.append(["", "exponent", *exponents])
     caption = (
-        "The table shows the processor time of a predicted frame [ms] on one core. "
-        "The models are untrained; their options are those of the recipes for "
-        f"{SPLIT} {SIZE}. The factor q multiplies the resolution along each axis, so "
-        "the box holds 2,000 q^2 particles. The time grows as a power of the number "
-        "of particles. The last row shows the exponent of this power."
+        "## Time of a predicted frame for more and more particles\n\n"
+        "The table shows the processor time [ms] of one predicted frame on one core. "
+        f"It is the time of a rollout of {FRAMES} frames, divided by {FRAMES}. The "
+        "models are a graph network (`gns`), a network of whole frames (`mlp`) and "
+        "`neuralmpm`. They are untrained, because the weights do not change the time. "
+        f"Their options come from the recipes for {SPLIT} {SIZE}.\n\n"
+        f"The box holds {PARTICLES:,} q^2 particles: q multiplies the number of "
+        "particles along each axis. (Table 3.1 has another q.) A power of the number "
+        "of particles was fitted to the times of each model. The last row shows its "
+        "exponent; 1 means that the time grows linearly."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)

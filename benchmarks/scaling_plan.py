@@ -231,9 +231,9 @@ def one(text: str) -> int:
 def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs per particle."""
     lines = [
-        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] "
-        "| hash it again [ns] | statistics [ns] "
-        "| bytes in the file, per particle and frame |",
+        "| q | particles | drawing the start [ns] | a substep [ns] "
+        "| writing a frame [ns] | hashing a written frame [ns] "
+        "| statistics of a frame [ns] | bytes in the file, per particle and frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row, parts, _ in measured:
@@ -253,9 +253,9 @@ def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
 def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs of whole generations, beside the sum of the parts."""
     lines = [
-        "| q | frames | whole generation [core s] "
-        "| expected from the parts above [core s] | one frame [MB] "
-        "| parent, peak [MB] | worker, peak [MB] |",
+        "| q | frames | whole generation [core s] | sum of the parts [core s] "
+        "| one frame [MB] | peak memory of the client [MB] "
+        "| peak memory of a worker [MB] |",
         "|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row, parts, runs in measured:
@@ -295,23 +295,25 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     twins = TESTS * hours * (p.draw + HORIZON * frame_seconds)
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
-    perturbed_runs = f"perturbed runs of the test scenarios ({100 * TESTS:.0f} %)"
+    perturbed_runs = (
+        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all)"
+    )
     rows = {
         "bytes before compression": f"{raw_terabytes:.2f} TB",
         "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB each)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{writing:,.0f} core hours",
         perturbed_runs: f"{twins:,.0f} core hours",
-        "statistics of the train scenarios (80 %)": f"{statistics:,.0f} core hours",
+        "statistics of the train scenarios (80 % of all)": f"{statistics:,.0f} core hours",
         "one `lagbench verify`": f"{checking:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"{SCENARIOS:,} scenarios of {n:,} particles, {frames} frames of "
-        f"{row.substeps} substeps, "
+        f"The following plan is for {SCENARIOS:,} scenarios. Each has {n:,} "
+        f"particles, {frames} frames of {row.substeps} substeps, and a grid of "
         f"{row.grid} x {row.grid} cells:",
         "",
-        "| | |",
+        "| part | size or time |",
         "|---|--:|",
         *(f"| {name} | {value} |" for name, value in rows.items()),
     ]
@@ -361,7 +363,20 @@ def main() -> int:
     _, largest_parts, _ = measured[-1]
     memory = extrapolate_memory(measured, million.particles)
     lines = [
+        "# Costs of large scenarios",
+        "",
+        "q names a row of Table 3.1 of the thesis. The row gives the number of "
+        "particles, the grid and the substeps. The first table shows processor times "
+        "per particle: the time of drawing the start, of one substep, and of what is "
+        "done with one frame.",
+        "",
         *parts_table(measured),
+        "",
+        "A *whole generation* makes one scenario of train and one of test, and repeats "
+        "the scenario of test as its perturbed run. So the sum of the parts counts "
+        "three runs of the solver and two written scenarios. A whole generation takes "
+        "longer: it also imports and compiles, and it writes the manifest and draws "
+        "the pictures.",
         "",
         *whole_table(measured),
         "",

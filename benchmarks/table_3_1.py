@@ -7,7 +7,7 @@ writes table_3_1_DEVICE.md and table_3_1_DEVICE.png and prints the table. The ro
 particles, grid and substeps per frame from the thesis; a block of liquid, four
 particles per cell, falls and spreads (free-surface solver). Times are the best of the
 repeats, in milliseconds: processor time on the CPU, so that other processes do not
-count, wall time on a GPU.
+count, wall time on a GPU. --machine names the machine in the text above the table.
 """
 
 from __future__ import annotations
@@ -207,17 +207,37 @@ def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
     return exponents(rows, substep_ms, frame_ms)
 
 
-def markdown(measurements: Sequence[TimedRow], device: str) -> str:
+def describe(device: str, machine: str) -> list[str]:
+    """Return the title of the table and the paragraphs that explain it."""
+    ours = f"with `--device {device}`"
+    if machine:
+        ours = f"{ours} on {machine}"
+    return [
+        "## Table 3.1: time of the solver for more and more particles",
+        "",
+        f"The table compares two solvers: ours, run {ours}, and that of the thesis, run "
+        "on the GPU of its author. (`lagbench cite cavity` names the thesis.) The "
+        "particles, the grid and the substeps per frame of each row are those of Table "
+        "3.1 of the thesis. q is its quality factor: the number of particles grows "
+        "roughly as q^2.",
+        "",
+        "All times are in milliseconds; fps is the number of frames per second. "
+        "t/frame is the time of one run of as many substeps as a frame has. t/substep "
+        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each of the two "
+        "runs ends with one copy of all positions. So t/substep contains a part of "
+        "this copy, and t/frame may be less than t/substep times the substeps.",
+        "",
+    ]
+
+
+def markdown(
+    measurements: Sequence[TimedRow], device: str, *, machine: str = ""
+) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        f"The table compares our solver with `--device {device}` and the solver of "
-        "the thesis on the GPU of its author. The times of a substep and of a frame "
-        "(t/substep, t/frame) are in milliseconds; fps is the number of frames per "
-        "second. The numbers of particles are those of Table 3.1 of the thesis. They "
-        "grow roughly as q^2, where q is the quality factor of the thesis.",
-        "",
+        *describe(device, machine),
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
-        "| thesis t/substep | thesis t/frame | thesis t/frame over ours |",
+        "| thesis t/substep | thesis t/frame | thesis t/frame / our t/frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for m in measurements:
@@ -231,10 +251,11 @@ def markdown(measurements: Sequence[TimedRow], device: str) -> str:
         )
     lines += [
         "",
-        "A row `A against B` shows the exponent p with which A grows as B^p. It is "
-        "the slope of a least-squares line through the logarithms of A and B.",
+        "A row `A against B` shows the exponent p in A ~ B^p. It is the slope of a "
+        "least-squares line through the logarithms of A and B. The last two columns "
+        "are the same if the table has all rows of the thesis.",
         "",
-        "| exponent of | ours | thesis, same rows | thesis, all rows |",
+        "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
     ]
     same_rows = of_thesis([measurement.row for measurement in measurements])
@@ -297,6 +318,7 @@ def main() -> int:
         choices=list(Device),
     )
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--machine", default="", help="as in 'an NVIDIA H100'")
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
     options = parser.parse_args()
     first, _, last = options.rows.partition("-")
@@ -309,7 +331,7 @@ def main() -> int:
             measurements.append(measurement)
 
     device = options.device.value
-    table = markdown(measurements, device)
+    table = markdown(measurements, device, machine=options.machine)
     options.output.mkdir(parents=True, exist_ok=True)
     table_path = options.output / f"table_3_1_{device}.md"
     table_path.write_text(table, encoding="utf-8")
