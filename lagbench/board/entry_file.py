@@ -140,7 +140,7 @@ def read_entry(path: Path) -> Entry:
             where=str(path),
             expected="known keys, with values of their kinds",
             got=format_issues(issues),
-            fix="mend the keys named above; docs/submitting.md describes them",
+            fix="correct the keys named above; docs/submitting.md describes them",
         )
     return entry
 
@@ -148,28 +148,31 @@ def read_entry(path: Path) -> Entry:
 def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
     """Return the description of a method from a YAML file and options.
 
-    Options win. None and empty options count as not given.
+    Options replace the values of the file. None and empty options count as not given.
 
     Raises:
-        UsageError: the file holds no keys, or a key does not fit.
-        UnreadableFileError: the file cannot be read.
+        UsageError: the file holds no keys with values, or these do not fit `Meta`.
+        UnreadableFileError: no regular file, too long, or no plain YAML.
     """
-    keys: object = {}
+    description: object = {}
     if path is not None:
-        keys = load_plain(path)
-    if not isinstance(keys, dict):
+        description = load_plain(path)
+    if not isinstance(description, dict):
         raise UsageError(
             "the file does not describe a method",
             where=str(path),
             expected="lines of key: value",
-            got=f"{type(keys).__name__}: {repr(keys)[:60]}",
+            got=f"{type(description).__name__}: {repr(description)[:60]}",
             fix="write lines as `name: My model`; docs/submitting.md has a whole file",
         )
-    for key, value in options.items():
-        if value not in (None, "", (), []):
-            keys = keys | {key: value}
 
-    meta, issues = examine(Meta, keys)
+    description = dict(description)
+    for key, value in options.items():
+        is_given = value not in (None, "", (), [])
+        if is_given:
+            description[key] = value
+
+    meta, issues = examine(Meta, description)
     if meta is None:
         where = "options"
         if path is not None:
@@ -179,7 +182,7 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
             where=where,
             expected="known keys, with values of their kinds",
             got=format_issues(issues),
-            fix="mend the keys named above; docs/submitting.md describes them",
+            fix="correct the keys named above; docs/submitting.md describes them",
         )
     return meta
 

@@ -222,15 +222,23 @@ def _name_type(value_type: h5py.h5t.TypeID) -> str:
 def estimate_chunk_cache(array: ArrayInfo) -> tuple[int, int]:
     """Return the bytes and the number of chunks to keep while frames are read in order.
 
-    A chunk is unpacked once if all chunks of a frame stay until the last frame that
-    shares them. The same holds for the scenarios of chunks over several scenarios.
+    With this cache no chunk is unpacked twice. Predictions have the axes [scenario,
+    frame, particle, space]: the chunks of one frame stay, and if a chunk holds several
+    scenarios, the chunks of all their frames. Other files have the axes [frame,
+    particle, space]: the chunks of one frame stay if a chunk holds several frames.
+
+    Returns:
+        Bytes and number of chunks; 0 and 1 for an array without chunks.
     """
     counts = array.chunk_counts
     if array.chunks is None or not counts:
         return 0, 1
+
     cached_chunks = math.prod(counts[2:])
-    if array.chunks[0] > 1:
-        cached_chunks *= math.prod(counts[1:2])
+    entries_per_chunk = array.chunks[0]  # along the first axis
+    has_second_axis = len(counts) > 1
+    if entries_per_chunk > 1 and has_second_axis:
+        cached_chunks *= counts[1]
     cached_chunks = max(1, cached_chunks)
     return cached_chunks * array.chunk_bytes, cached_chunks
 

@@ -182,15 +182,21 @@ class Film:
     """Composes the frames: a still background, one panel per recording, a counter."""
 
     def __init__(self, recordings: Sequence[Recording], panel: Panel) -> None:
-        """Draw all that does not move."""
+        """Choose slices and a colour scale, and draw all that does not move.
+
+        Raises:
+            UsageError: a recording has no vorticity to show.
+        """
         self._recordings = recordings
         self._panel = panel
         if panel is Panel.VORTICITY:
             for recording in recordings:
                 frames = _sample_frames(recording)
-                recording.fix_layer(frames)
+                recording.fix_slice(frames)
                 _check_vorticity(recording, frames)
         self._limit = _common_limit(recordings, panel)
+
+        # The panels stand side by side.
         self._painters = []
         self._lefts = []  # left side of each panel [pixel]
         left = MARGIN
@@ -204,10 +210,11 @@ class Film:
         height = TOP + SIDE + BOTTOM
         self.size = (width, height)
         self._background = self._draw_background()
-        letters = {}
+
+        # The counter of each frame is composed of these pictures.
+        self._counter_letters = {}
         for letter in LETTERS:
-            letters[letter] = _draw_letter(letter)
-        self._letters = letters
+            self._counter_letters[letter] = _draw_letter(letter)
 
     def frame(self, number: int) -> NDArray[np.uint8]:
         """Return one frame as RGB bytes, shape [row, column, 3]."""
@@ -221,7 +228,7 @@ class Film:
 
         # the counter stands at the bottom right
         text = self._counter_text(number)
-        letters = [self._letters[letter] for letter in text]
+        letters = [self._counter_letters[letter] for letter in text]
         counter = np.concatenate(letters, axis=1)
         right = self.size[0] - MARGIN
         left = right - counter.shape[1]

@@ -150,7 +150,7 @@ class Recording:
         self.scenario = int(identity["scenario"])
         self.parameters = parameters
         self.frames = frames
-        # plane across z that is drawn of every frame; None: the best one of each frame
+        # number along z of the slice of all frames; None: the best one of each frame
         self.layer: int | None = None
         self._read = read
         # rows of NaN fill up scenarios that have fewer particles than others
@@ -201,8 +201,12 @@ class Recording:
         """Whether the box has three dimensions."""
         return self.size.dimension == 3
 
-    def fix_layer(self, frames: Iterable[int]) -> None:
-        """Draw one plane across z of all frames: the best one of these frames."""
+    def fix_slice(self, frames: Iterable[int]) -> None:
+        """Choose one slice for all frames: the best one of these frames.
+
+        Only free surfaces in three dimensions need it. In full boxes the slice is
+        always the middle plane across z.
+        """
         if self.size.is_full_box or not self.is_solid:
             return
         counts = np.sum([self.scene(frame).nodes_of_layers for frame in frames], axis=0)

@@ -49,7 +49,7 @@ from lagbench.generators.simulate import (
 )
 from lagbench.generators.split import Device
 from lagbench.store.copy import gather as gather_files
-from lagbench.store.copy import list_gatherable
+from lagbench.store.copy import list_scenarios_to_gather
 from lagbench.store.publication import Publication, check_address, publish
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import describe_machine, promises_bits, worker_count
@@ -333,7 +333,7 @@ def _plan_only(
     """Scan a folder as if the sources were gathered; change nothing."""
     gathered: set[int] = set()
     for source in sources:
-        gathered.update(list_gatherable(setup.size, setup.root, source))
+        gathered.update(list_scenarios_to_gather(setup.size, setup.root, source))
     store = None
     url = url_of(setup.root)
     if url is not None:

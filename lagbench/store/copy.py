@@ -462,7 +462,8 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     """
     source_folder = size.folder(source)
     target_folder = size.folder(root)
-    source_manifest = _read_source_manifest(size, root, source)
+    source_manifest = _read_source_manifest(size, source)
+    _require_other_folder(size, root, source)
     taken_entries = []
     new_entries = []
     for entry in source_manifest.files:
@@ -497,30 +498,46 @@ def _link_or_copy(source: Path, target: Path) -> None:
             shutil.copyfile(source, temporary)
 
 
-def list_gatherable(size: Size, root: Path, source: Path) -> tuple[int, ...]:
-    """Return the scenarios that :func:`gather` would add and copy."""
-    source_manifest = _read_source_manifest(size, root, source)
-    manifest = read_or_empty(size, root)
+def list_scenarios_to_gather(size: Size, root: Path, source: Path) -> tuple[int, ...]:
+    """Return the scenarios whose files :func:`gather` would take from a source.
+
+    :func:`gather` also takes predictability limits for scenarios that the root folder
+    has; these are not listed.
+
+    Raises:
+        UsageError: the source has no such data set, or is the root folder.
+    """
+    source_manifest = _read_source_manifest(size, source)
+    _require_other_folder(size, root, source)
+    target_manifest = read_or_empty(size, root)
     source_folder = size.folder(source)
     target_folder = size.folder(root)
-    gatherable = []
+    scenarios = []
     for entry in source_manifest.files:
-        is_new = manifest.entry(entry.scenario) is None
-        has_source = (source_folder / entry.path).is_file()
-        if is_new and has_source and not (target_folder / entry.path).exists():
-            gatherable.append(entry.scenario)
-    return tuple(gatherable)
+        is_new = target_manifest.entry(entry.scenario) is None
+        has_source_file = (source_folder / entry.path).is_file()
+        has_target_file = (target_folder / entry.path).exists()
+        if is_new and has_source_file and not has_target_file:
+            scenarios.append(entry.scenario)
+    return tuple(scenarios)
 
 
-def _read_source_manifest(size: Size, root: Path, source: Path) -> Manifest:
+def _read_source_manifest(size: Size, source: Path) -> Manifest:
+    """Return the manifest of a source; refuse a source that has none."""
     manifest = read_manifest(source, size.split, size.name, size.major)
-    is_root = size.folder(source).resolve() == size.folder(root).resolve()
-    if manifest is not None and not is_root:
-        return manifest
-    got = "no manifest of that data set"
-    if manifest is not None:
-        got = "the folder to write to"
-    raise UsageError(
+    if manifest is None:
+        raise _refuse_source(size, source, got="no manifest of that data set")
+    return manifest
+
+
+def _require_other_folder(size: Size, root: Path, source: Path) -> None:
+    """Refuse a source that is the root folder."""
+    if size.folder(source).resolve() == size.folder(root).resolve():
+        raise _refuse_source(size, source, got="the folder to write to")
+
+
+def _refuse_source(size: Size, source: Path, *, got: str) -> UsageError:
+    return UsageError(
         "nothing can be gathered from a folder",
         where=str(source),
         expected=f"a root folder with {size.split} {size.name} of another call of "

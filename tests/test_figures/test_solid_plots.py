@@ -176,7 +176,7 @@ def test_a_film_shows_one_slice() -> None:
     """The slice of the best frame is that of all frames."""
     with open_recording(BLOCK) as recording:
         layers = layers_of(recording)
-        recording.fix_layer(range(FRAMES))
+        recording.fix_slice(range(FRAMES))
         assert recording.layer in layers
         assert layers_of(recording) == {recording.layer}
 
