@@ -298,13 +298,14 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     perturbed_runs = (
         f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all)"
     )
+    train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
         "bytes before compression": f"{raw_terabytes:.2f} TB",
         "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB each)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{writing:,.0f} core hours",
         perturbed_runs: f"{twins:,.0f} core hours",
-        "statistics of the train scenarios (80 % of all)": f"{statistics:,.0f} core hours",
+        train_statistics: f"{statistics:,.0f} core hours",
         "one `lagbench verify`": f"{checking:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }

@@ -215,16 +215,16 @@ def describe(device: str, machine: str) -> list[str]:
     return [
         "## Table 3.1: time of the solver for more and more particles",
         "",
-        f"The table compares two solvers: ours, run {ours}, and that of the thesis, run "
-        "on the GPU of its author. (`lagbench cite cavity` names the thesis.) The "
+        f"The table compares two solvers: ours, run {ours}, and that of the thesis, "
+        "run on the GPU of its author. (`lagbench cite cavity` names the thesis.) The "
         "particles, the grid and the substeps per frame of each row are those of Table "
         "3.1 of the thesis. q is its quality factor: the number of particles grows "
         "roughly as q^2.",
         "",
         "All times are in milliseconds; fps is the number of frames per second. "
         "t/frame is the time of one run of as many substeps as a frame has. t/substep "
-        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each of the two "
-        "runs ends with one copy of all positions. So t/substep contains a part of "
+        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each of the "
+        "two runs ends with one copy of all positions. So t/substep contains a part of "
         "this copy, and t/frame may be less than t/substep times the substeps.",
         "",
     ]
