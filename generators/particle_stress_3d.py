@@ -139,8 +139,11 @@ class ParticleStress3D(FreeSurfaceKernels):
         return columns(first, second, third)
 
     @ti.func
-    def elastic_stress(self, s: i32, p: i32, pressure: f32) -> mat3:
-        """Return the Kirchhoff stress without viscosity, of a liquid or a solid."""
+    def elastic_stress(self, s: i32, p: i32, isotropic_stress: f32) -> mat3:
+        """Return the Kirchhoff stress without viscosity, of a liquid or a solid.
+
+        A liquid has the isotropic stress only; a solid has none of it.
+        """
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
         mu = self.jelly[0]
@@ -158,7 +161,9 @@ class ParticleStress3D(FreeSurfaceKernels):
             mu = self.snow[0] * factor
             la = self.snow[1] * factor
         isotropic = mat3(
-            [pressure, 0.0, 0.0], [0.0, pressure, 0.0], [0.0, 0.0, pressure]
+            [isotropic_stress, 0.0, 0.0],
+            [0.0, isotropic_stress, 0.0],
+            [0.0, 0.0, isotropic_stress],
         )
         f = self.deformation(s, p)
         elastic = corotated_stress(f, mu, la)
@@ -173,17 +178,21 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def stress(self, s: i32, p: i32, solid: Template) -> None:
-        """Compute A of a particle, and the largest that it spreads."""
+        """Compute A of a particle, and the largest speed that it spreads to a node."""
         state = self.particle_state[s, p]
-        pressure = liquid_stress(state[3], self.parameters.liquid_modulus)
+        spread_jacobian = state[3]
+        modulus = self.parameters.liquid_modulus
+        isotropic_stress = liquid_stress(spread_jacobian, modulus)
         c = self.velocity_gradient(s, p)
         viscosity = self.liquid_viscosity
         elastic = ti.Matrix.zero(f32, 3, 3)
         if ti.static(solid):
             viscosity = self.viscosity(s, p)
-            elastic = self.elastic_stress(s, p, pressure)
-        # A node lies within 1.5 cells per axis.
-        row_reach = vec3(0.0)
+            elastic = self.elastic_stress(s, p, isotropic_stress)
+
+        # A node lies within 1.5 cells of the particle along each axis. This bounds the
+        # speed that A adds at the node, along each axis.
+        affine_speed = vec3(0.0)
         for column in ti.static(_AXES):
             a = vec4(0.0)
             for row in ti.static(_AXES):
@@ -192,17 +201,18 @@ class ParticleStress3D(FreeSurfaceKernels):
                 if ti.static(solid):
                     tau = tau + elastic[row, column]
                 elif ti.static(row == column):
-                    tau = tau + pressure
-                velocity_step = self.dx * c[row, column]
-                a[row] = velocity_step - self.stress_factor * tau
-                row_reach[row] = row_reach[row] + 1.5 * ti.abs(a[row])
+                    tau = tau + isotropic_stress
+                speed_per_cell = self.dx * c[row, column]
+                a[row] = speed_per_cell - self.stress_factor * tau
+                affine_speed[row] = affine_speed[row] + 1.5 * ti.abs(a[row])
             self.momentum_slopes[column][s, p] = self.velocity_scale * a
+
         extremes = self.extremes[s, p]
-        reach = extremes[3]
+        largest_node_speed = extremes[3]
         for row in ti.static(_AXES):
-            node_speed = ti.abs(state[row]) + row_reach[row]
-            reach = larger(finite(node_speed), reach)
-        extremes[3] = reach
+            node_speed = ti.abs(state[row]) + affine_speed[row]
+            largest_node_speed = larger(finite(node_speed), largest_node_speed)
+        extremes[3] = largest_node_speed
         self.extremes[s, p] = extremes
 
     @ti.func
