@@ -534,7 +534,12 @@ def test_a_model_that_sees_them_is_trained_scored_and_exported(
     assert torch.equal(again.position, rollout.position)
 
     with pytest.raises(UsageError) as caught:
-        predict(trained.weights, output, root=root, settings=(f"model.{option}=false",))
+        predict(
+            trained.weights,
+            tmp_path / "other.nc",
+            root=root,
+            settings=(f"model.{option}=false",),
+        )
     assert option in str(caught.value.got)
 
 

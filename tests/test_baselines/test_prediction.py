@@ -466,9 +466,10 @@ def test_only_the_input_frames_are_read(
 
 
 def test_missing_data_are_an_error(run: Predict, tmp_path: Path) -> None:
-    path = run().path
+    run()
+    output = tmp_path / "other.nc"
     with pytest.raises(DataError) as caught:
-        predict(tmp_path / "weights.pt", path, root=tmp_path / "nowhere")
+        predict(tmp_path / "weights.pt", output, root=tmp_path / "nowhere")
     assert str(caught.value.where).endswith("nowhere/curl-noise/tiny/v2")
 
 
