@@ -45,22 +45,34 @@ _EPSILON = 1e-6
 @ti.func
 def principal_minors(b: mat3) -> f32:
     """Return the sum of the three principal minors of a symmetric matrix."""
-    minor_z = b[0, 0] * b[1, 1] - b[0, 1] * b[0, 1]
-    minor_x = b[1, 1] * b[2, 2] - b[1, 2] * b[1, 2]
-    minor_y = b[0, 0] * b[2, 2] - b[0, 2] * b[0, 2]
+    xx = b[0, 0]
+    yy = b[1, 1]
+    zz = b[2, 2]
+    xy = b[0, 1]
+    yz = b[1, 2]
+    xz = b[0, 2]
+    minor_z = xx * yy - xy * xy
+    minor_x = yy * zz - yz * yz
+    minor_y = xx * zz - xz * xz
     return (minor_z + minor_x) + minor_y
 
 
 @ti.func
 def determinant(f: mat3) -> f32:
     """Return det F, expanded along the first row."""
-    minor_x = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
-    minor_y = f[1, 0] * f[2, 2] - f[1, 2] * f[2, 0]
-    minor_z = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
-    first = f[0, 0] * minor_x
-    second = f[0, 1] * minor_y
-    third = f[0, 2] * minor_z
-    return (first - second) + third
+    xx = f[0, 0]
+    xy = f[0, 1]
+    xz = f[0, 2]
+    yx = f[1, 0]
+    yy = f[1, 1]
+    yz = f[1, 2]
+    zx = f[2, 0]
+    zy = f[2, 1]
+    zz = f[2, 2]
+    minor_x = yy * zz - yz * zy
+    minor_y = yx * zz - yz * zx
+    minor_z = yx * zy - yy * zx
+    return (xx * minor_x - xy * minor_y) + xz * minor_z
 
 
 @ti.func
@@ -116,44 +128,59 @@ def corotated_stress(f: mat3, mu: f32, la: f32) -> mat3:
 
 
 @ti.func
+def tangent_of_turn(difference: f32, double: f32) -> f32:
+    """Return the tangent of the angle by which Jacobi's method turns a pair of axes.
+
+    It is 2 b_pq / (d +- sqrt(d^2 + 4 b_pq^2)) with the sign of d = b_qq - b_pp: then
+    the entry b_pq between the axes vanishes. ``double`` is 2 b_pq.
+    """
+    root = ti.sqrt(difference * difference + double * double)
+    signed_root = ti.select(difference < 0.0, -root, root)
+    divisor = difference + signed_root
+    is_diagonal = divisor == 0.0
+    safe_divisor = ti.select(is_diagonal, 1.0, divisor)
+    return ti.select(is_diagonal, 0.0, double / safe_divisor)
+
+
+@ti.func
+def turned(along_p: f32, along_q: f32, cosine: f32, sine: f32) -> Value:
+    """Return the components along two axes after these have turned."""
+    new_p = cosine * along_p - sine * along_q
+    new_q = sine * along_p + cosine * along_q
+    return new_p, new_q
+
+
+@ti.func
 def principal_axes(b: mat3) -> Value:
     """Return the eigenvalues of a symmetric matrix, and its eigenvectors as columns.
 
     Jacobi's method, four sweeps: each turns a pair of axes so that the entry between
-    them vanishes, by the angle with the tangent 2 b_pq / (d +- sqrt(d^2 + 4 b_pq^2)),
-    d = b_qq - b_pp, with the sign of d.
+    them vanishes.
     """
     a = b
     axes = mat3([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
     for _ in ti.static(range(_SWEEPS)):
         for p, q in ti.static(_AXIS_PAIRS):
-            double = 2.0 * a[p, q]
+            between = a[p, q]
             difference = a[q, q] - a[p, p]
-            root = ti.sqrt(difference * difference + double * double)
-            signed_root = ti.select(difference < 0.0, -root, root)
-            divisor = difference + signed_root
-            is_diagonal = divisor == 0.0
-            safe_divisor = ti.select(is_diagonal, 1.0, divisor)
-            tangent = ti.select(is_diagonal, 0.0, double / safe_divisor)
+            tangent = tangent_of_turn(difference, 2.0 * between)
             cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
 
-            shift = tangent * a[p, q]
+            shift = tangent * between
             a[p, p] = a[p, p] - shift
             a[q, q] = a[q, q] + shift
             a[p, q] = 0.0
             a[q, p] = 0.0
             # r is the third axis.
             r = ti.static(3 - p - q)
-            entry_p = cosine * a[r, p] - sine * a[r, q]
-            entry_q = sine * a[r, p] + cosine * a[r, q]
+            entry_p, entry_q = turned(a[r, p], a[r, q], cosine, sine)
             a[r, p] = entry_p
             a[p, r] = entry_p
             a[r, q] = entry_q
             a[q, r] = entry_q
             for row in ti.static(range(3)):
-                along_p = cosine * axes[row, p] - sine * axes[row, q]
-                along_q = sine * axes[row, p] + cosine * axes[row, q]
+                along_p, along_q = turned(axes[row, p], axes[row, q], cosine, sine)
                 axes[row, p] = along_p
                 axes[row, q] = along_q
     eigenvalues = vec3(a[0, 0], a[1, 1], a[2, 2])

@@ -13,7 +13,7 @@ from taichi.math import vec4
 from . import backend
 from .constitutive import lame, larger
 from .split import FreeSurfaceParameters, Material
-from .transfer import Value, fixed_point_scale
+from .transfer import Value, bounded, fixed_point_scale
 
 LIQUID = int(Material.LIQUID)
 SNOW = int(Material.SNOW)
@@ -176,6 +176,28 @@ class FreeSurfaceKernels:
         if index >= self.high - 1:
             mirrored = 2 * self.high - index
         return mirrored
+
+    @ti.func
+    def liquid_jacobian(
+        self,
+        old_jacobian: f32,
+        divergence: f32,
+        grid_jacobian: f32,
+        grid_density: f32,
+    ) -> f32:
+        """Return J of a liquid after a substep.
+
+        It follows the flow, and is drawn towards J and the density of the grid.
+        """
+        density = larger(grid_density, 1.0)
+        jacobian = old_jacobian + self.dt * divergence * old_jacobian
+        lag = grid_jacobian - old_jacobian
+        jacobian += self.parameters.jacobian_relaxation * lag
+        compression = 1.0 / density - jacobian
+        jacobian += self.parameters.density_coupling * compression
+        jacobian_min = self.parameters.jacobian_min
+        jacobian_max = self.parameters.jacobian_max
+        return bounded(jacobian, jacobian_min, jacobian_max)
 
     @ti.func
     def is_outward(self, index: i32, normal: f32) -> Value:

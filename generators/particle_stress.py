@@ -25,7 +25,7 @@ without it a settled liquid loses a fifth of its depth.
 
 import taichi as ti
 from taichi import f32, i32, i64
-from taichi.math import mat2, vec4
+from taichi.math import mat2, vec2, vec4
 
 from .constitutive import (
     corotated_stress,
@@ -135,29 +135,40 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def prepare(self, s: i32, p: i32, solid: Template) -> None:
         """Compute the stencil of a particle, and the slope A of what it carries."""
-        x = self.x[s, p]
-        first, second, third = stencil(x, self.inv_dx, self.width)
-        self.weight_rows[0][s, p] = first
-        self.weight_rows[1][s, p] = second
-        self.weight_rows[2][s, p] = third
+        self.locate(s, p)
         c = self.velocity_gradient(s, p)
         tau = self.stress(s, p, c, solid)
         a = self.dx * c - self.stress_factor * tau
-
-        # A node lies within 1.5 cells per axis.
-        speed = ti.abs(self.particle_state[s, p].xy)
-        slope = ti.abs(a)
-        reach_x = speed[0] + 1.5 * (slope[0, 0] + slope[0, 1])
-        reach_y = speed[1] + 1.5 * (slope[1, 0] + slope[1, 1])
-        extremes = self.extremes[s, p]
-        reach = largest_of(reach_x, reach_y)
-        extremes[3] = larger(reach, extremes[3])
-        self.extremes[s, p] = extremes
+        self.keep_reach(s, p, a)
         scaled = self.velocity_scale * a
         momentum_slope_x = vec4(scaled[0, 0], scaled[1, 0], 0.0, 0.0)
         momentum_slope_y = vec4(scaled[0, 1], scaled[1, 1], 0.0, 0.0)
         self.momentum_slope_x[s, p] = momentum_slope_x
         self.momentum_slope_y[s, p] = momentum_slope_y
+
+    @ti.func
+    def locate(self, s: i32, p: i32) -> None:
+        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
+        x = self.x[s, p]
+        first, second, third = stencil(x, self.inv_dx, self.width)
+        self.weight_rows[0][s, p] = first
+        self.weight_rows[1][s, p] = second
+        self.weight_rows[2][s, p] = third
+
+    @ti.func
+    def keep_reach(self, s: i32, p: i32, a: mat2) -> None:
+        """Keep the largest abs(v) + abs(A o) of a particle in this advance."""
+        # A node lies within 1.5 cells per axis.
+        speed = ti.abs(self.particle_state[s, p].xy)
+        slope = ti.abs(a)
+        slope_of_x = slope[0, 0] + slope[0, 1]
+        slope_of_y = slope[1, 0] + slope[1, 1]
+        reach_x = speed[0] + 1.5 * slope_of_x
+        reach_y = speed[1] + 1.5 * slope_of_y
+        reach = largest_of(reach_x, reach_y)
+        extremes = self.extremes[s, p]
+        extremes[3] = larger(reach, extremes[3])
+        self.extremes[s, p] = extremes
 
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
@@ -278,6 +289,7 @@ class ParticleStress(FreeSurfaceKernels):
     def flow(self, s: i32, p: i32, solid: Template) -> None:
         """Move a particle; update J of a liquid or F of a solid."""
         grid_state = self.grid_state[s, p]
+        grid_density = grid_state[2]
         grid_jacobian = grid_state[3]
         velocity = grid_state.xy
         x = self.x[s, p].xy + self.dt * velocity
@@ -289,44 +301,46 @@ class ParticleStress(FreeSurfaceKernels):
         old_ratio = matter[1]
         c = self.velocity_gradient(s, p)
         divergence = c[0, 0] + c[1, 1]
-        density = larger(grid_state[2], 1.0)
-        j = old_ratio + self.dt * divergence * old_ratio
-        j += self.parameters.jacobian_relaxation * (grid_jacobian - old_ratio)
-        j += self.parameters.density_coupling * (1.0 / density - j)
-        j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
+        j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
         ratio = j
         jacobian = j
         spread_jacobian = j
         if ti.static(solid):
             # Chosen, not branched upon: else no vectors.
+            is_snow = kind == SNOW
+            is_liquid = kind == LIQUID
             old_f = self.deformation[s, p]
-            f = old_f + self.dt * (c @ old_f)
-            yielded, growth = plastic_return(f, self.yield_low, self.yield_high)
-            f = ti.select(kind == SNOW, yielded, f)
-            f = ti.select(kind == LIQUID, old_f, f)
+            trial = old_f + self.dt * (c @ old_f)
+            yielded, growth = plastic_return(trial, self.yield_low, self.yield_high)
+            solid_f = ti.select(is_snow, yielded, trial)
+            f = ti.select(is_liquid, old_f, solid_f)
             self.deformation[s, p] = f
 
             jp_min = self.parameters.snow_jp_min
             jp_max = self.parameters.snow_jp_max
             jp = bounded(old_ratio * growth, jp_min, jp_max)
-            solid_ratio = ti.select(kind == SNOW, jp, old_ratio)
-            ratio = ti.select(kind == LIQUID, j, solid_ratio)
-            jacobian = ti.select(kind == LIQUID, j, determinant(f))
-            spread_jacobian = ti.select(kind == LIQUID, j, 1.0)
+            solid_ratio = ti.select(is_snow, jp, old_ratio)
+            ratio = ti.select(is_liquid, j, solid_ratio)
+            jacobian = ti.select(is_liquid, j, determinant(f))
+            spread_jacobian = ti.select(is_liquid, j, 1.0)
         new_state = vec4(velocity[0], velocity[1], 1.0, spread_jacobian)
         self.particle_state[s, p] = new_state
 
-        matter[1] = ratio
-        matter[2] = -larger(-ratio, -matter[2])
-        matter[3] = larger(ratio, matter[3])
-        self.matter[s, p] = matter
-        speed = ti.abs(velocity)
+        ratio_min = -larger(-ratio, -matter[2])
+        ratio_max = larger(ratio, matter[3])
+        self.matter[s, p] = vec4(kind, ratio, ratio_min, ratio_max)
+        self.keep_extremes(s, p, ti.abs(velocity), jacobian)
+
+    @ti.func
+    def keep_extremes(self, s: i32, p: i32, speed: vec2, jacobian: f32) -> None:
+        """Keep the largest speed and the extremes of J in this advance."""
         extremes = self.extremes[s, p]
-        speed_max = largest_of(speed[0], speed[1])
-        extremes[0] = larger(speed_max, extremes[0])
-        extremes[1] = -larger(-jacobian, -extremes[1])
-        extremes[2] = larger(jacobian, extremes[2])
-        self.extremes[s, p] = extremes
+        reach = extremes[3]
+        fastest = largest_of(speed[0], speed[1])
+        speed_max = larger(fastest, extremes[0])
+        jacobian_min = -larger(-jacobian, -extremes[1])
+        jacobian_max = larger(jacobian, extremes[2])
+        self.extremes[s, p] = vec4(speed_max, jacobian_min, jacobian_max, reach)
 
     # The drivers: the same phases in the same order.
 

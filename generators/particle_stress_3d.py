@@ -373,16 +373,14 @@ class ParticleStress3D(FreeSurfaceKernels):
         slope_y = self.slopes[1][s, p]
         slope_z = self.slopes[2][s, p]
         divergence = slope_x[0] + slope_y[1] + slope_z[2]
-        density = larger(self.grid_density[s, p], 1.0)
-        j = old_ratio + self.dt * divergence * old_ratio
-        j += self.parameters.jacobian_relaxation * (grid_jacobian - old_ratio)
-        j += self.parameters.density_coupling * (1.0 / density - j)
-        j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
+        grid_density = self.grid_density[s, p]
+        j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
         ratio = j
         spread_jacobian = j
         if ti.static(solid):
-            ratio = ti.select(kind == LIQUID, j, old_ratio)
-            spread_jacobian = ti.select(kind == LIQUID, j, 1.0)
+            is_liquid = kind == LIQUID
+            ratio = ti.select(is_liquid, j, old_ratio)
+            spread_jacobian = ti.select(is_liquid, j, 1.0)
         new_state = vec4(velocity[0], velocity[1], velocity[2], spread_jacobian)
         self.particle_state[s, p] = new_state
         self.keep_ratio(s, p, ratio)
