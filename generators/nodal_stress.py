@@ -437,13 +437,13 @@ class NodalStress:
         self.x[s, p] = vec4(x[0], x[1], 0.0, 0.0)
 
         divergence = slope_x[0] + slope_y[1]
-        jacobian = old_state[3]
-        jacobian = (
-            jacobian
-            + self.dt * divergence * jacobian
-            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
-            + self.parameters.density_coupling * (volume - grid_jacobian)
-        )
+        old_jacobian = old_state[3]
+        growth = self.dt * divergence * old_jacobian
+        lag = grid_jacobian - old_jacobian
+        relaxation = self.parameters.jacobian_relaxation * lag
+        compression = volume - grid_jacobian
+        coupling = self.parameters.density_coupling * compression
+        jacobian = old_jacobian + growth + relaxation + coupling
         self.particle_state[s, p] = vec4(v[0], v[1], 1.0, jacobian)
         speed = ti.abs(v)
         reached = vec4(speed[0], speed[1], jacobian, -jacobian)

@@ -686,13 +686,13 @@ class NodalStressND:
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
             x = self.kept_outside(s, inside)
 
-        jacobian = old_state[3]
-        jacobian = (
-            jacobian
-            + self.dt * divergence * jacobian
-            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
-            + self.parameters.density_coupling * (volume - grid_jacobian)
-        )
+        old_jacobian = old_state[3]
+        growth = self.dt * divergence * old_jacobian
+        lag = grid_jacobian - old_jacobian
+        relaxation = self.parameters.jacobian_relaxation * lag
+        compression = volume - grid_jacobian
+        coupling = self.parameters.density_coupling * compression
+        jacobian = old_jacobian + growth + relaxation + coupling
         self.particle_state[s, p] = vec4(v[0], v[1], v[2], jacobian)
         speed = ti.abs(v)
         reached = vec4(speed[0], speed[1], speed[2], jacobian)
@@ -709,12 +709,12 @@ class NodalStressND:
         grid_jacobian = self.grid_gain[s, p][3]
         for axis in ti.static(range(self.dimension)):
             self.slopes[axis][s, p] = vec4(0.0)
-        jacobian = self.particle_state[s, p][3]
-        jacobian = (
-            jacobian
-            + self.parameters.jacobian_relaxation * (grid_jacobian - jacobian)
-            + self.parameters.density_coupling * (volume - grid_jacobian)
-        )
+        old_jacobian = self.particle_state[s, p][3]
+        lag = grid_jacobian - old_jacobian
+        relaxation = self.parameters.jacobian_relaxation * lag
+        compression = volume - grid_jacobian
+        coupling = self.parameters.density_coupling * compression
+        jacobian = old_jacobian + relaxation + coupling
         self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
 
     @ti.func
