@@ -257,9 +257,10 @@ class Driver(ABC, Generic[Parameters]):
 
     def _place(self, position: Singles) -> None:
         """Set the positions, kept in the box; the fields hold zeros beside."""
-        scenarios, particles, _ = position.shape
-        padded = np.zeros((scenarios, particles, 4), np.float32)
-        padded[..., : self.dimension] = self._inside(position)
+        scenarios, particles, dimension = position.shape
+        shape = (scenarios, particles, 4)
+        padded = np.zeros(shape, np.float32)
+        padded[..., :dimension] = self._inside(position)
         rows = np.concatenate([padded, self._fixed], axis=1)
         self._kernels.x.from_numpy(rows)
 

@@ -66,11 +66,13 @@ class FullBox(Driver[FullBoxParameters]):
     def _inside(self, position: Singles) -> Singles:
         """Return positions between the walls, wrapped along periodic axes [length]."""
         box = self.parameters.box
+        start = np.asarray(box.low, np.float32)
+        end = np.asarray(box.high, np.float32)
         wrapped = box.wrap(position).astype(np.float32)
         # Rounding to float32 may reach the end of a period, which is its start.
-        is_at_end = wrapped >= np.asarray(box.high, np.float32)
-        start = np.asarray(box.low, np.float32)
-        wrapped = np.where(is_at_end & box.periodic, start, wrapped)
+        is_at_end = wrapped >= end
+        is_rounded_up = is_at_end & box.periodic
+        wrapped = np.where(is_rounded_up, start, wrapped)
         clipped = super()._inside(wrapped)
         return np.where(box.periodic, wrapped, clipped)
 
@@ -116,9 +118,12 @@ class FullBox(Driver[FullBoxParameters]):
         nodes = self._kernels.tables.shape
         state = self._kernels.next_state.to_numpy()
         values = state.reshape(self.scenarios, *nodes, -1)
-        interior = (slice(1, -1),) * self.dimension
-        inside = values[(slice(None), *interior)]
-        return np.asarray(inside[..., : self.dimension])
+        without_ghosts = slice(1, -1)
+        places = [slice(None)]
+        for _ in nodes:
+            places.append(without_ghosts)
+        interior = values[tuple(places)]
+        return np.asarray(interior[..., : self.dimension])
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""

@@ -227,9 +227,11 @@ def wrapped_offset(position: Array, centre: Array) -> Array:
 
 def rotated_gradient(psi: Smooth) -> Flow:
     """Return the flow u = dpsi/dy, v = -dpsi/dx."""
-    slope_x, slope_y = np.moveaxis(psi.gradient, 1, 0)
-    gradient_of_slope_x, gradient_of_slope_y = np.moveaxis(psi.hessian, 1, 0)
+    slope_x = psi.gradient[:, 0]
+    slope_y = psi.gradient[:, 1]
     velocity = np.stack([slope_y, -slope_x], axis=1)
+    gradient_of_slope_x = psi.hessian[:, 0]
+    gradient_of_slope_y = psi.hessian[:, 1]
     affine = np.stack([gradient_of_slope_y, -gradient_of_slope_x], axis=1)
     return Flow(velocity, affine)
 

@@ -271,7 +271,8 @@ def draw_perturbation(size: Size, scenario: int) -> Singles:
     seed = np.random.SeedSequence((*words, 1))
     rng = np.random.Generator(np.random.PCG64(seed))
     shape = (size.particles, size.box.dimension)
-    is_negative = rng.random(shape) < 0.5
+    draws = rng.random(shape)
+    is_negative = draws < 0.5
     signs = np.where(is_negative, -1.0, 1.0)
     displacement = QUANTUM * signs
     return displacement.astype(np.float32)

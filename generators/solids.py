@@ -89,10 +89,14 @@ class Block:
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
-        beyond = np.abs(position) - np.array(self.reach)
-        inside = np.minimum(beyond.max(axis=1), 0.0)
-        x, y, z = np.maximum(beyond, 0.0).T
-        outside = np.sqrt(x * x + y * y + z * z)
+        reach = np.array(self.reach)
+        beyond = np.abs(position) - reach
+        nearest_face = beyond.max(axis=1)
+        inside = np.minimum(nearest_face, 0.0)
+        way_outside = np.maximum(beyond, 0.0)
+        x, y, z = way_outside.T
+        square = x * x + y * y + z * z
+        outside = np.sqrt(square)
         return np.asarray(outside + inside)
 
 
