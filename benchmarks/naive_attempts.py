@@ -744,7 +744,7 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="barycentre",
-            what="Wasserstein mean of k analogs, matched anew at every frame",
+            what="Wasserstein mean of k analogs, matched anew at each measured frame",
             predict=own.barycentre,
             choices=grid(
                 lag=(0, 10),
@@ -754,7 +754,7 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="per-material",
-            what="every material has analogs of its own, with any company",
+            what="every material has analogs of its own, whatever is beside it there",
             predict=own.per_material,
             choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
         ),
@@ -781,7 +781,7 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="pool",
-            what="ballistic-analog, drawn towards a flat pool",
+            what="ballistic-analog, drawn towards a flat pool on the floor",
             predict=own.to_the_pool,
             choices=grid(
                 lag=(0, 10),

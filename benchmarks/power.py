@@ -183,10 +183,11 @@ PAGE = """\
 # Power: what the test can tell apart
 
 `python benchmarks/power.py --write` writes this page. The first rows assume how much
-methods and seeds scatter. A row of a data set is measured from the score files of its
-mini size in leaderboard/scores. A data set has a row if two of its methods have
-means within a factor of two and one of them has several seeds. From two methods of two
-seeds each the scatter is known only roughly.
+methods and seeds scatter. A row with the name of a split is measured from the score
+files of its size mini in leaderboard/scores. A split has a row if two of its methods
+meet two conditions: their means differ by less than a factor of two, and at least one
+of them has several seeds. If there are only two methods with two seeds each, the
+scatter is known only roughly.
 
 The value of seed s in scenario i is modelled as the mean times (1 + scenario +
 method-in-scenario + seed + rest), where the last four terms are random. The scenario
@@ -204,8 +205,9 @@ more seeds do. A board that ranks by hundredths ranks by chance.
 
 ## Equal methods that are told apart
 
-Both sides are seeds of one method, so the test may tell them apart in at most 5 %
-of the draws (give or take 1.4 percentage points, the error of so many draws). With one
+Both sides are seeds of one method, so the test should tell them apart in at most 5 %
+of the draws. The number of draws limits the accuracy of these shares: a share of 5 % is
+known to 1.4 percentage points. With one
 seed a side the test is the sign-flip test over scenarios. Its answer is right for those
 weights. As an answer about the method it is wrong as often as the first column says. So
 the leaderboard then speaks of "these weights". It says so too if one side has one seed
@@ -215,8 +217,9 @@ and the other side several: the scatter of the side with one seed is unknown.
 |---|---|---|---|---|---|
 {false_rows}
 
-The score files hold {pair_count} pairs of two seeds of the same method. The test tells
-{differing_count} of these pairs apart, at 5 %, although the method is the same.
+The score files of cavity, curl-noise, fluid and multimaterial at size mini hold
+{pair_count} pairs of two seeds of the same method. The test tells {differing_count}
+of these pairs apart, at 5 %, although the method is the same.
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
