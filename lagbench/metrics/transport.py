@@ -57,10 +57,10 @@ def sinkhorn_divergence(
     """Return ``S(x, y) - (S(x, x) + S(y, y)) / 2``, clipped at 0 [length^2].
 
     S is the entropic transport cost by POT, with the regularisation 0.1 [length^2];
-    LagrangeBench's own default gives values that differ by 11 to 15 %. The
-    regularisation blurs over sqrt(0.1), a third of the box, so the result shows little
-    but shifts of the whole cloud. Three n x n matrices make it slow and large (8192
-    particles: minutes and gigabytes). Prefer :func:`sliced_wasserstein2`. Along
+    LagrangeBench's default, the library OTT, gives values that differ by 11 to 15 %.
+    The regularisation blurs over sqrt(0.1), a third of the box, so the result shows
+    little but shifts of the whole cloud. Three n x n matrices make it slow and large
+    (8192 particles: minutes and gigabytes). Prefer :func:`sliced_wasserstein2`. Along
     periodic axes of the box distances are those to the nearest image.
     """
     self_cost = (_sinkhorn_cost(x, x, box) + _sinkhorn_cost(y, y, box)) / 2.0
