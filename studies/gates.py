@@ -35,25 +35,24 @@ from lagbench.atomic import write_atomically
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
+from lagbench.board.entry import Status
+from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
 from lagbench.tensors import Batch
+
+from .thesis.published import OPERATORS
+from .thesis.split_results import BOARD, read_json
 
 Floats = NDArray[np.float64]
 
 LIMITS = {"one_step": 1.0, "free_flight": 0.02, "settled": 0.01, "densest_cell": 3.0}
 """A measure of a gate must stay below its limit; its size counts, not its sign."""
 
+GRAPH_NETWORKS = (*OPERATORS, "supergat-sd")  # names of baselines
 FORMAT = 1  # of gates.json
-BOARD_WEIGHTS = Path("leaderboard/weights")
-METHODS = (
-    "gns",
-    "gns-free-flight",
-    "gns-pushforward",
-    "gns-spread",
-    "supergat",
-)  # graph networks that are measured by default
 FRAME_STEP = 20  # frames between the windows of a scenario
 ROLLOUT_STEP = 10  # frames between the states in which the fullest cell is sought
 FALL_TOLERANCE = 0.02  # of a window in free flight: mean acceleration off g, in g
@@ -283,13 +282,20 @@ def _format(value: float | None) -> str:
     return f"{value:.3g}"
 
 
-def board_weights(splits: Sequence[str], size: str) -> list[Path]:
-    """Return the committed weights of the graph networks that are measured."""
+def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path]:
+    """Return the weights of the graph networks among the active entries."""
     paths: list[Path] = []
-    for split in splits:
-        folder = BOARD_WEIGHTS / split / size
-        for method in METHODS:
-            paths += sorted(folder.glob(f"{method}_[0-9]*.pt"))
+    for entry_path in folder.entries():
+        entry = read_entry(folder.path / entry_path)
+        is_wanted = entry.split in splits and entry.size == size
+        if not is_wanted or entry.status is not Status.ACTIVE:
+            continue
+        for prediction in entry.predictions:
+            if prediction.weights is None:
+                continue
+            path = folder.path / prediction.weights.path
+            if read_json(path.with_suffix(".json")).get("baseline") in GRAPH_NETWORKS:
+                paths.append(path)
     return paths
 
 
@@ -315,7 +321,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     torch.set_num_threads(1)
     rows = []
-    for path in options.weights or board_weights(options.split, options.size):
+    paths = options.weights
+    if not paths:
+        paths = board_weights(Folder(BOARD), options.split, options.size)
+    for path in paths:
         row = measure(
             path,
             root=Path(options.root),

@@ -191,11 +191,12 @@ def claims_overview(
     rows_by_claim: Mapping[Claim, Mapping[str, Sequence[ComparedModels]]],
     places: Sequence[str],
 ) -> str:
-    """Return the answer to every claim, a column per split and size."""
+    """Return the answers to every claim that has one, a column per split and size."""
     rows = []
     for claim, rows_by_place in rows_by_claim.items():
         answers = [answer(rows_by_place[place]) or "-" for place in places]
-        rows.append([claim.question, *answers])
+        if any(rows_by_place[place] for place in places):
+            rows.append([claim.question, *answers])
     return markdown(["", *places], rows)
 
 
@@ -343,8 +344,9 @@ def vorticity_table(results: SplitResults) -> str:
         if has_thesis:
             heads.append(f"{measure.upper()}, thesis")
 
+    stand_ins = {results.stand_in(name): name for name in OPERATORS}
     rows = []
-    for name in dict.fromkeys((*OPERATORS, *results.models)):
+    for name in dict.fromkeys((*stand_ins, *results.models)):
         if name not in results.models:
             continue
         method = results.models[name]
@@ -355,7 +357,8 @@ def vorticity_table(results: SplitResults) -> str:
             first_value = method.at(metric, frame, first_scenario)
             row.append(f"{number(mean_value)} ({number(first_value)})")
             if has_thesis:
-                row.append(number(TABLE_5_4.get(name, {}).get(measure), 4))
+                published = TABLE_5_4.get(stand_ins.get(name, name), {})
+                row.append(number(published.get(measure), 4))
         rows.append(row)
     return markdown(heads, rows)
 
@@ -371,9 +374,10 @@ def order_agreement(results: SplitResults) -> str | None:
     thesis_values = []
     our_values = []
     for name, row in TABLE_5_4.items():
-        if name in results.models:
+        model = results.models.get(results.stand_in(name))
+        if model is not None:
             thesis_values.append(row["mse"])
-            our_values.append(results.models[name].at("vorticity_mse", frame))
+            our_values.append(model.at("vorticity_mse", frame))
     if len(thesis_values) < 2:
         return None
     return number(kendall_tau(thesis_values, our_values), 2)

@@ -1,11 +1,13 @@
 """Claims of the thesis and of ours, and what the scores say about each.
 
 A comparison is two-sided, in the loss of a metric, over the seeds that both models have
-(over all where they share none). Where both have one seed, the test is the exact
-sign-flip test over test scenarios, else the two-way bootstrap over scenarios and seeds.
+(over all where they share none, or where the fit of one of them draws nothing). Where
+both have one seed, the test is the exact sign-flip test over test scenarios, else the
+two-way bootstrap over scenarios and seeds.
 For the same weights used in two ways it is that of the differences seed by seed. The
-p-values of one model against several are corrected together (Holm 1979). With one
-training per model, a difference is one between two trainings; another seed may turn it.
+p-values of one model against several are corrected together (Holm 1979). With fewer
+than three trainings of a model, an answer is about these weights: another seed may turn
+it.
 """
 
 from __future__ import annotations
@@ -20,12 +22,16 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm
 from lagbench.metrics.table import CHOSEN
+from lagbench.references.table import REFERENCES
 
 from .cases import key_frame
 from .formatting import interval, number
 from .published import FRAME_MODELS, OPERATORS
-from .roster import ROSTER, label
+from .roster import ROSTER, WITHOUT_DRAWS, label
 from .split_results import Method, SplitResults, rank
+
+SEEDS_OF_A_CLAIM = 3
+"""Trainings of a model that a claim about its method needs."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,11 @@ _CLAIMS = {
 CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())
 
 
+def _is_drawn(name: str) -> bool:
+    """Return whether another seed gives another model."""
+    return name not in REFERENCES and name not in WITHOUT_DRAWS
+
+
 class Verdict(enum.StrEnum):
     """What a comparison says of the first of two models, at 5 %."""
 
@@ -133,6 +144,15 @@ class ComparedModels:
     win_count: int  # scenarios in which the first has the smaller loss
     seed_counts: tuple[int, int]  # trainings behind each mean
     p: float  # corrected for the number of rivals; NaN with too few scenarios
+
+    @property
+    def has_enough_seeds(self) -> bool:
+        """Whether the verdict is about the methods, not only about these weights."""
+        names = (self.first, self.second)
+        for name, count in zip(names, self.seed_counts, strict=True):
+            if _is_drawn(name) and count < SEEDS_OF_A_CLAIM:
+                return False
+        return True
 
     @property
     def verdict(self) -> Verdict:
@@ -187,7 +207,7 @@ def _compare_pair(
     first_seeds = {training.seed for training in first_method.trainings}
     second_seeds = {training.seed for training in second_method.trainings}
     common_seeds = first_seeds & second_seeds
-    if common_seeds:
+    if common_seeds and _is_drawn(first) and _is_drawn(second):
         first_method = first_method.of_seeds(common_seeds)
         second_method = second_method.of_seeds(common_seeds)
     if metric not in first_method.scores or metric not in second_method.scores:
@@ -242,7 +262,8 @@ def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
     first = claim.first or results.best_naive
     if first is None:
         return []
-    rivals = claim.rivals
+    first = results.stand_in(first)
+    rivals = tuple(results.stand_in(name) for name in claim.rivals)
     if not rivals:
         ranked = results.order(results.models)
         rivals = tuple(name for name in ranked if name != first)
@@ -259,6 +280,8 @@ def answer(rows: Sequence[ComparedModels]) -> str:
     """Return the answer of the rows by the ranking metric; "" without rows.
 
     One rival gives yes, no or open. Several give yes, or how many are worse or better.
+    An answer from fewer than three trainings of a model holds for these weights only,
+    and says so.
     """
     judged = []
     for row in rows:
@@ -270,6 +293,14 @@ def answer(rows: Sequence[ComparedModels]) -> str:
     verdicts = [row.verdict for row in judged]
     if Verdict.FEW in verdicts:
         return Verdict.FEW.value
+    if all(row.has_enough_seeds for row in judged):
+        return _count_verdicts(judged)
+    return f"{_count_verdicts(judged)} (these weights)"
+
+
+def _count_verdicts(judged: Sequence[ComparedModels]) -> str:
+    """Return yes, no or open; or how many of several rivals are worse or better."""
+    verdicts = [row.verdict for row in judged]
     better_count = verdicts.count(Verdict.BETTER)
     worse_count = verdicts.count(Verdict.WORSE)
     if better_count == len(judged):

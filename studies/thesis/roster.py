@@ -84,6 +84,14 @@ _MODELS = (
         variant_of="gns",
         recipe="unrolled",
     ),
+    RosterModel(
+        "gns-spread",
+        "GNS, noise of all levels",
+        variant_of="gns",
+        settings=("model.noise_std=1e-3", "model.noise_spread=true"),
+        recipe="pushforward",
+    ),
+    RosterModel("gns-free-flight", "GNS, free flight"),
     RosterModel("neuralmpm", "NeuralMPM", "#000000"),
     RosterModel(
         "neuralmpm-long",
@@ -193,10 +201,29 @@ _MODELS = (
     RosterModel("var-stable", "stable VAR", "#b0569a"),
 )
 
+
+def _with_pushforward(name: str) -> RosterModel:
+    """Return the variant of an operator that is trained from states of rollouts."""
+    plain = next(model for model in _MODELS if model.name == name)
+    return RosterModel(
+        f"{name}-{PUSHFORWARD}",
+        f"{plain.label}, pushforward",
+        plain.colour,
+        variant_of=name,
+        recipe=PUSHFORWARD,
+    )
+
+
+PUSHFORWARD = "pushforward"
+"""Variant of the recipes that graph networks pass their gates with."""
+
 ROSTER: Mapping[str, RosterModel] = MappingProxyType(
-    {model.name: model for model in _MODELS}
+    {model.name: model for model in (*_MODELS, *map(_with_pushforward, OPERATORS))}
 )
 """Models by name."""
+
+WITHOUT_DRAWS = ("var", "var-stable", "hybrid-projection", "hybrid-coarse")
+"""Models whose fit draws nothing: every seed gives the same weights."""
 
 _EVERYWHERE = ("neuralmpm", *OPERATORS, *FRAME_MODELS, "var", "var-stable")
 _ABLATIONS = ("supergat-unlinked", "supergat-unsummed", "gns-novorticity")

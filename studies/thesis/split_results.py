@@ -25,6 +25,7 @@ from lagbench.board.entry import (
     EntryCost,
     MeasuredCost,
     Prediction,
+    Status,
     Verification,
 )
 from lagbench.board.entry_file import read_entry
@@ -46,7 +47,7 @@ from lagbench.scoring.skill import (
     seconds_where_measured,
 )
 
-from .roster import ROSTER
+from .roster import PUSHFORWARD, ROSTER
 
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
@@ -279,6 +280,8 @@ class SplitResults:
         size = self.size.name
         for name, path in self._sources.entries(split, size).items():
             entry = read_entry(path)
+            if entry.status is not Status.ACTIVE:
+                continue
             verification = verification_of(entry, self._sources.verified)
             measured = None if verification is None else verification.cost
             # <board>/submissions/<split>/<size>/<name>.yaml
@@ -490,6 +493,17 @@ class SplitResults:
         return compute_against_classical(
             seeds, solvers, seconds=costs, seconds_per_frame=seconds
         )
+
+    def stand_in(self, name: str) -> str:
+        """Return the model that claims about a graph network are tested with.
+
+        It is the variant trained with pushforward, where that has scores: it passes the
+        gates. Else it is the model itself.
+        """
+        variant = f"{name}-{PUSHFORWARD}"
+        if variant in self.methods:
+            return variant
+        return name
 
     def was_trained(self, name: str) -> bool:
         """Return whether a training of a model is recorded, with scores or without."""

@@ -112,8 +112,9 @@ def test_hours_per_seed_are_the_mean_of_those_that_are_recorded() -> None:
 
 def write_entry(board: Path, **changes: object) -> None:
     """Write the committed entry of GNS for another size, with one seed, changed."""
-    committed = BOARD / "submissions" / SPLIT / "mini" / "gns.yaml"
+    committed = BOARD / "submissions" / SPLIT / "mini" / "gns-pushforward.yaml"
     entry = yaml.safe_load(committed.read_text())
+    entry["method"] = "gns"
     entry["size"] = SIZE
     score = entry["score"]
     score["files"] = score["files"][:1]
@@ -162,6 +163,21 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     run = methods["gat"]
     assert run.cost is not None
     assert run.cost.speed_up is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"status": "withdrawn"},
+        {"status": "superseded", "superseded_by": "gns-pushforward"},
+    ],
+)
+def test_an_inactive_entry_takes_no_part(
+    change: dict[str, str], tmp_path: Path
+) -> None:
+    write_entry(tmp_path, **change)
+    methods = SplitResults(Sources(board=tmp_path), SPLIT, SIZE).methods
+    assert "gns" not in methods
 
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])

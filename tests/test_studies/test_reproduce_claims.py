@@ -128,14 +128,15 @@ def test_first_place_takes_all_rivals() -> None:
     assert rivals == set(FIRST.rivals)
     for row in rows:
         assert row.p == 5 * 2 / 2**8
-    assert answer(rows) == "yes"
+    assert answer(rows) == "yes (these weights)"
 
     as_good_in_half = [0.05, 0.16] * 4
     results = six(supergat=equal(0.1), gns=as_good_in_half)
     tied = claim_rows(FIRST, results)
     open_rivals = [row.second for row in tied if row.verdict is Verdict.OPEN]
     assert open_rivals == ["gns"]
-    assert answer(tied) not in ("yes", "no")
+    counts = "ahead of 5 of 5; better than 4, worse than 0"
+    assert answer(tied) == f"{counts} (these weights)"
 
     last = claim_rows(FIRST, six(supergat=equal(0.9)))
     for row in last:
@@ -145,9 +146,9 @@ def test_first_place_takes_all_rivals() -> None:
 @pytest.mark.parametrize(
     ("without", "expected"),
     [
-        (0.9, "yes"),
-        (0.1, "no"),
-        (0.5, "open"),
+        (0.9, "yes (these weights)"),
+        (0.1, "no (these weights)"),
+        (0.5, "open (these weights)"),
     ],
 )
 def test_a_loss_is_judged_by_the_model_without_it(
@@ -168,6 +169,30 @@ def test_a_loss_is_judged_by_the_model_without_it(
         *claim.metrics,
         *claim.at_key_frame,
     }
+
+
+def test_three_trainings_on_both_sides_speak_for_the_methods() -> None:
+    """A reference predictor and a closed form need no second training."""
+    results = made_up_results({"var": equal(0.8), "persistence": equal(0.9)})
+    three_seeds = (equal(0.1), equal(0.11), equal(0.12))
+    results.methods["gns"] = a_method("gns", *three_seeds)
+    results.methods["gat"] = a_method("gat", *(equal(0.5) for _ in range(3)))
+    results.methods["mlp"] = a_method("mlp", equal(0.5), equal(0.5))
+    for rival in ("gat", "var", "persistence"):
+        rows = compare_models(results, "gns", [rival], [results.ranking])
+        assert answer(rows) == "yes", rival
+    rows = compare_models(results, "gns", ["mlp"], [results.ranking])
+    assert answer(rows) == "yes (these weights)"
+
+
+def test_a_network_that_passes_its_gates_stands_for_its_operator() -> None:
+    results = six(supergat=equal(0.9))
+    pushforward = a_method("supergat-pushforward", equal(0.1))
+    results.methods["supergat-pushforward"] = pushforward
+    rows = claim_rows(FIRST, results)
+    assert {row.first for row in rows} == {"supergat-pushforward"}
+    assert {row.second for row in rows} == set(FIRST.rivals)
+    assert answer(rows) == "yes (these weights)"
 
 
 def test_seeds_that_only_one_has_do_not_count() -> None:

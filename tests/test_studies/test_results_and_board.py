@@ -25,6 +25,9 @@ def test_learning_is_judged_as_the_leaderboard_judges_it() -> None:
     for tab in tabs:
         results = SplitResults(Sources(), tab.size.split, tab.size.name)
         for row in tab.rows:
+            if not row.active:
+                assert row.entry.method not in results.methods
+                continue
             against = None
             if row.entry.method in results.methods:
                 against = results.against_classical(row.entry.method)
@@ -35,7 +38,7 @@ def test_learning_is_judged_as_the_leaderboard_judges_it() -> None:
             assert against.value == pytest.approx(row.against_classical.mean, rel=1e-6)
             compared += 1
         _require_same_verdict(tab, results)
-    assert compared > 40
+    assert compared > 25
 
 
 def _require_same_verdict(tab: Tab, results: SplitResults) -> None:
