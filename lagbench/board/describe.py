@@ -43,6 +43,7 @@ def draft_entry(
     headers = [file.header for file in files]
     rivals: dict[Path, Entry] = {}
     extended = None
+    place = (headers[0].split, headers[0].size, "")  # until the method is known
 
     errors = ErrorCollector()
     with errors:
@@ -61,7 +62,9 @@ def draft_entry(
     with errors:
         about = _describe(headers, meta, extended)
     with errors:
-        weight_paths = require_weights(weights, headers, rivals)
+        weight_paths = require_weights(
+            weights, headers, rivals, folder=folder, place=place
+        )
     errors.raise_errors()
 
     hashes = [file.sha256 for file in files]

@@ -33,6 +33,7 @@ from .fields import (
     Long,
     Name,
     Number,
+    PlaceName,
     Seconds,
     Seed,
     Short,
@@ -69,10 +70,25 @@ class DataSet(Strict):
 
 
 class Weights(Strict):
-    """The weights that made predictions, kept in the leaderboard's folder."""
+    """The weights that made predictions, kept in the leaderboard's folder.
+
+    They lie beside the entry, or beside another one that shares them: the two entries
+    predict with the same weights in two ways.
+    """
 
     path: InnerPath = Field(description="inside the leaderboard's folder")
     sha256: Hash = Field(description="of the file")
+    shared_with: PlaceName | None = Field(
+        default=None,
+        description="another entry that keeps the file, as in cavity/mini/gns",
+    )
+
+    def place_of(self, own: Place) -> Place:
+        """Return the place of the entry that keeps the file: another's, or its own."""
+        if self.shared_with is None:
+            return own
+        split, size, method = self.shared_with.split("/")
+        return split, size, method
 
 
 class Prediction(Strict):
@@ -493,9 +509,9 @@ class Entry(About):
         """Paths of all files beside the entry: scores, weights and training logs."""
         paths = list(self.score_paths)
         for prediction in self.predictions:
-            if prediction.weights is not None:
-                like = prediction.weights.path
-                path = weights_path(self.place, prediction.seed, like)
+            weights = prediction.weights
+            if weights is not None and weights.shared_with is None:
+                path = weights_path(self.place, prediction.seed, weights.path)
                 paths += [path, path.with_suffix(".json")]
         return tuple(paths)
 

@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints
 
 ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
+PLACE = r"^[a-z0-9]+(-[a-z0-9]+)*(/[a-z0-9]+(-[a-z0-9]+)*){2}$"  # cavity/mini/gns
 # nothing that could end an HTML attribute
 WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"
 SHA256 = r"^[0-9a-f]{64}$"
@@ -115,6 +116,9 @@ def _parse_date(value: object) -> object:
 
 
 Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
+PlaceName = Annotated[
+    str, StringConstraints(pattern=PLACE, max_length=3 * LONGEST_ID + 2)
+]
 Label = Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
 Short = Annotated[
     str,

@@ -330,8 +330,9 @@ def _links_of(entry: Entry) -> Iterator[tuple[str, str]]:
     models = []
     for prediction in entry.predictions:
         if prediction.weights:
-            # the place follows from the entry, its own words are not believed
-            path = weights_path(entry.place, prediction.seed, prediction.weights.path)
+            # the path follows from the place, the entry's own words are not believed
+            place = prediction.weights.place_of(entry.place)
+            path = weights_path(place, prediction.seed, prediction.weights.path)
             models.append((prediction.seed, path))
     for seed, path in models:
         label = f"weights {seed}"

@@ -7,6 +7,9 @@ weights/<split>/<size>/<method>_<seed>.pt     parameters, which `lagbench predic
 weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
 weights/<split>/<size>/<method>_<seed>.onnx   or a model of another code base
 weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
+
+An entry may share the weights of another one: it predicts with them at another size,
+or with other options, such as the mean over mirror images. Then no second copy is kept.
 """
 
 from __future__ import annotations
@@ -29,8 +32,8 @@ from lagbench.submission.issues import ValidationIssue
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
-from .entry_file import MOST_FILE_BYTES, is_unchanged
-from .folder import Folder, Place, weights_path
+from .entry_file import MOST_FILE_BYTES, is_unchanged, read_entry_if_valid
+from .folder import DEPTH, WEIGHTS, Folder, Place, entry_path, weights_path
 from .issues import make_issue
 
 MOST_BYTES = 60_000_000
@@ -96,16 +99,49 @@ def inspect_weights(path: Path) -> WeightsFile:
     )
 
 
+def find_keeper(folder: Folder, place: Place, path: Path) -> Place | None:
+    """Return the other entry beside which a file of weights lies on this board.
+
+    None where the file lies elsewhere, or beside the entry of this place.
+    """
+    board = folder.path.resolve()
+    whole_path = path.resolve()
+    if not whole_path.is_relative_to(board):
+        return None
+    inner_path = whole_path.relative_to(board)
+    if len(inner_path.parts) != DEPTH or inner_path.parts[0] != WEIGHTS:
+        return None
+    _, split, size, _ = inner_path.parts
+    method, _, _ = inner_path.stem.rpartition("_")
+    keeper = (split, size, method)
+    if keeper == place:
+        return None
+    entry = read_entry_if_valid(folder.path / entry_path(keeper))
+    if entry is not None and inner_path in entry.files:
+        return keeper
+    return None
+
+
 def require_weights(
     weights: Sequence[str | Path],
     headers: Sequence[Header],
     rivals: Mapping[Path, Entry],
+    *,
+    folder: Folder,
+    place: Place,
 ) -> tuple[Path | None, ...]:
     """Return the weights of each of the predictions, by seed; None where it has none.
 
+    Args:
+        weights: files of weights, or of ONNX models.
+        headers: of the predictions.
+        rivals: other active entries of the data set, by path.
+        folder: the leaderboard.
+        place: split, size and method of the entry.
+
     Raises:
         UsageError: the weights are too large, cannot have made the predictions, nothing
-            says that they have, or they lie beside another entry already.
+            says that they have, or another entry has them and predicts in the same way.
         UnreadableFileError: a file is no file of weights.
     """
     paths = [Path(path) for path in weights]
@@ -121,7 +157,8 @@ def require_weights(
             chosen[index] = path
             continue
         file = inspect_weights(path)
-        _require_fit(file, headers[0], seeds)
+        is_shared = find_keeper(folder, place, path) is not None
+        _require_fit(file, headers[0], seeds, any_size=is_shared)
         index = seeds.index(file.seed)
         if chosen[index] is not None:
             raise UsageError(
@@ -131,8 +168,9 @@ def require_weights(
                 got=f"two of seed {file.seed}",
                 fix="give one of each seed at most",
             )
-        if file.sha256 in owners:
-            raise _owned_error(path, owners[file.sha256])
+        is_owned = is_shared or file.sha256 in owners
+        if is_owned and not (is_shared and _predicts_otherwise(file, headers[index])):
+            raise _owned_error(path, owners.get(file.sha256, "the entry beside it"))
         _require_made_by(file, headers[index])
         chosen[index] = path
     return tuple(chosen)
@@ -176,14 +214,31 @@ def _owned_error(path: Path, owner: str) -> UsageError:
     return UsageError(
         "these weights lie beside another entry",
         where=str(path),
-        expected="weights that no other entry has",
+        expected="weights that no other entry has, or predictions of another size or "
+        "with other options (lagbench predict --set)",
         got=f"those of {owner}",
-        fix="leave them out, and name them in --command; or give those of this method",
+        fix="give those of this method; to share them, give the file that lies on the "
+        "board, and predictions that another option or size made",
     )
 
 
-def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> None:
-    """Refuse a training state, and weights of another data set or seed."""
+def _predicts_otherwise(file: WeightsFile, header: Header) -> bool:
+    """Return whether predictions differ from what the weights predict by themselves."""
+    _, size, _ = file.data_set
+    if header.size != size:
+        return True
+    return header.provenance is not None and bool(
+        header.provenance.prediction_overrides
+    )
+
+
+def _require_fit(
+    file: WeightsFile, header: Header, seeds: Sequence[int], *, any_size: bool
+) -> None:
+    """Refuse a training state, and weights of another data set or seed.
+
+    Shared weights may be those of another size of the split.
+    """
     if file.is_state:
         raise UsageError(
             "this is a checkpoint of a training, not the weights of a model",
@@ -193,13 +248,17 @@ def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> Non
             fix="give the weights.pt beside it, and predictions that it made",
         )
     data_set = (header.split, header.size, header.dataset_sha256)
-    if file.data_set != data_set or file.seed not in seeds:
+    is_of_data = file.data_set == data_set
+    if any_size and file.data_set[1] != header.size:
+        is_of_data = file.data_set[0] == header.split
+    if not is_of_data or file.seed not in seeds:
         raise UsageError(
             "the weights do not belong to these predictions",
             where=str(file.path),
             expected=f"{_describe_data_set(data_set)}, seeds {seeds}",
             got=file.describe_data_set(),
-            fix="leave them out; those of another size are named in --command",
+            fix="leave them out; of those of another size give the file that lies on "
+            "the board",
         )
 
 
@@ -258,8 +317,15 @@ def name_weights(
             key = (prediction.seed, prediction.sha256)
             named.append(previous_weights.get(key))
         else:
-            inner_path = weights_path(place, prediction.seed, path).as_posix()
-            named.append(Weights(path=inner_path, sha256=file_sha256(path)))
+            keeper = find_keeper(folder, place, path)
+            inner_path = weights_path(keeper or place, prediction.seed, path)
+            named.append(
+                Weights(
+                    path=inner_path.as_posix(),
+                    sha256=file_sha256(path),
+                    shared_with=None if keeper is None else "/".join(keeper),
+                )
+            )
     return tuple(named)
 
 
@@ -281,9 +347,10 @@ def _sound_weights(
         weights = prediction.weights
         if weights is None:
             continue
-        path = weights_path(place, prediction.seed, weights.path)
+        path = weights_path(weights.place_of(place), prediction.seed, weights.path)
+        is_shared = find_keeper(folder, place, folder.path / path) is not None
         if (
-            weights.sha256 not in owners
+            (is_shared or weights.sha256 not in owners)
             and weights.path == path.as_posix()
             and is_unchanged(folder, path, weights.sha256)
         ):
@@ -299,8 +366,9 @@ def _owners_of_weights(entries: Mapping[Path, Entry]) -> dict[str, str]:
     owners = {}
     for path, entry in entries.items():
         for prediction in entry.predictions:
-            if prediction.weights is not None:
-                owners[prediction.weights.sha256] = str(path)
+            weights = prediction.weights
+            if weights is not None and weights.shared_with is None:
+                owners[weights.sha256] = str(path)
     return owners
 
 
@@ -314,7 +382,7 @@ def copy_weights(
     """
     copies = {}
     for number, (weights, path) in enumerate(zip(named, paths, strict=True)):
-        if weights is None or path is None:
+        if weights is None or path is None or weights.shared_with is not None:
             continue
         sources = {Path(weights.path): path}
         log = _find_training_log(path)
@@ -359,6 +427,7 @@ def check_weights(
 
     Unfit logs of trainings are reported, too; a log that is not there is no issue.
     """
+    keepers = {entry.place: entry for entry in entries}
     known_paths: set[Path] = set()
     active_paths: dict[str, Path] = {}  # by SHA-256
     for entry in entries:
@@ -366,10 +435,15 @@ def check_weights(
             weights = prediction.weights
             if weights is None:
                 continue
-            path = weights_path(entry.place, prediction.seed, weights.path)
+            where = f"{entry.yaml_path}, predictions.{number}.weights"
+            place = weights.place_of(entry.place)
+            path = weights_path(place, prediction.seed, weights.path)
+            if weights.shared_with is not None:
+                yield from _check_sharing(entry, prediction, keepers.get(place), where)
+                yield from _check_weights_file(folder, path, weights, where=where)
+                continue
             log = path.with_suffix(".json")
             known_paths |= {path, log}
-            where = f"{entry.yaml_path}, predictions.{number}.weights"
             yield from _check_weights_file(folder, path, weights, where=where)
             yield from _check_log(folder, log)
 
@@ -408,6 +482,38 @@ def check_weights(
             expected=f"at most {MOST_BYTES} bytes in all",
             fix="keep larger ones as files of a release, and name them by `weights: "
             "https://...` in the entry",
+        )
+
+
+def _check_sharing(
+    entry: Entry, prediction: Prediction, keeper: Entry | None, where: str
+) -> Iterator[ValidationIssue]:
+    """Yield why an entry may not share the weights that another one keeps."""
+    weights = prediction.weights
+    if weights is None:
+        return
+    kept_hashes = set()
+    for kept in () if keeper is None else keeper.predictions:
+        if kept.weights is not None and kept.weights.shared_with is None:
+            kept_hashes.add(kept.weights.sha256)
+    if weights.sha256 not in kept_hashes:
+        yield make_issue(
+            "weights",
+            where,
+            f"{weights.shared_with} does not keep them",
+            what="shared weights that their entry does not keep",
+            expected="an entry with the same weights",
+        )
+    provenance = prediction.provenance or entry.provenance
+    has_options = provenance is not None and provenance.prediction_overrides
+    is_other_size = keeper is not None and keeper.place[:2] != entry.place[:2]
+    if not has_options and not is_other_size:
+        yield make_issue(
+            "weights",
+            where,
+            f"the weights of {weights.shared_with}, with the same options",
+            what="the same weights twice",
+            expected="predictions of another size, or with other options",
         )
 
 

@@ -473,6 +473,76 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
     assert failing_checks(own) == {"weights"}
 
 
+AVERAGED = f"{OURS}, predicted with model.average=true"
+
+
+def share(own: BoardBench) -> None:
+    """Submit predictions that another option made, with the weights of an entry."""
+    run = trained(own, 0, AVERAGED, share=0.3)
+    submitted(own, run, weights=(kept_weights(own),), method="glide")
+
+
+@pytest.mark.usefixtures("first")
+def test_an_entry_shares_the_weights_of_another(own: BoardBench) -> None:
+    """It predicts with other options, so both are sound, and the file lies there once;
+    the page leads to it.
+    """
+    before = kept_files(own)
+    share(own)
+    assert kept_files(own) == before
+    entry = read_entry(own.entry("glide"))
+    (weights,) = [prediction.weights for prediction in entry.predictions]
+    assert weights is not None
+    assert weights.shared_with == "cavity/tiny/drift"
+    assert own.folder / weights.path == kept_weights(own)
+    assert weights.sha256 == file_sha256(kept_weights(own))
+    assert entry.provenance is not None
+    assert entry.provenance.prediction_overrides == ("model.average=true",)
+    assert Path(weights.path) not in entry.files
+    assert_sound(own)
+
+
+@pytest.mark.usefixtures("first")
+def test_shared_weights_stay_those_of_the_entry_that_keeps_them(
+    own: BoardBench,
+) -> None:
+    """The check finds it where that entry has other weights, or is gone; and where the
+    predictions are made in the same way.
+    """
+    share(own)
+    glide = own.entry("glide")
+    shared = glide.read_text()
+    own.edit("glide", lambda entry: entry["predictions"][0].pop("provenance", None))
+    glide.write_text(glide.read_text().replace(AVERAGED, OURS))
+    assert failing_checks(own) == {"weights"}
+
+    glide.write_text(shared)
+    assert_sound(own)
+    other = "0" * 64
+    own.edit(
+        "drift",
+        lambda entry: entry["predictions"][0]["weights"].update(sha256=other),
+    )
+    assert failing_checks(own) == {"weights"}
+
+    glide.write_text(shared.replace("cavity/tiny/drift", "cavity/tiny/nobody"))
+    assert failing_checks(own) == {"weights"}
+
+
+def test_only_the_file_on_the_board_is_shared(own: BoardBench, first: Path) -> None:
+    """A copy of it is refused, and so are predictions with the same options."""
+    otherwise = trained(own, 0, AVERAGED, share=0.3)
+    alike = trained(own, 0, share=0.4)
+    before = own.state()
+    for run, weights in (
+        (otherwise, first / "weights.pt"),
+        (alike, kept_weights(own)),
+    ):
+        with pytest.raises(UsageError, match="beside another entry"):
+            submitted(own, run, weights=(weights,), method="glide")
+    assert own.state() == before
+
+
 def test_other_weights_are_refused(own: BoardBench) -> None:
     """Weights of another seed, one twice, a state to go on from, files that are none;
     nothing is written.
