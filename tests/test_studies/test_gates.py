@@ -60,6 +60,11 @@ def test_a_gate_fails_at_its_limit_and_one_without_meaning_never() -> None:
     assert GATES.failed == ["one_step", "free_flight"]
 
 
+def test_the_densest_cell_may_reach_its_limit() -> None:
+    assert "densest_cell" not in replace(GATES, densest_cell=3.0).failed
+    assert "densest_cell" in replace(GATES, densest_cell=3.001).failed
+
+
 def test_what_is_recorded_of_other_weights_stays(tmp_path: Path) -> None:
     """Measured again, weights have one line, the new one."""
     path = tmp_path / "gates.json"
