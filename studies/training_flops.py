@@ -90,6 +90,8 @@ def count_entry(folder: Folder, entry: Entry, root: Path) -> Operations | None:
         weights = prediction.weights
         if weights is None or not weights.path.endswith(".pt"):
             continue
+        if weights.shared_with is not None:
+            continue  # the row of the other entry has this training
         path = folder.path / weights.path
         model = restore(load(path), where=str(path))
         size = load_registry().size(entry.split, entry.size)
@@ -101,11 +103,17 @@ def count_entry(folder: Folder, entry: Entry, root: Path) -> Operations | None:
 
 
 def _mean_windows(predictions: Sequence[Prediction]) -> float | None:
-    """Return the windows that a training of an entry saw, mean over its seeds."""
+    """Return the windows that a training of an entry saw, mean over its seeds.
+
+    Steps of earlier trainings, from whose weights it started, count as many windows.
+    """
     windows = []
     for prediction in predictions:
-        if prediction.budget is not None and prediction.budget.windows:
-            windows.append(prediction.budget.windows)
+        budget = prediction.budget
+        if budget is None or not budget.windows or not budget.steps:
+            continue
+        all_steps = budget.steps + (budget.start_steps or 0)
+        windows.append(budget.windows * all_steps / budget.steps)
     if not windows:
         return None
     return sum(windows) / len(windows)
