@@ -343,8 +343,8 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
     if unscored:
         names = ", ".join(unscored)
         yield (
-            f"- {results.where}: {names}: trained, but without a score "
-            "([baselines](baselines.md) says why)."
+            f"- {results.where}: {names}: trained, but without an active entry "
+            "([baselines](baselines.md#gates) says why)."
         )
     if missing:
         names = ", ".join(missing)
