@@ -49,9 +49,9 @@ from .thesis.split_results import BOARD, read_json
 Floats = NDArray[np.float64]
 
 LIMITS = {"one_step": 1.0, "free_flight": 0.02, "settled": 0.01, "densest_cell": 3.0}
-"""A measure must stay below its limit; the densest cell may reach it.
+"""The size of a measure, not its sign, must be less than its limit.
 
-Its size counts, not its sign.
+The densest cell may reach its limit.
 """
 
 GRAPH_NETWORKS = (*OPERATORS, "supergat-sd")  # names of baselines
@@ -84,10 +84,10 @@ class Gates:
             value = getattr(self, name)
             if value is None:
                 continue
-            is_too_large = abs(value) >= limit
+            is_within = abs(value) < limit  # NaN is not
             if name == "densest_cell":
-                is_too_large = value > limit
-            if is_too_large:
+                is_within = value <= limit
+            if not is_within:
                 names.append(name)
         return names
 
@@ -299,9 +299,10 @@ def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path
         if not is_wanted or entry.status is not Status.ACTIVE:
             continue
         for prediction in entry.predictions:
-            if prediction.weights is None:
+            weights = prediction.weights
+            if weights is None or weights.shared_with is not None:
                 continue
-            path = folder.path / prediction.weights.path
+            path = folder.path / weights.path
             if read_json(path.with_suffix(".json")).get("baseline") in GRAPH_NETWORKS:
                 paths.append(path)
     return paths

@@ -194,7 +194,10 @@ def claims_overview(
     """Return the answers to every claim that has one, a column per split and size."""
     rows = []
     for claim, rows_by_place in rows_by_claim.items():
-        answers = [answer(rows_by_place[place]) or "-" for place in places]
+        rival_count = len(claim.rivals)
+        answers = []
+        for place in places:
+            answers.append(answer(rows_by_place[place], rival_count) or "-")
         if any(rows_by_place[place] for place in places):
             rows.append([claim.question, *answers])
     return markdown(["", *places], rows)

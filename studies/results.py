@@ -116,10 +116,11 @@ mean is better than those of three of five models. "Yes" and "better" mean signi
 better at 5 %. "No" and "worse" mean significantly worse. "Open" means that the test
 finds no difference. Two models are compared over the seeds that both have, or over all
 seeds if they share none. "These weights" means that a model has fewer than three
-trainings: the answer is then about these weights, not about the methods. A dash means
-that an entry is missing. Entries that were superseded or withdrawn take no part: most
-of them are graph networks that fail a [gate](baselines.md#gates). For an operator the
-entry with the recipe `pushforward` is compared, if there is one."""
+trainings, so the answer is about these weights, not about the methods. Models whose fit
+draws nothing need one training only. A dash means that an entry is missing. Models that
+fail a [gate](baselines.md#gates) take no part, and neither do entries that were
+superseded or withdrawn. For an operator the entry with the recipe `pushforward` is
+compared, if there is one."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer

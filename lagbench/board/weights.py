@@ -152,6 +152,8 @@ def require_weights(
     chosen: list[Path | None] = [None] * len(headers)
     for path in paths:
         if path.suffix == ".onnx":
+            if find_keeper(folder, place, path) is not None:
+                raise _owned_error(path, "the entry beside it")
             index = chosen.index(None) if None in chosen else 0
             _require_onnx(path, headers[index], owners)
             chosen[index] = path
@@ -429,6 +431,7 @@ def check_weights(
     """
     keepers = {entry.place: entry for entry in entries}
     known_paths: set[Path] = set()
+    uses: dict[tuple[object, ...], Path] = {}  # of shared weights, by active entries
     active_paths: dict[str, Path] = {}  # by SHA-256
     for entry in entries:
         for number, prediction in enumerate(entry.predictions):
@@ -440,6 +443,18 @@ def check_weights(
             path = weights_path(place, prediction.seed, weights.path)
             if weights.shared_with is not None:
                 yield from _check_sharing(entry, prediction, keepers.get(place), where)
+                use = _use_of_shared(entry, prediction)
+                first_user = entry.yaml_path
+                if entry.status is Status.ACTIVE:
+                    first_user = uses.setdefault(use, entry.yaml_path)
+                if first_user != entry.yaml_path:
+                    yield make_issue(
+                        "weights",
+                        where,
+                        f"used as in {first_user}",
+                        what="the same weights twice",
+                        expected="other options, or another size",
+                    )
                 yield from _check_weights_file(folder, path, weights, where=where)
                 continue
             log = path.with_suffix(".json")
@@ -485,6 +500,16 @@ def check_weights(
         )
 
 
+def _use_of_shared(entry: Entry, prediction: Prediction) -> tuple[object, ...]:
+    """Return what tells one use of shared weights from another."""
+    provenance = prediction.provenance or entry.provenance
+    options: tuple[str, ...] = ()
+    if provenance is not None:
+        options = tuple(sorted(set(provenance.prediction_overrides)))
+    sha256 = None if prediction.weights is None else prediction.weights.sha256
+    return sha256, entry.split, entry.size, options
+
+
 def _check_sharing(
     entry: Entry, prediction: Prediction, keeper: Entry | None, where: str
 ) -> Iterator[ValidationIssue]:
@@ -505,15 +530,20 @@ def _check_sharing(
             expected="an entry with the same weights",
         )
     provenance = prediction.provenance or entry.provenance
-    has_options = provenance is not None and provenance.prediction_overrides
-    is_other_size = keeper is not None and keeper.place[:2] != entry.place[:2]
-    if not has_options and not is_other_size:
+    has_options = provenance is not None and bool(provenance.prediction_overrides)
+    is_other_size = (
+        keeper is not None and keeper.split == entry.split and keeper.size != entry.size
+    )
+    is_same_data = keeper is not None and keeper.place[:2] == entry.place[:2]
+    is_onnx = weights.path.endswith(".onnx")  # it has no options
+    if is_onnx or not (is_other_size or (is_same_data and has_options)):
         yield make_issue(
             "weights",
             where,
-            f"the weights of {weights.shared_with}, with the same options",
+            f"the weights of {weights.shared_with}, used as there",
             what="the same weights twice",
-            expected="predictions of another size, or with other options",
+            expected="weights of PyTorch, and predictions of another size or with other "
+            "options",
         )
 
 

@@ -6,8 +6,8 @@ both have one seed, the test is the exact sign-flip test over test scenarios, el
 two-way bootstrap over scenarios and seeds.
 For the same weights used in two ways it is that of the differences seed by seed. The
 p-values of one model against several are corrected together (Holm 1979). With fewer
-than three trainings of a model, an answer is about these weights: another seed may turn
-it.
+than three trainings of a model, an answer is about these weights: another seed may
+change it.
 """
 
 from __future__ import annotations
@@ -258,15 +258,25 @@ def _seed_values(method: Method, metric: str, frame: int | None) -> list[Score]:
 
 
 def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
-    """Return all comparisons of a claim, those by the ranking metric first."""
+    """Return all comparisons of a claim, those by the ranking metric first.
+
+    Models that fail a gate take no part. An operator is compared by the variant that is
+    trained with pushforward, where that has scores.
+    """
     first = claim.first or results.best_naive
     if first is None:
         return []
-    first = results.stand_in(first)
-    rivals = tuple(results.stand_in(name) for name in claim.rivals)
+    rivals = claim.rivals
+    if rivals and set(rivals) <= set(OPERATORS):
+        first = results.stand_in(first)
+        rivals = tuple(results.stand_in(name) for name in rivals)
+    if first in results.under_trained:
+        return []
     if not rivals:
         ranked = results.order(results.models)
         rivals = tuple(name for name in ranked if name != first)
+
+    rivals = tuple(name for name in rivals if name not in results.under_trained)
 
     metrics = tuple(dict.fromkeys((results.ranking, *claim.metrics)))
     over_horizon = compare_models(results, first, rivals, metrics)
@@ -276,12 +286,16 @@ def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
     return over_horizon + at_key_frame
 
 
-def answer(rows: Sequence[ComparedModels]) -> str:
+def answer(rows: Sequence[ComparedModels], rival_count: int = 0) -> str:
     """Return the answer of the rows by the ranking metric; "" without rows.
 
     One rival gives yes, no or open. Several give yes, or how many are worse or better.
     An answer from fewer than three trainings of a model holds for these weights only,
-    and says so.
+    and says so. So does an answer from fewer rivals than the claim has.
+
+    Args:
+        rows: comparisons of one claim on one data set.
+        rival_count: models that the claim names as rivals; 0 for all that there are.
     """
     judged = []
     for row in rows:
@@ -293,9 +307,12 @@ def answer(rows: Sequence[ComparedModels]) -> str:
     verdicts = [row.verdict for row in judged]
     if Verdict.FEW in verdicts:
         return Verdict.FEW.value
+    text = _count_verdicts(judged)
+    if len(judged) < rival_count:
+        text = f"{text}; {len(judged)} of {rival_count} compared"
     if all(row.has_enough_seeds for row in judged):
-        return _count_verdicts(judged)
-    return f"{_count_verdicts(judged)} (these weights)"
+        return text
+    return f"{text} (these weights)"
 
 
 def _count_verdicts(judged: Sequence[ComparedModels]) -> str:

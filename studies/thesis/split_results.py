@@ -30,6 +30,7 @@ from lagbench.board.entry import (
 )
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
+from lagbench.board.gates import gates_failed_by, read_failed_gates
 from lagbench.board.verified import read_verified, verification_of
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import UnreadableFileError
@@ -220,6 +221,13 @@ class Sources:
             return {}
         return read_verified(Folder(self.board))
 
+    @cached_property
+    def failed_gates(self) -> Mapping[str, tuple[str, ...]]:
+        """Gates that weights fail, by SHA-256 of the weights."""
+        if self.board is None:
+            return {}
+        return read_failed_gates(Folder(self.board))
+
     def entries(self, split: str, size: str) -> dict[str, Path]:
         """Return the entries of the board by name."""
         if self.board is None:
@@ -270,6 +278,7 @@ class SplitResults:
         self.size = sources.size(split, size)
         self.methods: dict[str, Method] = {}  # by name, reference predictors included
         self.stale: list[Path] = []  # score files of another version of the data
+        self.under_trained: set[str] = set()  # names of models that fail a gate
         self._sources = sources
         self._read_entries()
         self._read_runs()
@@ -282,6 +291,8 @@ class SplitResults:
             entry = read_entry(path)
             if entry.status is not Status.ACTIVE:
                 continue
+            if gates_failed_by(entry, self._sources.failed_gates):
+                self.under_trained.add(name)
             verification = verification_of(entry, self._sources.verified)
             measured = None if verification is None else verification.cost
             # <board>/submissions/<split>/<size>/<name>.yaml
@@ -497,8 +508,8 @@ class SplitResults:
     def stand_in(self, name: str) -> str:
         """Return the model that claims about a graph network are tested with.
 
-        It is the variant trained with pushforward, where that has scores: it passes the
-        gates. Else it is the model itself.
+        It is the variant trained with pushforward, where that has scores. Else it is
+        the model itself.
         """
         variant = f"{name}-{PUSHFORWARD}"
         if variant in self.methods:

@@ -529,6 +529,32 @@ def test_shared_weights_stay_those_of_the_entry_that_keeps_them(
     assert failing_checks(own) == {"weights"}
 
 
+@pytest.mark.usefixtures("first")
+def test_weights_that_another_entry_shares_are_not_replaced(own: BoardBench) -> None:
+    share(own)
+    before = own.state()
+    other = trained(own, 0, share=0.5)
+    with pytest.raises(UsageError, match="another entry predicts"):
+        submitted(own, other, weights=(), replace=True)
+    assert own.state() == before
+
+
+@pytest.mark.usefixtures("first")
+def test_shared_weights_are_used_in_one_way_once(own: BoardBench) -> None:
+    """Two entries that share weights with the same options are found, and so is one of
+    another split.
+    """
+    share(own)
+    twin = own.entry("glide").with_name("slide.yaml")
+    words = own.entry("glide").read_text().replace("method: glide", "method: slide")
+    twin.write_text(words)
+    result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
+    uses = [found for found in result.findings if "used as in" in str(found)]
+    assert len(uses) == 1
+    twin.unlink()
+    assert_sound(own)
+
+
 def test_only_the_file_on_the_board_is_shared(own: BoardBench, first: Path) -> None:
     """A copy of it is refused, and so are predictions with the same options."""
     otherwise = trained(own, 0, AVERAGED, share=0.3)

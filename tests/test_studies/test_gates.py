@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +59,11 @@ GATES = Gates(
 
 def test_a_gate_fails_at_its_limit_and_one_without_meaning_never() -> None:
     assert GATES.failed == ["one_step", "free_flight"]
+
+
+def test_a_measure_that_is_no_number_fails() -> None:
+    nowhere = replace(GATES, one_step=math.nan, densest_cell=math.nan)
+    assert {"one_step", "densest_cell"} <= set(nowhere.failed)
 
 
 def test_the_densest_cell_may_reach_its_limit() -> None:

@@ -195,6 +195,28 @@ def test_a_network_that_passes_its_gates_stands_for_its_operator() -> None:
     assert answer(rows) == "yes (these weights)"
 
 
+def test_models_that_fail_a_gate_take_no_part() -> None:
+    """Neither first nor as rivals; the answer says how many rivals were compared."""
+    results = six(supergat=equal(0.1))
+    results.under_trained = {"gat", "gns"}
+    rows = claim_rows(FIRST, results)
+    assert {row.second for row in rows} == {"pointnet", "gatv2", "transformer"}
+    answered = answer(rows, len(FIRST.rivals))
+    assert answered == "yes; 3 of 5 compared (these weights)"
+    results.under_trained = {"supergat"}
+    assert claim_rows(FIRST, results) == []
+
+
+def test_an_ablation_is_compared_by_its_own_recipe() -> None:
+    """The variant with pushforward stands in for an operator among operators only."""
+    ablation = "gns-novorticity"
+    claims = {claim.rivals: claim for claim in CLAIMS}
+    results = made_up_results({"gns": EQUAL, ablation: equal(0.9)})
+    results.methods["gns-pushforward"] = a_method("gns-pushforward", equal(0.1))
+    rows = claim_rows(claims[(ablation,)], results)
+    assert {row.first for row in rows} == {"gns"}
+
+
 def test_seeds_that_only_one_has_do_not_count() -> None:
     """Two models are compared over common seeds; where there are none, over all."""
     results = made_up_results({})
