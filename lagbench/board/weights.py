@@ -542,7 +542,7 @@ def _check_sharing(
             where,
             f"the weights of {weights.shared_with}, used as there",
             what="the same weights twice",
-            expected="weights of PyTorch, and predictions of another size or with other "
+            expected="weights of PyTorch; predictions of another size, or with other "
             "options",
         )
 
