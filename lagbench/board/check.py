@@ -51,7 +51,7 @@ class CheckResult:
     # entries of which some seeds were confirmed and others not scored: they are not
     # added
     partly: tuple[str, ...] = ()
-    # entries whose models were run again and gave the same scores
+    # active entries whose models were run again and gave the same scores
     reproduced_wholly: int = 0  # on all test scenarios
     reproduced_partly: int = 0  # on a part of them
     # reference predictors that were measured again, by data set, as in "cavity mini"

@@ -53,7 +53,7 @@ class FolderChecks:
     issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     readable_score_files: set[Path] = field(default_factory=set)
-    # lines of verified.yaml that hold
+    # lines of verified.yaml that hold, of active entries
     verifications: list[Verification] = field(default_factory=list)
     # entries by content hash and by fingerprint of their predictions
     _scored: dict[str, list[ScoredEntry]] = field(default_factory=dict)
@@ -420,7 +420,8 @@ class FolderChecks:
             line = verification_of(entry, verified)
             if line is not None:
                 names.add(entry.yaml_path.as_posix())
-                self.verifications.append(line)
+                if entry.status is Status.ACTIVE:
+                    self.verifications.append(line)
                 self._check_level(entry, line)
         for name in sorted(verified.keys() - names):
             self._add("verified", VERIFIED, ascii(name)[:120])

@@ -278,10 +278,13 @@ def _source_of(content: str) -> str:
 
 
 def draw_intro(board: Board) -> Markup:
-    """Return the sentences under the title: what this is, and what is verified."""
+    """Return the sentences under the title: what this is, and what is verified.
+
+    They count active entries only.
+    """
     rows: list[BoardRow] = []
     for tab in board.tabs:
-        rows += tab.rows
+        rows += [row for row in tab.rows if row.active]
     entries = _count(len(rows), "entry", "entries")
     data_sets = _count(len(board.tabs), "data set", "data sets")
     sentences = escaped(

@@ -223,9 +223,10 @@ def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
             )
 
     if result.reproduced_wholly or result.reproduced_partly:
+        wholly = format_count(result.reproduced_wholly, "active entry")
         yield (
-            f"reproduced: {format_count(result.reproduced_wholly, 'entry')} on all "
-            f"test scenarios, {result.reproduced_partly} on a part of them"
+            f"reproduced: {wholly} on all test scenarios, "
+            f"{result.reproduced_partly} on a part of them"
         )
     state = "nothing wrong"
     if result.findings:
