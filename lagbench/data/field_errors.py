@@ -87,6 +87,9 @@ PATTERN_WORDS = {
     r"^[a-z0-9]+(-[a-z0-9]+)*$": (
         "small letters, digits and single hyphens, as in my-model"
     ),
+    r"^[a-z0-9]+(-[a-z0-9]+)*(/[a-z0-9]+(-[a-z0-9]+)*){2}$": (
+        "split, size and method of an entry, as in cavity/mini/gns"
+    ),
     r"^[a-z0-9_]+$": "small letters, digits and underscores",
     r"^[a-z0-9_]{1,60}$": "1 to 60 small letters, digits and underscores",
     r"^[a-z][a-z0-9_-]*$": (

@@ -341,10 +341,10 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("training.learning_rat=1", "did you mean 'learning_rate'"),
-        ("training.schedule.evry=1", "did you mean 'every'"),
+        ("training.learning_rat=1", "did you mean 'training.learning_rate'"),
+        ("training.schedule.evry=1", "did you mean 'training.schedule.every'"),
         ("training.schedule=cosin", "schedule"),
-        ("model.strat=1", "did you mean 'start'"),
+        ("model.strat=1", "did you mean 'model.start'"),
         ("modle.start=1", "model.KEY=VALUE"),
         ("model.start", "model.KEY=VALUE"),
         ("training.batch=[1", "no YAML"),
@@ -415,10 +415,13 @@ def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
     [
         ("{format: 2, recipes: {}}", "format"),
         ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
-        ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
+        (
+            "{format: 1, recipes: {a/b: {modell: {}}}}",
+            "did you mean 'recipes.a/b.model'",
+        ),
         (
             "{format: 1, recipes: {a/b: {baselines: {gns: {trainin: {}}}}}}",
-            "did you mean 'training'",
+            "did you mean 'recipes.a/b.baselines.gns.training'",
         ),
         (
             "{format: 1, recipes: {cavity/tiny: {baselines: {gnss: {}}}}}",

@@ -149,7 +149,8 @@ def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
         template("cavitty", output=output, **location)
     with pytest.raises(UsageError) as caught:
         template("cavity", "tiny", output=output, **location)
-    assert caught.value.where == str(output)
+    assert caught.value.where == "--output"
+    assert str(output) in str(caught.value)
     assert output.read_bytes() == b"mine"
 
 
