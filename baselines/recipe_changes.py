@@ -6,7 +6,7 @@ Both may come from a stranger. Options that are unknown here are passed over.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -14,7 +14,14 @@ import yaml
 from lagbench.errors import LagbenchError
 
 from .catalogue import find
-from .recipe import ANY, LATER_OPTIONS, Recipe, recipe_for, recipe_names
+from .recipe import (
+    ANY,
+    LATER_OPTIONS,
+    Recipe,
+    change_options,
+    recipe_for,
+    recipe_names,
+)
 
 # options that do not change the learned weights' meaning, or are told elsewhere
 UNLISTED = ("seed", "compile", "log_every", "checkpoint_every")
@@ -39,6 +46,33 @@ def list_settings(recipe: object) -> tuple[str, ...]:
     for key, value in _find_changes(shipped_options, recipe, LATER_OPTIONS):
         settings.append(f"{key}={_format_yaml(value)}")
     return tuple(sorted(settings))
+
+
+def list_effective_settings(
+    baseline: str, options: Mapping[str, Any], settings: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the settings of a prediction that change the model, in one form and order.
+
+    A setting that states the value of the weights' own recipe, or of its default,
+    changes nothing and is left out. Settings that the model does not take, and those of
+    a model that is not installed, are returned as they are written.
+
+    Args:
+        baseline: name of the baseline in the weights.
+        options: options of the model in the weights.
+        settings: settings of the prediction, as in ``model.average=true``.
+    """
+    try:
+        entry = find(baseline)
+        before = change_options(entry, options, ())
+        after = change_options(entry, options, settings)
+    except LagbenchError:
+        return tuple(sorted(set(settings)))
+    changes = []
+    for name, value in after.items():
+        if value != before[name]:
+            changes.append(f"model.{name}={json.dumps(value, sort_keys=True)}")
+    return tuple(sorted(changes))
 
 
 def _find_shipped_recipe(recipe: Mapping[str, Any]) -> Recipe | None:

@@ -6,6 +6,7 @@ there is, or for years of work. What passes here can be loaded in this process.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.work.machine import run_in_child
 
 from .checkpoint import load, restore
+from .recipe_changes import list_effective_settings
 
 SECONDS = 20.0  # processor time of reading and building, without imports [s]
 WALL_SECONDS = 120.0  # time of the clock, with imports on a busy machine [s]
@@ -68,3 +70,42 @@ def check_in_child(path: Path) -> None:
             got=reason,
             fix=fix or "write them with lagbench.models.registered.export_safetensors",
         )
+
+
+def read_effective_settings(request: Sequence[str]) -> list[str]:
+    """Return the settings of a prediction that change the model of its weights.
+
+    Where the weights cannot be read, the settings are returned as they are written. It
+    is run in a child process.
+
+    Args:
+        request: path of the weights, then the settings.
+    """
+    path, *settings = request
+    try:
+        checkpoint = load(path)
+        effective = list_effective_settings(
+            checkpoint.baseline, checkpoint.options, settings
+        )
+    except Exception:  # options of a stranger may break a model in any way
+        return sorted(set(settings))
+    return list(effective)
+
+
+def read_in_child(requests: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return what `read_effective_settings` returns for each request.
+
+    All files are read in one child process. Where it is stopped, the settings of the
+    file that stopped it, and of those after it, are returned as they are written.
+    """
+    answers = run_in_child(
+        f"{__name__}.{read_effective_settings.__name__}",
+        requests,
+        seconds=SECONDS,
+        wall=WALL_SECONDS,
+        memory=MEMORY,
+    )
+    settings = list(answers.values)
+    for request in requests[len(settings) :]:
+        settings.append(sorted(set(request[1:])))
+    return settings

@@ -87,7 +87,8 @@ def check_board(
         page: whether to compare the page, too, where all else is right.
         base: git revision; entries there that the folder alters are issues.
         own: methods whose entries the change may alter.
-        isolated: whether a child process reads score files first.
+        isolated: whether a child process reads score files first, and the recipes of
+            shared weights.
         predictions: files of predictions of entries, which are scored again.
         recording: whether to note confirmed entries in verified.yaml.
         floors: sizes whose shipped scores of reference predictors are measured again.
@@ -105,6 +106,7 @@ def check_board(
         folder=folder,
         registry=described,
         unreadable=_find_unreadable(folder) if isolated else {},
+        isolated=isolated,
     )
     checks.run()
     issues = checks.issues

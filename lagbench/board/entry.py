@@ -522,3 +522,10 @@ class Entry(About):
         if provenance is None:
             return TrainingProvenance.from_sentence(self.training)
         return provenance
+
+    def settings_of(self, prediction: Prediction) -> tuple[str, ...]:
+        """Return the options that one of the predictions changed, as it states them."""
+        provenance = prediction.provenance or self.provenance
+        if provenance is None:
+            return ()
+        return provenance.prediction_overrides

@@ -50,6 +50,7 @@ class FolderChecks:
     folder: Folder
     registry: Registry
     unreadable: Mapping[Path, str]  # files that a child process cannot read, and why
+    isolated: bool = True  # whether a child process reads the recipes of shared weights
     issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     readable_score_files: set[Path] = field(default_factory=set)
@@ -65,7 +66,7 @@ class FolderChecks:
         for path in self.folder.reference_files():
             self._guard(path, self._check_reference)
         self._check_misplaced_files()
-        self.issues += check_weights(self.folder, self.entries)
+        self.issues += check_weights(self.folder, self.entries, isolated=self.isolated)
         self._check_successors()
         self._check_twins()
         self._check_names()

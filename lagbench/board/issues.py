@@ -124,7 +124,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "weights": BoardCheck(
         "weights that are missing, edited or in a wrong place; weights that no entry "
-        "names, or that two entries name and use in the same way; shared weights that "
+        "names, or that two active entries use in the same way; shared weights that "
         "their entry does not keep; more than 60 MB of weights, or a file of more than "
         "40 MB; a training log that is too long or broken",
         "the weights are not those of the entry",

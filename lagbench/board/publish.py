@@ -41,6 +41,7 @@ from .folder import (
     score_paths,
 )
 from .ranking import combine, scored_file, summarise, write_references
+from .sharing import require_weights_stay
 from .shift import shift_without_stale_line
 from .verified import list_without_stale_line
 from .weights import copy_weights, name_weights
@@ -101,7 +102,7 @@ def publish(
         staged_scores = _stage_scores(draft, predictions, cards, folder, staging)
         predictions = _with_weights(draft, predictions, folder, previous)
         entry = _form_entry(draft, predictions, files, cards, staged_scores)
-        _require_shared_weights_stay(folder, entry, previous)
+        require_weights_stay(folder, entry, previous)
 
         moves = _moves_of_scores(draft, staged_scores)
         moves |= _stage_weights(draft, entry, staging)
@@ -135,41 +136,6 @@ def publish(
         kept=_find_kept_weights(entry, moves, folder),
         removed=removed,
     )
-
-
-def _require_shared_weights_stay(
-    folder: Folder, entry: Entry, previous: Entry | None
-) -> None:
-    """Refuse to replace or remove weights that another entry shares.
-
-    Raises:
-        UsageError: another entry predicts with weights that would go.
-    """
-    if previous is None:
-        return
-    staying = {
-        prediction.weights.sha256
-        for prediction in entry.predictions
-        if prediction.weights
-    }
-    keeper = "/".join(entry.place)
-    for path in folder.entries():
-        if path.parts[1] != entry.split or path == entry.yaml_path:
-            continue
-        other = read_entry_if_valid(folder.path / path)
-        for prediction in () if other is None else other.predictions:
-            weights = prediction.weights
-            if weights is None or weights.shared_with != keeper:
-                continue
-            if weights.sha256 not in staying:
-                raise UsageError(
-                    "another entry predicts with the weights that would go",
-                    where=str(folder.path / path),
-                    expected=f"the weights {weights.sha256[:16]} of {keeper} stay",
-                    got="other weights, or none",
-                    fix="submit under a new --method, and set the old entry to "
-                    "status: superseded",
-                )
 
 
 def _write_journal(

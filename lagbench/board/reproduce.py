@@ -255,16 +255,12 @@ def open_model(
         from lagbench.baselines.weights_check import check_in_child
 
         check_in_child(path)
-    provenance = prediction.provenance or entry.provenance
-    settings: tuple[str, ...] = ()
-    if provenance is not None:
-        settings = provenance.prediction_overrides
     return WeightsRunner(
         path,
         size=entry.size,
         root=root,
         registry=registry,
-        settings=settings,
+        settings=entry.settings_of(prediction),
         threads=threads,
     )
 

@@ -8,8 +8,9 @@ weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recip
 weights/<split>/<size>/<method>_<seed>.onnx   or a model of another code base
 weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
 
-An entry may share the weights of another one: it predicts with them at another size,
-or with other options, such as the mean over mirror images. Then no second copy is kept.
+An entry may share the weights of another one (:mod:`.sharing`): it predicts with them
+at another size, or with other options, such as the mean over mirror images; or it takes
+the place of an inactive entry. Then no second copy is kept.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
@@ -32,9 +34,10 @@ from lagbench.submission.issues import ValidationIssue
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
-from .entry_file import MOST_FILE_BYTES, is_unchanged, read_entry_if_valid
-from .folder import DEPTH, WEIGHTS, Folder, Place, entry_path, weights_path
+from .entry_file import MOST_FILE_BYTES, is_unchanged
+from .folder import Folder, Place, weights_path
 from .issues import make_issue
+from .sharing import Use, check_sharing, check_uses, find_keeper, list_uses, where_in
 
 MOST_BYTES = 60_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
@@ -55,6 +58,7 @@ class WeightsFile:
     sha256: str
     is_state: bool  # a state to go on from, with an optimiser
     baseline: str
+    options: Mapping[str, Any]  # of the model, plain values
     data_set: tuple[str, str, str]  # split, size and SHA-256
     seed: int
     provenance: TrainingProvenance
@@ -63,6 +67,12 @@ class WeightsFile:
     def describe_data_set(self) -> str:
         """Return split, size, data set and seed in words."""
         return f"{_describe_data_set(self.data_set)}, seed {self.seed}"
+
+    def list_effective_settings(self, settings: Sequence[str]) -> tuple[str, ...]:
+        """Return the settings of a prediction that change the model."""
+        from lagbench.baselines.recipe_changes import list_effective_settings
+
+        return list_effective_settings(self.baseline, self.options, settings)
 
 
 def _describe_data_set(data_set: tuple[str, str, str]) -> str:
@@ -92,34 +102,12 @@ def inspect_weights(path: Path) -> WeightsFile:
         sha256=file_sha256(path),
         is_state=checkpoint.optimizer is not None,
         baseline=checkpoint.baseline,
+        options=checkpoint.options,
         data_set=(info.split, info.size, info.dataset_sha256),
         seed=recipe.get("training", {}).get("seed", 0),
         provenance=training_provenance(checkpoint),
         parameters=count_rounded_parameters(checkpoint) or None,
     )
-
-
-def find_keeper(folder: Folder, place: Place, path: Path) -> Place | None:
-    """Return the other entry beside which a file of weights lies on this board.
-
-    None where the file lies elsewhere, or beside the entry of this place.
-    """
-    board = folder.path.resolve()
-    whole_path = path.resolve()
-    if not whole_path.is_relative_to(board):
-        return None
-    inner_path = whole_path.relative_to(board)
-    if len(inner_path.parts) != DEPTH or inner_path.parts[0] != WEIGHTS:
-        return None
-    _, split, size, _ = inner_path.parts
-    method, _, _ = inner_path.stem.rpartition("_")
-    keeper = (split, size, method)
-    if keeper == place:
-        return None
-    entry = read_entry_if_valid(folder.path / entry_path(keeper))
-    if entry is not None and inner_path in entry.files:
-        return keeper
-    return None
 
 
 def require_weights(
@@ -149,18 +137,17 @@ def require_weights(
 
     seeds = [header.seed or 0 for header in headers]
     owners = _owners_of_weights(rivals)
+    uses = list_uses([*rivals.values()])
     chosen: list[Path | None] = [None] * len(headers)
     for path in paths:
+        keeper = find_keeper(folder, place, path)
         if path.suffix == ".onnx":
-            if find_keeper(folder, place, path) is not None:
-                raise _owned_error(path, "the entry beside it")
             index = chosen.index(None) if None in chosen else 0
-            _require_onnx(path, headers[index], owners)
+            _require_onnx(path, headers[index], uses, keeper)
             chosen[index] = path
             continue
         file = inspect_weights(path)
-        is_shared = find_keeper(folder, place, path) is not None
-        _require_fit(file, headers[0], seeds, any_size=is_shared)
+        _require_fit(file, headers[0], seeds, any_size=keeper is not None)
         index = seeds.index(file.seed)
         if chosen[index] is not None:
             raise UsageError(
@@ -170,9 +157,9 @@ def require_weights(
                 got=f"two of seed {file.seed}",
                 fix="give one of each seed at most",
             )
-        is_owned = is_shared or file.sha256 in owners
-        if is_owned and not (is_shared and _predicts_otherwise(file, headers[index])):
-            raise _owned_error(path, owners.get(file.sha256, "the entry beside it"))
+        if file.sha256 in owners and keeper is None:
+            raise _owned_error(path, owners[file.sha256])
+        _require_new_use(file, headers[index], uses)
         _require_made_by(file, headers[index])
         chosen[index] = path
     return tuple(chosen)
@@ -191,17 +178,26 @@ def _require_small(paths: Sequence[Path]) -> None:
         )
 
 
-def _require_onnx(path: Path, header: Header, owners: Mapping[str, str]) -> None:
+def _require_onnx(
+    path: Path, header: Header, uses: Sequence[Use], keeper: Entry | None
+) -> None:
     """Refuse an ONNX file that cannot be run, or is another entry's or seed's.
 
-    ONNX files belong to the predictions in their order.
+    ONNX files belong to the predictions in their order. They have no options, so only
+    that of an inactive entry of the same data set can be shared.
     """
     from lagbench.models.onnx_model import check_onnx
 
     declared = check_onnx(path)
-    owner = owners.get(file_sha256(path))
-    if owner is not None:
-        raise _owned_error(path, owner)
+    sha256 = file_sha256(path)
+    for use in uses:
+        if use.weights.sha256 == sha256:
+            raise _owned_error(path, str(use.entry.yaml_path))
+    if keeper is not None:
+        data_set = (header.split, header.size)
+        kept_path = weights_path(keeper.place, header.seed, path)
+        if keeper.place[:2] != data_set or kept_path.name != path.name:
+            raise _owned_error(path, str(keeper.yaml_path))
     if header.parameters is not None and header.parameters != declared.parameters:
         raise UsageError(
             "the model did not make these predictions",
@@ -216,22 +212,34 @@ def _owned_error(path: Path, owner: str) -> UsageError:
     return UsageError(
         "these weights lie beside another entry",
         where=str(path),
-        expected="weights that no other entry has, or predictions of another size or "
-        "with other options (lagbench predict --set)",
+        expected="weights that no other active entry has",
         got=f"those of {owner}",
         fix="give those of this method; to share them, give the file that lies on the "
         "board, and predictions that another option or size made",
     )
 
 
-def _predicts_otherwise(file: WeightsFile, header: Header) -> bool:
-    """Return whether predictions differ from what the weights predict by themselves."""
-    _, size, _ = file.data_set
-    if header.size != size:
-        return True
-    return header.provenance is not None and bool(
-        header.provenance.prediction_overrides
-    )
+def _require_new_use(file: WeightsFile, header: Header, uses: Sequence[Use]) -> None:
+    """Refuse predictions that an active entry makes with the same weights and options.
+
+    Options are compared with the recipe in the weights.
+    """
+    settings: tuple[str, ...] = ()
+    if header.provenance is not None:
+        settings = header.provenance.prediction_overrides
+    effective = file.list_effective_settings(settings)
+    for use in uses:
+        is_same_file = use.weights.sha256 == file.sha256
+        if is_same_file and file.list_effective_settings(use.settings) == effective:
+            raise UsageError(
+                "another entry predicts with these weights in the same way",
+                where=str(file.path),
+                expected="predictions of another size, or with options that change the "
+                "model (lagbench predict --set)",
+                got=", ".join(settings) or f"the options of {use.entry.yaml_path}",
+                fix="predict with another option or size; or, if this entry replaces "
+                f"{use.entry.yaml_path}, set that one to status: superseded first",
+            )
 
 
 def _require_fit(
@@ -320,12 +328,17 @@ def name_weights(
             named.append(previous_weights.get(key))
         else:
             keeper = find_keeper(folder, place, path)
-            inner_path = weights_path(keeper or place, prediction.seed, path)
+            shared_with = None
+            keeper_place = place
+            if keeper is not None:
+                keeper_place = keeper.place
+                shared_with = "/".join(keeper_place)
+            inner_path = weights_path(keeper_place, prediction.seed, path)
             named.append(
                 Weights(
                     path=inner_path.as_posix(),
                     sha256=file_sha256(path),
-                    shared_with=None if keeper is None else "/".join(keeper),
+                    shared_with=shared_with,
                 )
             )
     return tuple(named)
@@ -423,43 +436,35 @@ def reason_unfit_log(path: Path) -> str | None:
 
 
 def check_weights(
-    folder: Folder, entries: Sequence[Entry]
+    folder: Folder, entries: Sequence[Entry], *, isolated: bool = True
 ) -> Iterator[ValidationIssue]:
-    """Yield weights that are missing, edited, misplaced, without an entry or too many.
+    """Yield weights that are missing, edited, misplaced, without an entry or too many,
+    and those that two active entries use in the same way.
 
     Unfit logs of trainings are reported, too; a log that is not there is no issue.
+
+    Args:
+        folder: the leaderboard.
+        entries: entries that fit the schema.
+        isolated: whether a child process reads the recipes of shared weights.
     """
     keepers = {entry.place: entry for entry in entries}
     known_paths: set[Path] = set()
-    uses: dict[tuple[object, ...], Path] = {}  # of shared weights, by active entries
     active_paths: dict[str, Path] = {}  # by SHA-256
     for entry in entries:
         for number, prediction in enumerate(entry.predictions):
             weights = prediction.weights
             if weights is None:
                 continue
-            where = f"{entry.yaml_path}, predictions.{number}.weights"
+            where = where_in(entry, number)
             place = weights.place_of(entry.place)
             path = weights_path(place, prediction.seed, weights.path)
+            yield from _check_weights_file(folder, path, weights, where=where)
             if weights.shared_with is not None:
-                yield from _check_sharing(entry, prediction, keepers.get(place), where)
-                use = _use_of_shared(entry, prediction)
-                first_user = entry.yaml_path
-                if entry.status is Status.ACTIVE:
-                    first_user = uses.setdefault(use, entry.yaml_path)
-                if first_user != entry.yaml_path:
-                    yield make_issue(
-                        "weights",
-                        where,
-                        f"used as in {first_user}",
-                        what="the same weights twice",
-                        expected="other options, or another size",
-                    )
-                yield from _check_weights_file(folder, path, weights, where=where)
+                yield from check_sharing(entry, number, keepers)
                 continue
             log = path.with_suffix(".json")
             known_paths |= {path, log}
-            yield from _check_weights_file(folder, path, weights, where=where)
             yield from _check_log(folder, log)
 
             is_active = entry.status is Status.ACTIVE
@@ -473,6 +478,7 @@ def check_weights(
                         what="the same weights twice",
                         expected="one place",
                     )
+    yield from check_uses(folder, entries, isolated=isolated)
 
     lying_paths = folder.weight_files()
     for path in lying_paths:
@@ -497,53 +503,6 @@ def check_weights(
             expected=f"at most {MOST_BYTES} bytes in all",
             fix="keep larger ones as files of a release, and name them by `weights: "
             "https://...` in the entry",
-        )
-
-
-def _use_of_shared(entry: Entry, prediction: Prediction) -> tuple[object, ...]:
-    """Return what tells one use of shared weights from another."""
-    provenance = prediction.provenance or entry.provenance
-    options: tuple[str, ...] = ()
-    if provenance is not None:
-        options = tuple(sorted(set(provenance.prediction_overrides)))
-    sha256 = None if prediction.weights is None else prediction.weights.sha256
-    return sha256, entry.split, entry.size, options
-
-
-def _check_sharing(
-    entry: Entry, prediction: Prediction, keeper: Entry | None, where: str
-) -> Iterator[ValidationIssue]:
-    """Yield why an entry may not share the weights that another one keeps."""
-    weights = prediction.weights
-    if weights is None:
-        return
-    kept_hashes = set()
-    for kept in () if keeper is None else keeper.predictions:
-        if kept.weights is not None and kept.weights.shared_with is None:
-            kept_hashes.add(kept.weights.sha256)
-    if weights.sha256 not in kept_hashes:
-        yield make_issue(
-            "weights",
-            where,
-            f"{weights.shared_with} does not keep them",
-            what="shared weights that their entry does not keep",
-            expected="an entry with the same weights",
-        )
-    provenance = prediction.provenance or entry.provenance
-    has_options = provenance is not None and bool(provenance.prediction_overrides)
-    is_other_size = (
-        keeper is not None and keeper.split == entry.split and keeper.size != entry.size
-    )
-    is_same_data = keeper is not None and keeper.place[:2] == entry.place[:2]
-    is_onnx = weights.path.endswith(".onnx")  # it has no options
-    if is_onnx or not (is_other_size or (is_same_data and has_options)):
-        yield make_issue(
-            "weights",
-            where,
-            f"the weights of {weights.shared_with}, used as there",
-            what="the same weights twice",
-            expected="weights of PyTorch; predictions of another size, or with other "
-            "options",
         )
 
 

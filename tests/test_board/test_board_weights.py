@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
-from simple_models import INFO, Drift
+from simple_models import INFO, Drift, install
 
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
+from lagbench.baselines.weights_check import read_in_child
 from lagbench.board import submit as submitting
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
@@ -555,6 +556,98 @@ def test_shared_weights_are_used_in_one_way_once(own: BoardBench) -> None:
     assert_sound(own)
 
 
+@pytest.mark.usefixtures("first")
+def test_an_option_with_its_default_is_no_other_option(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`submit` refuses shared weights with it, and the check finds an entry that was
+    written by hand.
+    """
+    install(monkeypatch, drift=Drift)
+    run = trained(own, 0, f"{OURS}, predicted with model.fail_at=0", share=0.3)
+    before = own.state()
+    with pytest.raises(UsageError, match="in the same way"):
+        submitted(own, run, weights=(kept_weights(own),), method="glide")
+    assert own.state() == before
+
+    other = trained(own, 0, f"{OURS}, predicted with model.fail_at=1000", share=0.4)
+    submitted(own, other, weights=(kept_weights(own),), method="glide")
+    assert_sound(own)
+    glide = own.entry("glide")
+    glide.write_text(glide.read_text().replace("fail_at=1000", "fail_at=0"))
+    assert failing_checks(own) == {"weights"}
+
+
+@pytest.mark.usefixtures("first")
+def test_one_option_in_two_spellings_is_one(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(monkeypatch, drift=Drift)
+    weights = (kept_weights(own),)
+    first = trained(own, 0, f"{OURS}, predicted with model.start=2", share=0.3)
+    submitted(own, first, weights=weights, method="glide")
+    second = trained(own, 0, f"{OURS}, predicted with model.start=2.0", share=0.4)
+    with pytest.raises(UsageError, match=r"glide\.yaml"):
+        submitted(own, second, weights=weights, method="slide")
+    third = trained(own, 0, f"{OURS}, predicted with model.start=3", share=0.5)
+    submitted(own, third, weights=weights, method="slide")
+    assert_sound(own)
+    slide = own.entry("slide")
+    slide.write_text(slide.read_text().replace("start=3", "start=2.0"))
+    assert failing_checks(own) == {"weights"}
+
+
+def test_a_child_process_reads_the_options_of_weights(
+    own: BoardBench, first: Path
+) -> None:
+    """What it cannot read, and options that the model lacks, stay as written."""
+    checkpoint = replace(load(first / "weights.pt"), baseline="neuralmpm")
+    save(first / "neuralmpm.pt", checkpoint)
+    path = str(first / "neuralmpm.pt")
+    requests = [
+        (path, "model.average=false"),
+        (path, "model.average=yes", "model.average=true"),
+        (path, "model.nothing=1"),
+        (str(first / "predictions.nc"), "model.b=1", "model.a=1"),
+    ]
+    assert read_in_child(requests) == [
+        [],
+        ["model.average=true"],
+        ["model.nothing=1"],
+        ["model.a=1", "model.b=1"],
+    ]
+
+
+@pytest.mark.parametrize("change", ["supersede", "withdraw"])
+def test_a_successor_takes_over_the_weights_of_an_inactive_entry(
+    own: BoardBench, first: Path, change: str
+) -> None:
+    """It shares the file that lies there, with the same predictions; not while the
+    other entry is active.
+    """
+    weights = (kept_weights(own),)
+    with pytest.raises(UsageError):
+        submitted(own, first, weights=weights, method="glide")
+    own.edit("drift", supersede if change == "supersede" else withdraw)
+    before = kept_files(own)
+    submitted(own, first, weights=weights, method="glide")
+    assert kept_files(own) == before
+    entry = read_entry(own.entry("glide"))
+    assert entry.predictions[0].weights is not None
+    assert entry.predictions[0].weights.shared_with == "cavity/tiny/drift"
+    assert_sound(own)
+
+    # a third entry cannot use them in the same way
+    other = trained(own, 0, share=0.3)
+    for given in (weights[0], first / "weights.pt"):
+        with pytest.raises(UsageError, match="in the same way"):
+            submitted(own, other, weights=(given,), method="slide")
+    # nor can both be active
+    own.edit("drift", restore)
+    own.edit("drift", lambda content: content.pop("superseded_by", None))
+    assert "weights" in failing_checks(own)
+
+
 def test_only_the_file_on_the_board_is_shared(own: BoardBench, first: Path) -> None:
     """A copy of it is refused, and so are predictions with the same options."""
     otherwise = trained(own, 0, AVERAGED, share=0.3)
@@ -564,7 +657,7 @@ def test_only_the_file_on_the_board_is_shared(own: BoardBench, first: Path) -> N
         (otherwise, first / "weights.pt"),
         (alike, kept_weights(own)),
     ):
-        with pytest.raises(UsageError, match="beside another entry"):
+        with pytest.raises(UsageError, match="another entry"):
             submitted(own, run, weights=(weights,), method="glide")
     assert own.state() == before
 

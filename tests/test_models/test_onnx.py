@@ -434,3 +434,14 @@ def test_an_entry_carries_an_onnx_model(
     assert result.exit_code == 0
     (line,) = result.lines.values()
     assert line.level is Level.REPRODUCED
+
+    # its successor shares the file once the entry is inactive
+    successor = meta.model_copy(update={"method": "straight", "name": "Straight"})
+    with pytest.raises(UsageError):
+        submit([predictions], successor, weights=[place], **options)
+    entry = board / "submissions/curl-noise/tiny/lines.yaml"
+    old = entry.read_text()
+    entry.write_text(f"{old}status: superseded\nsuperseded_by: straight\n")
+    submit([predictions], successor, weights=[place], **options)
+    assert [file.name for file in place.parent.iterdir()] == [place.name]
+    assert check_board(board, isolated=False).findings == ()
