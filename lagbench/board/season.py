@@ -4,7 +4,9 @@ Closing a season freezes the entries that have models. A seed follows from the h
 all frozen models, so nobody knows the blind scenarios before the season is closed, and
 afterwards everybody can draw them::
 
-    seed = SHA-256(season, split, size, version, hashes of all frozen models, value)
+    seed = SHA-256(season, split, size, version, all frozen models, value)
+
+A frozen model is the hash of its file, and the options of the prediction.
 
 The value is a public random number, from a source that was named when the season was
 closed; a season may do without one. docs/seasons.md says what that proves.
@@ -16,6 +18,7 @@ closed; a season may do without one. docs/seasons.md says what that proves.
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -33,8 +36,9 @@ from lagbench.metrics.table import RANKING, ranking_metric
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE
 from lagbench.scoring.skill import best_reference
+from lagbench.submission.provenance import Overrides
 
-from .entry import Entry, Strict
+from .entry import Entry, Prediction, Strict
 from .entry_file import examine, format_issues, is_unchanged, load_plain, yaml_bytes
 from .fields import (
     MOST_SEEDS,
@@ -79,10 +83,28 @@ _Count = Annotated[int, Field(ge=FEWEST_SCENARIOS, le=MOST_SCENARIOS)]
 
 
 class FrozenModel(Strict):
-    """The model of one seed of an entry."""
+    """The model of one seed of an entry, and the options that it predicts with."""
 
     seed: Seed | None = None
     sha256: Hash
+    # options that the prediction changed; None in the files of earlier seasons
+    options: Annotated[Overrides, Field(strict=False)] | None = None
+
+    @property
+    def identity(self) -> str:
+        """What enters the seed: the hash, and options as JSON where there are some."""
+        if not self.options:
+            return self.sha256
+        return f"{self.sha256} {json.dumps(sorted(self.options))}"
+
+    def is_of(self, entry: Entry, prediction: Prediction) -> bool:
+        """Tell whether a prediction of an entry has this model and these options."""
+        weights = prediction.weights
+        if weights is None or prediction.seed != self.seed:
+            return False
+        if weights.sha256 != self.sha256:
+            return False
+        return self.options is None or self.options == entry.settings_of(prediction)
 
 
 class FrozenEntry(Strict):
@@ -136,14 +158,14 @@ class Season(Strict):
     ]
 
     @property
-    def model_hashes(self) -> tuple[str, ...]:
-        """Hashes of all frozen models, ascending."""
-        hashes = set()
+    def models(self) -> tuple[str, ...]:
+        """Identities of all frozen models, ascending."""
+        identities = set()
         for data_set in self.data_sets:
             for entry in data_set.entries:
                 for model in entry.models:
-                    hashes.add(model.sha256)
-        return tuple(sorted(hashes))
+                    identities.add(model.identity)
+        return tuple(sorted(identities))
 
     @property
     def is_waiting(self) -> bool:
@@ -169,7 +191,8 @@ def draw_seed(
         split: name of the split.
         size: name of the size.
         version: version of the data set.
-        models: SHA-256 of all frozen models of the season.
+        models: SHA-256 of all frozen models of the season, each with its options if it
+            has any.
         value: the public random value; empty without one.
     """
     lines = [
@@ -179,8 +202,8 @@ def draw_seed(
         f"size {size}",
         f"version {version}",
     ]
-    for sha256 in sorted(set(models)):
-        lines.append(f"model {sha256}")
+    for model in sorted(set(models)):
+        lines.append(f"model {model}")
     lines.append(f"value {value}")
     text = "".join(f"{line}\n" for line in lines)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -290,7 +313,7 @@ def with_seeds(season: Season) -> Season:
                 data_set.split,
                 data_set.size,
                 data_set.version,
-                models=season.model_hashes,
+                models=season.models,
                 value=season.value,
             )
         data_sets.append(data_set.model_copy(update={"draw_seed": seed}))
@@ -518,7 +541,12 @@ def _frozen_models(folder: Folder, entry: Entry) -> tuple[FrozenModel, ...]:
                 got="another file, or none",
                 fix="lagbench leaderboard check",
             )
-        models.append(FrozenModel(seed=prediction.seed, sha256=weights.sha256))
+        model = FrozenModel(
+            seed=prediction.seed,
+            sha256=weights.sha256,
+            options=entry.settings_of(prediction),
+        )
+        models.append(model)
     return tuple(models)
 
 

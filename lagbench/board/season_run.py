@@ -425,8 +425,9 @@ class _SeasonRun:
         raise ChecksFailedError(
             "the frozen model is no longer on the board",
             where=str(path),
-            expected=f"seed {model.seed}, a model with SHA-256 {model.sha256[:16]}",
-            got="no such model beside the entry",
+            expected=f"seed {model.seed}, a model with SHA-256 {model.sha256[:16]}, "
+            f"predicted with {', '.join(model.options or ()) or 'its own options'}",
+            got="no such model beside the entry, or other options",
             fix="check out the commit that closed the season",
         )
 

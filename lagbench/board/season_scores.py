@@ -142,12 +142,12 @@ def values_of(scores: Score) -> dict[int, float]:
 
 
 def find_prediction(entry: Entry, model: FrozenModel) -> int | None:
-    """Return the number of the prediction that a frozen model made, None without it."""
+    """Return the number of the prediction that a frozen model made, None without it.
+
+    None also where the entry predicts with other options by now.
+    """
     for index, prediction in enumerate(entry.predictions):
-        weights = prediction.weights
-        if weights is None or prediction.seed != model.seed:
-            continue
-        if weights.sha256 == model.sha256:
+        if model.is_of(entry, prediction):
             return index
     return None
 

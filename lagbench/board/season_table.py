@@ -24,7 +24,13 @@ from .entry import BlindScore, Entry, Level, Verification
 from .entry_file import read_entry_if_valid
 from .folder import Folder, entry_path
 from .season import Season, SeasonDataSet
-from .season_scores import DataSetScores, ModelScores, SeasonScores
+from .season_scores import (
+    DataSetScores,
+    ModelScores,
+    SeasonScores,
+    find_prediction,
+    frozen_models,
+)
 from .verified import record
 
 DIGITS = 6
@@ -125,7 +131,7 @@ def record_blind(
             continue
         place = (row.split, row.size, row.method)
         entry = read_entry_if_valid(folder.path / entry_path(place))
-        if entry is None or not _has_models(entry, row.models):
+        if entry is None or not _has_frozen_models(entry, season):
             continue
         line = record(folder, entry, partial(_with_blind, season=season, row=row))
         if line.level is Level.BLIND:
@@ -133,13 +139,15 @@ def record_blind(
     return tuple(blind_entries)
 
 
-def _has_models(entry: Entry, models: Sequence[str]) -> bool:
-    """Tell whether an entry still has the models that were frozen."""
-    hashes = set()
-    for prediction in entry.predictions:
-        if prediction.weights is not None:
-            hashes.add(prediction.weights.sha256)
-    return hashes.issuperset(models)
+def _has_frozen_models(entry: Entry, season: Season) -> bool:
+    """Tell whether an entry still has the models that were frozen, and the options."""
+    for data_set in season.data_sets:
+        if (data_set.split, data_set.size) != (entry.split, entry.size):
+            continue
+        for frozen, model in frozen_models(data_set):
+            if frozen.method == entry.method and find_prediction(entry, model) is None:
+                return False
+    return True
 
 
 def _with_blind(line: Verification, *, season: Season, row: SeasonRow) -> Verification:

@@ -127,7 +127,7 @@ def _describe_season(season: Season, path: Path, board: Path) -> Iterator[str]:
             f"{format_count(len(data_set.entries), 'entry')}, "
             f"{data_set.scenarios} blind scenarios, seed {seed}"
         )
-    yield f"{path}: {format_count(len(season.model_hashes), 'model')} frozen"
+    yield f"{path}: {format_count(len(season.models), 'model')} frozen"
     if season.is_waiting:
         yield f"the seeds wait for: {season.source}"
     else:

@@ -19,6 +19,7 @@ from lagbench.board.entry import Level
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import reproduce
 from lagbench.board.season import (
+    FrozenModel,
     Season,
     close,
     draw_seed,
@@ -138,6 +139,18 @@ def test_the_seed_is_a_hash_that_anybody_can_form() -> None:
     assert len(others - {expected}) == 3
 
 
+def test_options_of_frozen_models_enter_the_seed() -> None:
+    """As a list of JSON behind the hash; a model without options has its hash alone."""
+    sha256 = "a" * 64
+    plain = FrozenModel(seed=0, sha256=sha256, options=())
+    assert plain.identity == FrozenModel(seed=0, sha256=sha256).identity == sha256
+    averaged = FrozenModel(
+        seed=0, sha256=sha256, options=("model.b=[1, 2]", "model.average=true")
+    )
+    options = '["model.average=true", "model.b=[1, 2]"]'
+    assert averaged.identity == f"{sha256} {options}"
+
+
 def test_the_whole_seed_enters_the_draws() -> None:
     """A change of its last digit leads to other numbers, and the text to the same."""
     names = ("cavity", "mini", 2, 1000)
@@ -206,6 +219,44 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
+def change_options(bench: ModelBoard) -> None:
+    """Let the entry state an option of its prediction."""
+
+    def change(content: dict[str, Any]) -> None:
+        provenance = content["predictions"][0]["provenance"]
+        provenance["prediction_overrides"] = ["model.neighbours=4"]
+
+    bench.edit(bench.folder / PATH, change)
+
+
+def test_the_options_of_a_prediction_are_frozen(own: ModelBoard) -> None:
+    """An entry that predicts with other options is not the frozen one; a season of
+    before, which froze none, is read as it is.
+    """
+    path = own.folder / "seasons" / SEASON / "season.yaml"
+    (data_set,) = read_season(Folder(own.folder), SEASON).data_sets
+    assert data_set.entries[0].models[0].options == ()
+    change_options(own)
+    with pytest.raises(ChecksFailedError, match="options"):
+        run_again(own, again=True)
+    assert own.find().findings == ()  # an entry may change after a season
+
+    text = path.read_text()
+    assert "options: []" in text
+    path.write_text(re.sub(r"\n +options: \[\]", "", text))
+    (data_set,) = read_season(Folder(own.folder), SEASON).data_sets
+    assert data_set.entries[0].models[0].options is None
+    assert run_again(own).exit_code == 0
+
+    later = close_season(own, "later")
+    (model,) = later.data_sets[0].entries[0].models
+    assert model.options == ("model.neighbours=4",)
+    assert read_season(Folder(own.folder), "later") == later
+    season_file = path.parents[1] / "later" / "season.yaml"
+    season_file.write_text(season_file.read_text().replace("neighbours=4", "average=1"))
+    assert [issue.check for issue in own.find().findings] == ["season"]
+
+
 @pytest.mark.slow
 def test_each_of_two_entries_with_one_model_is_predicted(twins: ModelBoard) -> None:
     """Entries may run the same model in different ways, as means over mirror images."""
@@ -251,7 +302,7 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
         "curl-noise",
         "tiny",
         load().size("curl-noise", "tiny").version,
-        models=season.model_hashes,
+        models=season.models,
         value="17 4 33",
     )
     with pytest.raises(UsageError):
