@@ -516,6 +516,16 @@ class Entry(About):
         return tuple(paths)
 
     @property
+    def shared_with(self) -> tuple[str, ...]:
+        """Other entries whose weights this one predicts with, as in cavity/mini/gns."""
+        keepers: dict[str, None] = {}
+        for prediction in self.predictions:
+            weights = prediction.weights
+            if weights is not None and weights.shared_with is not None:
+                keepers[weights.shared_with] = None
+        return tuple(keepers)
+
+    @property
     def provenance(self) -> TrainingProvenance | None:
         """Training behind the first seed; None where words of a person describe it."""
         provenance = self.predictions[0].provenance

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -22,7 +23,7 @@ from lagbench.figures.html import MISSING, text, words
 
 from .columns import describe_check, format_ranks
 from .encoding import ArrayStore, Reference
-from .entry import Entry
+from .entry import Entry, Status
 from .model import (
     BoardRow,
     Curve,
@@ -76,9 +77,10 @@ def page_data(
     """
     arrays = ArrayStore()
     columns: list[Plain] = []  # most tabs have the same ones
+    keepers = _list_keepers(views)
     tabs = []
     for view in views:
-        tabs.append(_TabWriter(view, arrays, columns).tab())
+        tabs.append(_TabWriter(view, arrays, columns, keepers).tab())
     first_film = None
     if hero is not None:
         first_film = _hero(*hero, arrays)
@@ -93,6 +95,26 @@ def page_data(
         data, ensure_ascii=True, allow_nan=False, separators=(",", ":")
     )
     return encoded.encode(), arrays.to_bytes()
+
+
+@dataclass(frozen=True)
+class _Keeper:
+    """An entry that may keep the weights of another one."""
+
+    status: Status
+    address: str  # of its details on the page
+
+
+def _list_keepers(views: Sequence[TableView]) -> Mapping[str, _Keeper]:
+    """Return the entries of all tabs by place, as in cavity/mini/gns."""
+    keepers = {}
+    for view in views:
+        tab = view.tab
+        for row in tab.rows:
+            address = f"#tab={tab.id}&entry={row.id}"
+            place = "/".join(row.entry.place)
+            keepers[place] = _Keeper(row.entry.status, address)
+    return keepers
 
 
 def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
@@ -131,12 +153,17 @@ class _TabWriter:
     """Turns one tab into plain values and arrays."""
 
     def __init__(
-        self, view: TableView, arrays: ArrayStore, columns: list[Plain]
+        self,
+        view: TableView,
+        arrays: ArrayStore,
+        columns: list[Plain],
+        keepers: Mapping[str, _Keeper],
     ) -> None:
         self._view = view
         self._tab = view.tab
         self._arrays = arrays
         self._all_columns = columns
+        self._keepers = keepers
         greatest = 0.0
         if self._tab.truth is not None:
             true_vorticity = np.abs(self._tab.truth.vorticity)
@@ -243,9 +270,24 @@ class _TabWriter:
             "pictures": pictures,
             "residuals": residuals,
             "command": entry.command,
-            "about": list(_about(row)),
+            "about": [*_about(row), *self._about_shared_weights(entry)],
             "predictions": list(_predictions(row)),
         }
+
+    def _about_shared_weights(self, entry: Entry) -> Iterator[tuple[str, ...]]:
+        """Yield whose weights an entry predicts with: label, words and address.
+
+        An entry that is not on the page has no address.
+        """
+        for place in entry.shared_with:
+            words_of_keeper = f"those of {place}"
+            keeper = self._keepers.get(place)
+            if keeper is None:
+                yield "weights", words_of_keeper
+                continue
+            if keeper.status is not Status.ACTIVE:
+                words_of_keeper += f", which is {keeper.status}"
+            yield "weights", words_of_keeper, keeper.address
 
     def _line(self, line: Line) -> Plain:
         """Return the cells of a line, each kind in the order of the columns."""

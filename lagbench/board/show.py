@@ -173,6 +173,7 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "level": str(level_of(row)),
         "cost_source": source_of_cost(row) or None,
         "variant_of": row.variant_of,
+        "shared_with": list(entry.shared_with),
         "rank_range": row.rank_range,
         "seeds": len(entry.predictions),
         "parameters": entry.parameters,

@@ -487,6 +487,7 @@ def test_json_has_the_numbers_of_the_board(board: Board) -> None:
     names = sorted(reference.name for reference in board.tabs[0].references)
     floors = sorted(floor["id"] for floor in plain["floors"])
     assert floors == names
+    assert damped["shared_with"] == []
 
 
 def test_unknown_names_are_refused(board: Board) -> None:

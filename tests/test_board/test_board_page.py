@@ -27,6 +27,7 @@ from lagbench.board.entry import (
     EntryFlag,
     Level,
     Reproduction,
+    Status,
     Verification,
     Weights,
 )
@@ -751,6 +752,30 @@ def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
     bad = with_entry(first_row, code="javascript:alert(1)")
     bad_page = with_rows(board, bad)
     assert 'href="javascript' not in bad_page
+
+
+def test_the_details_name_the_entry_whose_weights_a_row_shares(board: Board) -> None:
+    """With its status where it is inactive, and a link where it is on the page."""
+    first, second, *_ = board.tabs[0].rows
+    keeper = "/".join(second.entry.place)
+
+    def about_weights(*rows: BoardRow, keeper: str = keeper) -> list[list[str]]:
+        weights = Weights(path="x", sha256="0" * 64, shared_with=keeper)
+        predictions = []
+        for prediction in first.entry.predictions:
+            shared = prediction.model_copy(update={"weights": weights})
+            predictions.append(shared)
+        row = with_entry(first, predictions=tuple(predictions))
+        about = by_id(row_data_of(with_rows(board, row, *rows)))[row.id]["about"]
+        return [item for item in about if item[0] == "weights"]
+
+    link = f"#tab={board.tabs[0].id}&entry={second.id}"
+    assert about_weights(second) == [["weights", f"those of {keeper}", link]]
+    withdrawn = with_entry(second, status=Status.WITHDRAWN)
+    words = f"those of {keeper}, which is withdrawn"
+    assert about_weights(withdrawn) == [["weights", words, link]]
+    other = "fluid/mini/elsewhere"
+    assert about_weights(keeper=other) == [["weights", f"those of {other}"]]
 
 
 def test_weights_beside_the_entry_have_a_link_a_seed(board: Board) -> None:

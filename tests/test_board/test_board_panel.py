@@ -4,6 +4,7 @@ nothing.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +30,7 @@ from sample_boards import make_board, with_entry
 
 from lagbench.board.build import picture_first
 from lagbench.board.cost import points_of
-from lagbench.board.entry import EntryFlag
+from lagbench.board.entry import EntryFlag, Weights
 from lagbench.board.model import Board
 from lagbench.board.page import render
 
@@ -109,6 +110,28 @@ def test_panel_by_keyboard(page: Page, board: Board) -> None:
         "!document.getElementById('panel').open && !location.hash.includes('entry=')",
     )
     assert page.value("document.activeElement.textContent") == entry.name
+
+
+def test_the_panel_leads_to_the_entry_whose_weights_a_row_shares(
+    running: Browser, board: Board, tmp_path: Path
+) -> None:
+    first, second, *others = board.tabs[0].rows
+    keeper = "/".join(second.entry.place)
+    weights = Weights(path="x", sha256="0" * 64, shared_with=keeper)
+    predictions = []
+    for prediction in first.entry.predictions:
+        predictions.append(prediction.model_copy(update={"weights": weights}))
+    sharing = with_entry(first, predictions=tuple(predictions))
+    tab = replace(board.tabs[0], rows=(sharing, second, *others))
+    file = tmp_path / "index.html"
+    file.write_text(render(replace(board, tabs=(tab,))), encoding="utf-8")
+    page = running.open(file, width=390)
+    restored(page, f"#tab=cavity-full&entry={first.id}")
+    run(page, "document.querySelector('#panel .origin dd a').click()")
+    title = "document.getElementById('panel-title').textContent"
+    until(page, f"{title} === {json.dumps(second.entry.name)}")
+    assert page.messages == []
+    close(page)
 
 
 def test_panel_draws_everything(page: Page, board: Board) -> None:

@@ -153,7 +153,7 @@ function drawOrigin(row) {
   return el("section", { class: "origin" }, [
     row.command ? [el("h3", {}, "The same predictions again"), commandBox(row.command)] : null,
     el("h3", {}, "About"),
-    el("dl", {}, row.about.map(([name, text]) => [el("dt", {}, name), el("dd", {}, text)])),
+    el("dl", {}, row.about.map(([name, text, address]) => [el("dt", {}, name), el("dd", {}, address ? el("a", { href: address }, text) : text)])),
     el("h3", {}, "Predictions"),
     grid(["seed", "mean", "size", "SHA-256", "predictions", "score file"], row.predictions.map(predictionLine), "Predictions", "text"),
   ]);
