@@ -33,18 +33,20 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
+from lagbench.baselines.simulator import GraphNetwork
 from lagbench.board.entry import Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
+from lagbench.errors import UsageError
 from lagbench.tensors import Batch
 
-from .thesis.published import OPERATORS
-from .thesis.split_results import BOARD, read_json
+from .thesis.split_results import BOARD
 
 Floats = NDArray[np.float64]
 
@@ -54,7 +56,6 @@ LIMITS = {"one_step": 1.0, "free_flight": 0.02, "settled": 0.01, "densest_cell":
 The densest cell may reach its limit.
 """
 
-GRAPH_NETWORKS = (*OPERATORS, "supergat-sd")  # names of baselines
 FORMAT = 1  # of gates.json
 FRAME_STEP = 20  # frames between the windows of a scenario
 ROLLOUT_STEP = 10  # frames between the states in which the fullest cell is sought
@@ -291,8 +292,11 @@ def _format(value: float | None) -> str:
 
 
 def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path]:
-    """Return the weights of the graph networks among the active entries."""
-    paths: list[Path] = []
+    """Return the weights of the graph networks among the active entries.
+
+    The weights of another size have their gates there.
+    """
+    paths: dict[Path, None] = {}
     for entry_path in folder.entries():
         entry = read_entry(folder.path / entry_path)
         is_wanted = entry.split in splits and entry.size == size
@@ -300,12 +304,26 @@ def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path
             continue
         for prediction in entry.predictions:
             weights = prediction.weights
-            if weights is None or weights.shared_with is not None:
+            if weights is None or weights.place_of(entry.place)[1] != size:
                 continue
             path = folder.path / weights.path
-            if read_json(path.with_suffix(".json")).get("baseline") in GRAPH_NETWORKS:
-                paths.append(path)
-    return paths
+            if is_graph_network(path):
+                paths[path] = None
+    return list(paths)
+
+
+def is_graph_network(weights: Path) -> bool:
+    """Tell whether the record in a file of weights names a graph network.
+
+    ONNX files have no such record, and models of other packages may be missing here.
+    """
+    if weights.suffix == ".onnx":
+        return False
+    try:
+        entry = find(load(weights).baseline)
+    except UsageError:
+        return False
+    return issubclass(entry.model, GraphNetwork)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from model_board import NAME, PATH, ModelBoard
 
-from studies.gates import Gates, StepErrors, count_densest, read_recorded, to_json
+from lagbench.baselines.checkpoint import load, save
+from lagbench.board.folder import Folder
+from lagbench.data.checksums import file_sha256
+from studies.gates import (
+    Gates,
+    StepErrors,
+    board_weights,
+    count_densest,
+    read_recorded,
+    to_json,
+)
 
 GRAVITY = 2.5 / 3600
 
@@ -81,3 +95,62 @@ def test_what_is_recorded_of_other_weights_stays(tmp_path: Path) -> None:
     first, second = read_recorded(path)
     assert first["one_step"] == 0.5
     assert second["method"] == "gns_1"
+
+
+def weights_of(board: Path) -> list[Path]:
+    """Return the weights of graph networks on a board, relative to it."""
+    paths = board_weights(Folder(board), ["curl-noise"], "tiny")
+    return [path.relative_to(board) for path in paths]
+
+
+@pytest.fixture
+def board(model_board: ModelBoard, tmp_path: Path) -> Path:
+    """A copy of a board with a graph network, whose training has no log."""
+    shutil.copytree(model_board.folder, tmp_path / "board")
+    return tmp_path / "board"
+
+
+def change_weights(board: Path, suffix: str, baseline: str) -> Path:
+    """Write the weights anew, with another baseline in their record."""
+    old = board / "weights/curl-noise/tiny/gns_0.pt"
+    checkpoint = replace(load(old), baseline=baseline)
+    old.unlink()
+    new = old.with_suffix(suffix)
+    save(new, checkpoint)
+    content = yaml.safe_load((board / PATH).read_text())
+    content["predictions"][0]["weights"] = {
+        "path": new.relative_to(board).as_posix(),
+        "sha256": file_sha256(new),
+    }
+    (board / PATH).write_text(yaml.safe_dump(content, sort_keys=False))
+    return new
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_weights_say_themselves_that_they_are_a_graph_network(
+    board: Path, suffix: str
+) -> None:
+    """A log beside them is not asked."""
+    path = change_weights(board, suffix, "gns")
+    assert weights_of(board) == [path.relative_to(board)]
+    path.with_suffix(".json").write_text(json.dumps({"baseline": "neuralmpm"}))
+    assert weights_of(board) == [path.relative_to(board)]
+
+
+def test_weights_of_other_models_have_no_gates(board: Path) -> None:
+    path = change_weights(board, ".safetensors", "neuralmpm")
+    path.with_suffix(".json").write_text(json.dumps({"baseline": "gns"}))
+    assert weights_of(board) == []
+
+
+def test_shared_weights_of_an_inactive_entry_are_measured_once(board: Path) -> None:
+    path = Path("weights/curl-noise/tiny/gns_0.pt")
+    entry = board / PATH
+    content = yaml.safe_load(entry.read_text())
+    content["predictions"][0]["weights"]["shared_with"] = NAME
+    content["method"] = "successor"
+    successor = yaml.safe_dump(content, sort_keys=False)
+    entry.with_stem("successor").write_text(successor)
+    assert weights_of(board) == [path]
+    entry.write_text(f"{entry.read_text()}status: withdrawn\nreason: a trial\n")
+    assert weights_of(board) == [path]
