@@ -22,6 +22,7 @@ from lagbench.atomic import check_output_file, write_atomically
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.submission.format import PREDICTIONS_SIGNS
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -42,7 +43,7 @@ from .machine import (
 from .provenance import training_provenance
 from .recipe import change_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
-from .run_folder import LARGEST_LOG, RunFolder
+from .run_folder import RunFolder
 from .start import warn_of_last_state
 
 TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
@@ -146,8 +147,7 @@ def predict(
     checkpoint_path = Path(checkpoint)
     trained = load(checkpoint)
     output_path = Path(output)
-    check_replaceable(output_path)
-    check_output_file(output_path, overwrite=overwrite)
+    check_outputs(output_path, overwrite=overwrite)
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = resolve_root(root)
@@ -319,23 +319,15 @@ def _write_costs(result: PredictionResult) -> None:
     write_atomically(path, text.encode() + b"\n", option="--output")
 
 
-def check_replaceable(output: Path) -> None:
+def check_outputs(output: Path, *, overwrite: bool) -> None:
     """Refuse to write predictions and their costs over files of another kind.
 
     Raises:
-        UsageError: the output is a folder, a JSON file, or a file of another kind.
+        UsageError: the output is a folder, a JSON file, or a file of another kind, or
+            there is such a file.
     """
-    costs = output  # a folder may have no name of its own
-    if not output.is_dir():
-        costs = output.with_suffix(".json")
-    if costs.is_dir():
-        raise UsageError(
-            "the output is a folder",
-            where="--output",
-            expected="the name of a file",
-            got=str(costs),
-            fix=f"name a file, as in -o {costs / 'predictions.nc'}",
-        )
+    check_output_file(output, overwrite=overwrite, signs=PREDICTIONS_SIGNS)
+    costs = output.with_suffix(".json")
     if output == costs:
         raise UsageError(
             "predictions are no JSON",
@@ -345,25 +337,8 @@ def check_replaceable(output: Path) -> None:
             fix=f"name it {output.with_suffix('.nc').name}: the costs of the "
             f"predictions go to {costs.name}",
         )
-    # Scores have no format of data, scenarios no hash of the whole data set.
-    _check_kind(output, signs=(b"lagbench_format", b"dataset_sha256"))
-    _check_kind(costs, signs=(b"seconds_without_search",))
-
-
-def _check_kind(path: Path, *, signs: tuple[bytes, ...]) -> None:
-    """Refuse to replace a file that lacks one of the signs of its kind."""
-    if not path.is_file():
-        return
-    with path.open("rb") as stream:
-        content = stream.read(LARGEST_LOG)
-    if content and not all(sign in content for sign in signs):
-        raise UsageError(
-            "the output would replace a file that is something else",
-            where="--output",
-            expected="no file, or predictions to replace",
-            got=str(path),
-            fix="name another file: -o predictions.nc",
-        )
+    # costs belong to the predictions beside them, and go when these go
+    check_output_file(costs, overwrite=True, signs=(b"seconds_without_search",))
 
 
 class _TimedRollouts:

@@ -16,6 +16,9 @@ from .errors import LagbenchError, UsageError, WorkFailedError
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
 
+SIGNED_BYTES = 4 << 20
+"""How much of a file is read to learn its kind [bytes]."""
+
 ROOT_OPTION = "--root or LAGBENCH_ROOT"
 """The option that names the folder for most files."""
 
@@ -77,15 +80,20 @@ def refuse_folders(paths: Iterable[Path]) -> None:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
-def check_output_file(output: Path, *, overwrite: bool) -> None:
+def check_output_file(
+    output: Path, *, overwrite: bool, signs: Sequence[bytes] = ()
+) -> None:
     """Refuse, before the work, a file to write that must not be replaced.
 
     Args:
-        output: the file that ``--output`` names.
+        output: the file that ``--output`` names, or one beside it.
         overwrite: whether the user allows to replace a file of that name.
+        signs: bytes that a file of the kind that is written has near its beginning;
+            files that lack one are never replaced.
 
     Raises:
-        UsageError: it is a folder or a device, or there is such a file.
+        UsageError: it is a folder, a device or a file of another kind, or there is such
+            a file.
     """
     if not os.path.lexists(output):
         return
@@ -105,6 +113,14 @@ def check_output_file(output: Path, *, overwrite: bool) -> None:
             got=f"{output}, a device, socket or pipe",
             fix="name a file",
         )
+    if signs and not _has_signs(output, signs):
+        raise UsageError(
+            "the output would replace a file that is something else",
+            where="--output",
+            expected="no file, or one of the kind that is written",
+            got=str(output),
+            fix="name another file",
+        )
     if not overwrite:
         other = output.with_name(f"{output.stem}-2{output.suffix}")
         raise UsageError(
@@ -115,6 +131,15 @@ def check_output_file(output: Path, *, overwrite: bool) -> None:
             fix="replace it: --overwrite; or write elsewhere, as in -o "
             f"{shlex.quote(str(other))}",
         )
+
+
+def _has_signs(path: Path, signs: Sequence[bytes]) -> bool:
+    """Tell whether a file is empty or has all signs of its kind."""
+    if not path.exists():  # a link that leads nowhere
+        return True
+    with path.open("rb") as stream:
+        beginning = stream.read(SIGNED_BYTES)
+    return not beginning or all(sign in beginning for sign in signs)
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:

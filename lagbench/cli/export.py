@@ -72,7 +72,7 @@ def export_command(
             root=root,
             from_walls=from_walls,
             wall_particles=wall_particles,
-            force=overwrite,
+            overwrite=overwrite,
             progress=progress,
         )
     print_result(result, _describe(result), as_json=as_json, quiet=quiet)

@@ -12,7 +12,7 @@ from lagbench.data.local import locate_split
 from lagbench.errors import UsageError
 from lagbench.figures.report.report import check_folder, write_report
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.score import score, scores_folder
+from lagbench.scoring.score import check_extras, score, scores_folder
 from lagbench.scoring.tables import (
     brief_lines,
     brief_table,
@@ -80,6 +80,8 @@ def score_command(
     It shows the skill and the first metrics beside those of the best reference
     predictor.
     """
+    extra_names = tuple(name for name in extras.split(",") if name)
+    check_extras(extra_names)
     _check_file_count(predictions, report)
     folders = _score_folders(predictions, output)
     if split is not None:
@@ -98,7 +100,7 @@ def score_command(
                 output_dir=folder,
                 workers=workers,
                 scheduler=scheduler,
-                extras=tuple(name for name in extras.split(",") if name),
+                extras=extra_names,
                 progress=progress,
                 examined=print_errors,
                 validated=validation,

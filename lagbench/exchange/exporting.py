@@ -82,7 +82,7 @@ def export(
     root: str | Path | None = None,
     from_walls: bool | None = None,
     wall_particles: bool = False,
-    force: bool = False,
+    overwrite: bool = False,
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> ExportResult:
@@ -104,7 +104,7 @@ def export(
         wall_particles: full boxes of two dimensions with four walls only: add
             particles beside the walls that move along with them, since neither
             format has wall velocities.
-        force: write over an earlier export.
+        overwrite: whether to replace an earlier export.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
@@ -124,7 +124,7 @@ def export(
     for subset in HASHED_SUBSETS:
         file_of[subset] = target / f"{subset}{ENDINGS[form]}"
     paths = tuple(file_of.values())
-    _check_target(target, paths, force=force)
+    _check_target(target, paths, overwrite=overwrite)
 
     frames_of = _frames_by_subset(entry, folder)
     statistics, dataset_sha256 = _recorded_statistics(entry, folder)
@@ -239,7 +239,7 @@ def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, ...]:
     return tuple(round_down(low - wall_thickness) for low, _ in size.bounds)
 
 
-def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
+def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> None:
     """Refuse a folder that must not be written to."""
     if (folder / FORCE).exists():
         raise UsageError(
@@ -253,7 +253,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
     for path in (*files, folder / NAME):
         if path.exists():
             existing.append(path.name)
-    if existing and not force:
+    if existing and not overwrite:
         raise UsageError(
             "files of that name are there",
             where=str(folder),

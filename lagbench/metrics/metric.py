@@ -170,6 +170,7 @@ class Metric:
     horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
     # extra of lagbench that it needs; measured only when asked for
     extra: str | None = None
+    module: str | None = None  # module of that extra that the statistic imports
 
     def __post_init__(self) -> None:
         """Fill in ``of``; refuse a metric that is incomplete or has no usable name."""

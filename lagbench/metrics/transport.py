@@ -145,6 +145,7 @@ def sliced_w2(pair: FramePair) -> float:
     source="LagrangeBench (Toshev et al. 2023)",
     applies=at_slow_frames,
     extra="transport",
+    module="ot",
 )
 def sinkhorn_pot(pair: FramePair) -> float:
     """Sinkhorn divergence by POT, regularisation 0.1: blurred and slow, optional."""

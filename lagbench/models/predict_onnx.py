@@ -11,6 +11,7 @@ from lagbench.atomic import check_output_file
 from lagbench.data.local import load_rooted_registry, locate, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.store.copy import scenario_files
+from lagbench.submission.format import PREDICTIONS_SIGNS
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
@@ -49,7 +50,8 @@ def predict_onnx(
     Args:
         model: the ONNX file, docs/submitting.md describes it.
         output: the predictions.nc to write.
-        overwrite: whether to replace a file of that name.
+        overwrite: whether to replace predictions of that name; files of another kind,
+            such as the model, are never replaced.
         split: name of the split.
         size: name of the size; the only one that is there when None.
         method: name of the method; by default the stem of the file.
@@ -65,7 +67,7 @@ def predict_onnx(
         DataError: the test subset is missing.
         WorkFailedError: the model needs more time or memory than allowed.
     """
-    check_output_file(Path(output), overwrite=overwrite)
+    check_output_file(Path(output), overwrite=overwrite, signs=PREDICTIONS_SIGNS)
     root_folder = resolve_root(root)
     known = load_rooted_registry(root_folder, registry)
     tier, folder, _ = locate(split, size, root=root, registry=known)

@@ -18,7 +18,12 @@ from lagbench.data.local import (
     resolve_root,
 )
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError, UsageError, suggest_name
+from lagbench.errors import (
+    UnreadableFileError,
+    UsageError,
+    check_installed,
+    suggest_name,
+)
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (
@@ -417,22 +422,37 @@ def _write(card: ScoreCard, folder: Path) -> ScoreCard:
 
 
 def _select_metrics(extras: str | Collection[str]) -> tuple[Metric, ...]:
-    """Return the metrics to measure; refuse an extra that brings none."""
+    """Return the metrics to measure; refuse extras as `check_extras` does."""
     if isinstance(extras, str):
         extras = (extras,)
-    extras_with_metrics = {
-        metric.extra for metric in available().values() if metric.extra
-    }
+    check_extras(extras)
+    return select(extras=extras)
+
+
+def check_extras(extras: Collection[str]) -> None:
+    """Refuse an extra that brings no metrics, or whose package is missing.
+
+    Raises:
+        UsageError: there is no such extra, or it is not installed.
+    """
+    modules: dict[str, set[str]] = {}
+    for metric in available().values():
+        if metric.extra is None:
+            continue
+        modules_of_extra = modules.setdefault(metric.extra, set())
+        if metric.module is not None:
+            modules_of_extra.add(metric.module)
     for extra in extras:
-        if extra not in extras_with_metrics:
+        if extra not in modules:
             raise UsageError(
                 f"no extra {extra!r} with metrics",
                 where="--extras",
                 expected="an extra that brings metrics",
                 got=ascii(extra),
-                fix=suggest_name(extra, extras_with_metrics),
+                fix=suggest_name(extra, modules),
             )
-    return select(extras=extras)
+        for module in sorted(modules[extra]):
+            check_installed(module, extra=extra)
 
 
 def score_scenarios(

@@ -30,7 +30,7 @@ from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import (
     PredictionResult,
     UnfinishedWarning,
-    check_replaceable,
+    check_outputs,
     predict,
 )
 from lagbench.baselines.recipe import recipe_for
@@ -701,7 +701,7 @@ def test_the_current_folder_is_not_replaced(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError):
-        check_replaceable(Path())
+        check_outputs(Path(), overwrite=True)
 
 
 def test_predictions_are_replaced_on_request_while_their_cost_is_beside_them(

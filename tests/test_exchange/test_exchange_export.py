@@ -308,7 +308,7 @@ def test_an_export_that_breaks_off_is_not_whole(
             str(mixed.folder),
             format="gns-npz",
             output=tmp_path,
-            force=True,
+            overwrite=True,
         )
     assert not (tmp_path / "metadata.json").exists()
     assert not list(tmp_path.glob(".*"))
@@ -334,7 +334,7 @@ def test_the_same_data_give_the_same_bytes(
         str(mixed.folder),
         format=form,
         output=tmp_path / "a",
-        force=True,
+        overwrite=True,
     )
 
 
@@ -526,7 +526,7 @@ def test_a_program_beside_the_data_is_refused(
             str(mixed.folder),
             format="lagrangebench-h5",
             output=tmp_path,
-            force=True,
+            overwrite=True,
         )
     assert caught.value.where.endswith("force.py")
     assert [path.name for path in tmp_path.iterdir()] == ["force.py"]

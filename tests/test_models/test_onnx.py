@@ -405,9 +405,21 @@ def test_an_entry_carries_an_onnx_model(
         root=generated.root,
     )
     assert prediction.method == "lines"
-    with pytest.raises(UsageError) as caught:
-        predict_onnx(path, path, split=SIZE.split, size=SIZE.name, root=generated.root)
-    assert "--overwrite" in str(caught.value.fix)
+    for output, fix in ((path, "another file"), (predictions, "--overwrite")):
+        with pytest.raises(UsageError) as caught:
+            predict_onnx(
+                path, output, split=SIZE.split, size=SIZE.name, root=generated.root
+            )
+        assert fix in str(caught.value.fix)
+    with pytest.raises(UsageError):
+        predict_onnx(
+            path,
+            path,
+            overwrite=True,
+            split=SIZE.split,
+            size=SIZE.name,
+            root=generated.root,
+        )
     board = tmp_path / "board"
     meta = Meta(authors=("A. Author",), command="make")
     options: dict[str, Any] = {

@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shutil
+import sys
 from collections import Counter
 from dataclasses import replace
 from itertools import product
@@ -399,16 +400,29 @@ def test_a_misspelt_extra_is_refused(bench: ScoreBench, predictions: Path) -> No
     assert caught.value.where == "--extras"
 
 
-def test_optional_metrics_need_their_extra(
-    bench: ScoreBench, predictions: Path
+def test_an_extra_that_is_not_installed_is_told_before_the_work(
+    bench: ScoreBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sinkhorn without POT is refused; with POT it is scored."""
-    if importlib.util.find_spec("ot") is None:
-        with pytest.raises(UsageError):
-            bench.evaluate(predictions, extras=("transport",))
-    else:
-        card = bench.evaluate(predictions, extras=("transport",))
-        assert card.submission["sinkhorn_pot"].mean > 0.0
+    """Nothing is validated or measured first."""
+    monkeypatch.setitem(sys.modules, "ot", None)
+    seen: list[object] = []
+    with pytest.raises(UsageError) as caught:
+        bench.evaluate(
+            predictions,
+            extras=("transport",),
+            examined=seen.append,
+            progress=seen.append,
+        )
+    assert "lagbench[transport]" in str(caught.value.fix)
+    assert seen == []
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("ot") is None, reason="needs the extra transport"
+)
+def test_an_extra_brings_its_metrics(bench: ScoreBench, predictions: Path) -> None:
+    card = bench.evaluate(predictions, extras=("transport",))
+    assert card.submission["sinkhorn_pot"].mean > 0.0
 
 
 def test_a_card_becomes_a_table_of_values(bench: ScoreBench, tmp_path: Path) -> None:

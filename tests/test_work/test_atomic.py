@@ -8,12 +8,13 @@ import pytest
 
 from lagbench.atomic import (
     atomic_path,
+    check_output_file,
     check_writable,
     move_together,
     remove_leftovers,
     write_atomically,
 )
-from lagbench.errors import DataError, WorkFailedError
+from lagbench.errors import DataError, UsageError, WorkFailedError
 
 
 def test_a_file_appears_only_on_the_clean_exit(tmp_path: Path) -> None:
@@ -94,3 +95,21 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
     left.touch()
     assert remove_leftovers(tmp_path) == [left]
     assert list((tmp_path / "test").iterdir()) == [kept]
+
+
+def test_a_file_of_another_kind_is_never_replaced(tmp_path: Path) -> None:
+    """One of the kind is, on request; what is empty or not there is free to take."""
+    signs = (b"first", b"second")
+    path = tmp_path / "file"
+    check_output_file(path, overwrite=False, signs=signs)
+    path.write_bytes(b"first only")
+    for overwrite in (False, True):
+        with pytest.raises(UsageError, match="something else"):
+            check_output_file(path, overwrite=overwrite, signs=signs)
+    for content in (b"second and first", b""):
+        path.write_bytes(content)
+        check_output_file(path, overwrite=True, signs=signs)
+        with pytest.raises(UsageError, match="already"):
+            check_output_file(path, overwrite=False, signs=signs)
+    with pytest.raises(UsageError):
+        check_output_file(tmp_path, overwrite=True, signs=signs)
