@@ -72,7 +72,7 @@ class DataSet(Strict):
 class Weights(Strict):
     """The weights that made predictions, kept in the leaderboard's folder.
 
-    They lie beside the entry, or beside another one that keeps them: the two entries
+    They lie beside the entry, or beside another one that keeps them. Two active entries
     predict with the same weights in two ways.
     """
 
