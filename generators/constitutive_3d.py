@@ -4,6 +4,11 @@ The equations are those of :mod:`.constitutive`, with the same signs and units p
 length^3. Only ``+ - * /``, ``sqrt`` and comparisons are used, each a fixed number of
 times, so that every processor returns the same bits.
 
+A matrix is written as its three rows, a symmetric one as its entries in Voigt's order:
+xx, yy, zz, yz, xz and xy. An entry is a number, or a vector that holds the numbers of
+several particles: vector instructions then treat these particles at once, and the bits
+stay the same.
+
 A deformation gradient F has the polar decomposition F = V R with the symmetric left
 stretch V; V^2 = B = F F^T. With the signed principal stretches s1, s2, s3 (one is
 negative where F inverts) the invariants of V are
@@ -27,10 +32,10 @@ Van Loan (Jacobi's method), Stomakhin et al. 2012, 2013.
 
 import taichi as ti
 from taichi import f32
-from taichi.math import mat3, vec3
+from taichi.math import mat3
 
 from .constitutive import STRETCH_MIN, larger
-from .transfer import Value, bounded
+from .transfer import Template, Value, bounded
 
 # Newton steps: relative error of V within 2e-6 for stretches from 0.3 to 2.5
 _NEWTON_STEPS = 6
@@ -43,14 +48,34 @@ _EPSILON = 1e-6
 
 
 @ti.func
-def principal_minors(b: mat3) -> f32:
+def rows_of(f: mat3) -> Value:
+    """Return the rows of the matrix of one particle."""
+    return [
+        [f[0, 0], f[0, 1], f[0, 2]],
+        [f[1, 0], f[1, 1], f[1, 2]],
+        [f[2, 0], f[2, 1], f[2, 2]],
+    ]
+
+
+@ti.func
+def dot(a: Template, b: Template) -> Value:
+    """Return the sum of the products of three pairs of entries."""
+    return (a[0] * b[0] + a[1] * b[1]) + a[2] * b[2]
+
+
+@ti.func
+def times_transposed(rows: Template) -> Value:
+    """Return M M^T, a symmetric matrix."""
+    x = rows[0]
+    y = rows[1]
+    z = rows[2]
+    return [dot(x, x), dot(y, y), dot(z, z), dot(y, z), dot(x, z), dot(x, y)]
+
+
+@ti.func
+def principal_minors(b: Template) -> Value:
     """Return the sum of the three principal minors of a symmetric matrix."""
-    xx = b[0, 0]
-    yy = b[1, 1]
-    zz = b[2, 2]
-    xy = b[0, 1]
-    yz = b[1, 2]
-    xz = b[0, 2]
+    xx, yy, zz, yz, xz, xy = b
     minor_z = xx * yy - xy * xy
     minor_x = yy * zz - yz * yz
     minor_y = xx * zz - xz * xz
@@ -58,17 +83,11 @@ def principal_minors(b: mat3) -> f32:
 
 
 @ti.func
-def determinant(f: mat3) -> f32:
+def determinant(rows: Template) -> Value:
     """Return det F, expanded along the first row."""
-    xx = f[0, 0]
-    xy = f[0, 1]
-    xz = f[0, 2]
-    yx = f[1, 0]
-    yy = f[1, 1]
-    yz = f[1, 2]
-    zx = f[2, 0]
-    zy = f[2, 1]
-    zz = f[2, 2]
+    xx, xy, xz = rows[0]
+    yx, yy, yz = rows[1]
+    zx, zy, zz = rows[2]
     minor_x = yy * zz - yz * zy
     minor_y = yx * zz - yz * zx
     minor_z = yx * zy - yy * zx
@@ -76,22 +95,13 @@ def determinant(f: mat3) -> f32:
 
 
 @ti.func
-def trace(b: mat3) -> f32:
-    """Return the sum of the diagonal."""
-    return (b[0, 0] + b[1, 1]) + b[2, 2]
+def trace(b: Template) -> Value:
+    """Return the sum of the diagonal of a symmetric matrix."""
+    return (b[0] + b[1]) + b[2]
 
 
 @ti.func
-def add_to_diagonal(b: mat3, value: f32) -> mat3:
-    """Return b + value I."""
-    result = b
-    for axis in ti.static(range(3)):
-        result[axis, axis] = b[axis, axis] + value
-    return result
-
-
-@ti.func
-def left_stretch(b: mat3, jacobian: f32) -> mat3:
+def left_stretch(b: Template, jacobian: Value) -> Value:
     """Return V of the polar decomposition F = V R, from B = F F^T and J = det F.
 
     It vanishes where the rotation is ambiguous: where two stretches are opposite.
@@ -108,27 +118,43 @@ def left_stretch(b: mat3, jacobian: f32) -> mat3:
     pairs = 0.5 * (total * total - b_trace)
     divisor = larger(pairs * total - jacobian, _EPSILON)
     inverse = 1.0 / divisor
-    numerator = (pairs + b_trace) * b - b @ b
-    numerator = add_to_diagonal(numerator, total * jacobian)
-    return inverse * numerator
+    factor = pairs + b_trace
+    on_diagonal = total * jacobian
+    xx, yy, zz, yz, xz, xy = b
+    square = times_transposed([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return [
+        inverse * ((factor * xx - square[0]) + on_diagonal),
+        inverse * ((factor * yy - square[1]) + on_diagonal),
+        inverse * ((factor * zz - square[2]) + on_diagonal),
+        inverse * (factor * yz - square[3]),
+        inverse * (factor * xz - square[4]),
+        inverse * (factor * xy - square[5]),
+    ]
 
 
 @ti.func
-def corotated_stress(f: mat3, mu: f32, la: f32) -> mat3:
+def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
     """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
-    Lame's constants mu and lambda are in [mass/(length s^2)].
+    It is symmetric. Lame's constants mu and lambda are in [mass/(length s^2)].
     """
-    b = f @ f.transpose()
-    jacobian = determinant(f)
+    b = times_transposed(rows)
+    jacobian = determinant(rows)
     volumetric = la * (jacobian - 1.0) * jacobian
-    excess = b - left_stretch(b, jacobian)  # (F - R) F^T
-    stretch_stress = (2.0 * mu) * excess
-    return add_to_diagonal(stretch_stress, volumetric)
+    v = left_stretch(b, jacobian)
+    double_mu = 2.0 * mu
+    return [
+        double_mu * (b[0] - v[0]) + volumetric,
+        double_mu * (b[1] - v[1]) + volumetric,
+        double_mu * (b[2] - v[2]) + volumetric,
+        double_mu * (b[3] - v[3]),
+        double_mu * (b[4] - v[4]),
+        double_mu * (b[5] - v[5]),
+    ]
 
 
 @ti.func
-def tangent_of_turn(difference: f32, double: f32) -> f32:
+def tangent_of_turn(difference: Value, double: Value) -> Value:
     """Return the tangent of the angle by which Jacobi's method turns a pair of axes.
 
     It is 2 b_pq / (d +- sqrt(d^2 + 4 b_pq^2)) with the sign of d = b_qq - b_pp: then
@@ -143,7 +169,7 @@ def tangent_of_turn(difference: f32, double: f32) -> f32:
 
 
 @ti.func
-def turned(along_p: f32, along_q: f32, cosine: f32, sine: f32) -> Value:
+def turned(along_p: Value, along_q: Value, cosine: Value, sine: Value) -> Value:
     """Return the components along two axes after these have turned."""
     new_p = cosine * along_p - sine * along_q
     new_q = sine * along_p + cosine * along_q
@@ -151,44 +177,77 @@ def turned(along_p: f32, along_q: f32, cosine: f32, sine: f32) -> Value:
 
 
 @ti.func
-def principal_axes(b: mat3) -> Value:
-    """Return the eigenvalues of a symmetric matrix, and its eigenvectors as columns.
+def principal_axes(b: Template) -> Value:
+    """Return the eigenvalues of a symmetric matrix, and its eigenvectors.
 
     Jacobi's method, four sweeps: each turns a pair of axes so that the entry between
     them vanishes.
     """
-    a = b
-    axes = mat3([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+    diagonal = [b[0], b[1], b[2]]
+    # the entries beside the diagonal; that of two axes stands at the place of the third
+    opposite = [b[3], b[4], b[5]]
+    zero = 0.0 * b[0]
+    one = zero + 1.0
+    axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     for _ in ti.static(range(_SWEEPS)):
         for p, q in ti.static(_AXIS_PAIRS):
-            between = a[p, q]
-            difference = a[q, q] - a[p, p]
-            tangent = tangent_of_turn(difference, 2.0 * between)
+            r = ti.static(3 - p - q)
+            between = opposite[r]
+            tangent = tangent_of_turn(diagonal[q] - diagonal[p], 2.0 * between)
             cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
-
             shift = tangent * between
-            a[p, p] = a[p, p] - shift
-            a[q, q] = a[q, q] + shift
-            a[p, q] = 0.0
-            a[q, p] = 0.0
-            # r is the third axis.
-            r = ti.static(3 - p - q)
-            entry_p, entry_q = turned(a[r, p], a[r, q], cosine, sine)
-            a[r, p] = entry_p
-            a[p, r] = entry_p
-            a[r, q] = entry_q
-            a[q, r] = entry_q
+            diagonal[p] = diagonal[p] - shift
+            diagonal[q] = diagonal[q] + shift
+            opposite[r] = zero
+            # the entries between p and r, and between q and r
+            along_p, along_q = turned(opposite[q], opposite[p], cosine, sine)
+            opposite[q] = along_p
+            opposite[p] = along_q
             for row in ti.static(range(3)):
-                along_p, along_q = turned(axes[row, p], axes[row, q], cosine, sine)
-                axes[row, p] = along_p
-                axes[row, q] = along_q
-    eigenvalues = vec3(a[0, 0], a[1, 1], a[2, 2])
-    return eigenvalues, axes
+                new_p, new_q = turned(axes[p][row], axes[q][row], cosine, sine)
+                axes[p][row] = new_p
+                axes[q][row] = new_q
+    return diagonal, axes
 
 
 @ti.func
-def plastic_return(f: mat3, low: f32, high: f32) -> Value:
+def transposed(rows: Template) -> Value:
+    """Return the rows of the transposed matrix."""
+    x = rows[0]
+    y = rows[1]
+    z = rows[2]
+    return [[x[0], y[0], z[0]], [x[1], y[1], z[1]], [x[2], y[2], z[2]]]
+
+
+@ti.func
+def dots(row: Template, others: Template) -> Value:
+    """Return the sums of the products of a row with three others."""
+    return [dot(row, others[0]), dot(row, others[1]), dot(row, others[2])]
+
+
+@ti.func
+def clamped(square: Value, low: f32, high: f32) -> Value:
+    """Return clamped over trial stretch, and its inverse, from the squared stretch."""
+    positive = larger(square, 0.0)
+    trial = larger(ti.sqrt(positive), STRETCH_MIN)
+    stretch = bounded(trial, low, high)
+    return stretch / trial, trial / stretch
+
+
+@ti.func
+def stretched_row(
+    i: Template, ratios: Template, components: Template, columns: Template
+) -> Value:
+    """Return a row of Q diag(ratios) Q^T F, from the rows of Q and the columns of F."""
+    row = components[i]
+    scaled = [ratios[0] * row[0], ratios[1] * row[1], ratios[2] * row[2]]
+    stretch = dots(scaled, components)
+    return dots(stretch, columns)
+
+
+@ti.func
+def plastic_return(rows: Template, low: f32, high: f32) -> Value:
     """Clamp the principal stretches of the trial gradient F to [low, high].
 
     With the principal axes Q of B = F F^T, the elastic gradient is Q diag(new / old)
@@ -197,18 +256,20 @@ def plastic_return(f: mat3, low: f32, high: f32) -> Value:
     gradient of snow, whose stretches lie near 1.
 
     Returns:
-        The elastic F, and the factor on Jp: trial stretches over clamped ones.
+        The rows of the elastic F, and the factor on Jp: trial stretches over clamped
+        ones.
     """
-    squares, axes = principal_axes(f @ f.transpose())
-    scaled_axes = axes
-    growth = 1.0
-    for k in ti.static(range(3)):
-        square = larger(squares[k], 0.0)
-        trial = larger(ti.sqrt(square), STRETCH_MIN)
-        clamped = bounded(trial, low, high)
-        growth = growth * (trial / clamped)
-        ratio = clamped / trial
-        for row in ti.static(range(3)):
-            scaled_axes[row, k] = ratio * axes[row, k]
-    stretch = scaled_axes @ axes.transpose()
-    return stretch @ f, growth
+    squares, axes = principal_axes(times_transposed(rows))
+    first_ratio, first_growth = clamped(squares[0], low, high)
+    second_ratio, second_growth = clamped(squares[1], low, high)
+    third_ratio, third_growth = clamped(squares[2], low, high)
+    growth = (first_growth * second_growth) * third_growth
+    ratios = [first_ratio, second_ratio, third_ratio]
+    components = transposed(axes)  # row i: the components i of the three axes
+    columns = transposed(rows)
+    elastic = [
+        stretched_row(0, ratios, components, columns),
+        stretched_row(1, ratios, components, columns),
+        stretched_row(2, ratios, components, columns),
+    ]
+    return elastic, growth

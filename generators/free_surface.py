@@ -82,8 +82,7 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         kernels = self._kernels
         # Material of each particle, shape [scenario, particle]
         self._material = stack(states, "material").astype(np.int32)
-        is_solid = self._material != Material.LIQUID
-        kernels.solid = bool(is_solid.any())
+        kernels.sort_by_material(self._material)
         matter = np.zeros((*shape, 4), np.float32)
         matter[:, :, 0] = self._material
         matter[:, :, 1:] = 1.0

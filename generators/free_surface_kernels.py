@@ -6,7 +6,9 @@ in :mod:`.particle_stress` and :mod:`.particle_stress_3d`.
 
 from typing import ClassVar
 
+import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 from taichi import f32, i32
 from taichi.math import vec4
 
@@ -118,6 +120,14 @@ class FreeSurfaceKernels:
             (row_shape, self._row_fields()),
             (scenario_shape, scenario_fields),
         )
+
+    def sort_by_material(self, material: NDArray[np.int32]) -> None:
+        """Note whether there are solids.
+
+        Args:
+            material: Material of each particle, shape [scenario, particle].
+        """
+        self.solid = bool((material != LIQUID).any())
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that

@@ -11,12 +11,20 @@ Only ``+ - * /``, ``sqrt`` and comparisons are used, and sums are integers
 Source: Hu et al. 2018; Jiang et al. 2015 (APIC).
 """
 
+import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 from taichi import f32, i32, i64
 from taichi.math import mat3, vec3, vec4
 
+from . import backend
 from .constitutive import hardening, larger, liquid_stress
-from .constitutive_3d import corotated_stress, determinant, plastic_return
+from .constitutive_3d import (
+    corotated_stress,
+    determinant,
+    plastic_return,
+    rows_of,
+)
 from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, finite
 from .transfer import (
     Nothing,
@@ -32,6 +40,21 @@ from .transfer import (
 )
 
 _AXES = (0, 1, 2)
+_ENTRIES = 6  # of a symmetric matrix, in Voigt's order
+
+# Solids are computed in blocks of so many particles, one in each lane of a vector
+# register. LLVM finds vectors only where lanes are read from memory and written to it.
+# So loops of their own copy from particles to lists, and back.
+_LANES = 8
+
+
+def _fill_list(field: ti.ScalarField, is_member: NDArray[np.bool_]) -> int:
+    """Fill a list with the numbers of particles, and with zeros behind them."""
+    numbers = np.flatnonzero(is_member)
+    filled = np.zeros(field.shape, np.int32)
+    filled[: len(numbers)] = numbers
+    field.from_numpy(filled)
+    return len(numbers)
 
 
 @ti.data_oriented
@@ -61,6 +84,20 @@ class ParticleStress3D(FreeSurfaceKernels):
         # v and Jbar of the nodes, at the particle
         self.grid_state = vec4.field()
         self.grid_density = ti.field(f32)  # r of the nodes, at the particle
+        # Kirchhoff stress of a solid without damping [mass/(length s^2)]: entries xx,
+        # yy and zz, and a zero; entries yz, xz and xy, and a zero
+        self.elastic_diagonal = vec4.field()
+        self.elastic_beside = vec4.field()
+
+        # of scenario 0: the particles that are solids, and those that are snow
+        self.solids = ti.field(i32)
+        self.snow_particles = ti.field(i32)
+        # of each member of such a list: rows of F, Lame's constants mu and lambda, the
+        # elastic stress, and the factor on Jp
+        self.listed_gradient = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
+        self.listed_moduli = [ti.field(f32), ti.field(f32)]
+        self.listed_stress = [ti.field(f32) for _ in range(_ENTRIES)]
+        self.listed_growth = ti.field(f32)
 
         # of each node: n v, n J
         self.sums = ti.Vector.field(4, i64)
@@ -77,6 +114,8 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.stencil_place,
             self.grid_state,
             self.grid_density,
+            self.elastic_diagonal,
+            self.elastic_beside,
         )
 
     def _node_fields(self) -> tuple[ti.Field, ...]:
@@ -84,6 +123,29 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     def _row_fields(self) -> tuple[ti.Field, ...]:
         return (self.row_sums,)
+
+    def _place_fields(self) -> None:
+        """Give the fields their memory, each an array of its own."""
+        super()._place_fields()
+        whole_blocks = _LANES * -(-self.particles // _LANES)
+        listed = (
+            self.solids,
+            self.snow_particles,
+            *self.listed_gradient[0],
+            *self.listed_gradient[1],
+            *self.listed_gradient[2],
+            *self.listed_moduli,
+            *self.listed_stress,
+            self.listed_growth,
+        )
+        backend.place(((whole_blocks,), listed))
+
+    def sort_by_material(self, material: NDArray[np.int32]) -> None:
+        """Note whether there are solids, and which particles of scenario 0 they are."""
+        super().sort_by_material(material)
+        first = material[0]
+        self.solid_count = _fill_list(self.solids, first != LIQUID)
+        self.snow_count = _fill_list(self.snow_particles, first == SNOW)
 
     # The phases: each function is one phase at one particle or node.
 
@@ -139,11 +201,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         return columns(first, second, third)
 
     @ti.func
-    def elastic_stress(self, s: i32, p: i32, isotropic_stress: f32) -> mat3:
-        """Return the Kirchhoff stress without viscosity, of a liquid or a solid.
-
-        A liquid has the isotropic stress only; a solid has none of it.
-        """
+    def moduli(self, s: i32, p: i32) -> Value:
+        """Return Lame's constants mu and lambda of a solid [mass/(length s^2)]."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
         mu = self.jelly[0]
@@ -160,14 +219,76 @@ class ParticleStress3D(FreeSurfaceKernels):
             )
             mu = self.snow[0] * factor
             la = self.snow[1] * factor
-        isotropic = mat3(
-            [isotropic_stress, 0.0, 0.0],
-            [0.0, isotropic_stress, 0.0],
-            [0.0, 0.0, isotropic_stress],
-        )
-        f = self.deformation(s, p)
-        elastic = corotated_stress(f, mu, la)
-        return ti.select(kind == LIQUID, isotropic, elastic)
+        return mu, la
+
+    @ti.func
+    def keep_elastic_stress(self, s: i32, p: i32, stress: Template) -> None:
+        """Store the Kirchhoff stress of a solid without damping."""
+        self.elastic_diagonal[s, p] = vec4(stress[0], stress[1], stress[2], 0.0)
+        self.elastic_beside[s, p] = vec4(stress[3], stress[4], stress[5], 0.0)
+
+    @ti.func
+    def compute_elastic_stress(self, s: i32, p: i32) -> None:
+        """Compute the Kirchhoff stress of a solid without damping."""
+        mu, la = self.moduli(s, p)
+        rows = rows_of(self.deformation(s, p))
+        stress = corotated_stress(rows, mu, la)
+        self.keep_elastic_stress(s, p, stress)
+
+    @ti.func
+    def list_gradient(self, members: Template, number: i32) -> None:
+        """Copy F of a member of a list to its place."""
+        f = self.deformation(0, members[number])
+        for row, column in ti.static(ti.ndrange(3, 3)):
+            self.listed_gradient[row][column][number] = f[row, column]
+
+    @ti.func
+    def list_moduli(self, number: i32) -> None:
+        """Copy Lame's constants of a solid to its place in the list."""
+        mu, la = self.moduli(0, self.solids[number])
+        self.listed_moduli[0][number] = mu
+        self.listed_moduli[1][number] = la
+
+    @ti.func
+    def listed_rows(self, block: i32) -> Value:
+        """Return the rows of F of a block of particles."""
+        return [
+            self.listed_row(0, block),
+            self.listed_row(1, block),
+            self.listed_row(2, block),
+        ]
+
+    @ti.func
+    def listed_row(self, row: Template, block: i32) -> Value:
+        """Return a row of F of a block of particles."""
+        fields = ti.static(self.listed_gradient[row])
+        return [
+            lanes_of(fields[0], block),
+            lanes_of(fields[1], block),
+            lanes_of(fields[2], block),
+        ]
+
+    @ti.func
+    def compute_listed_stress(self, block: i32) -> None:
+        """Compute the Kirchhoff stress of a block of solids without damping."""
+        mu = lanes_of(self.listed_moduli[0], block)
+        la = lanes_of(self.listed_moduli[1], block)
+        stress = corotated_stress(self.listed_rows(block), mu, la)
+        for entry in ti.static(range(_ENTRIES)):
+            keep_lanes(self.listed_stress[entry], block, stress[entry])
+
+    @ti.func
+    def keep_listed_stress(self, number: i32) -> None:
+        """Copy the stress of a solid from its place in the list."""
+        stress = [
+            self.listed_stress[0][number],
+            self.listed_stress[1][number],
+            self.listed_stress[2][number],
+            self.listed_stress[3][number],
+            self.listed_stress[4][number],
+            self.listed_stress[5][number],
+        ]
+        self.keep_elastic_stress(0, self.solids[number], stress)
 
     @ti.func
     def viscosity(self, s: i32, p: i32) -> f32:
@@ -185,10 +306,13 @@ class ParticleStress3D(FreeSurfaceKernels):
         isotropic_stress = liquid_stress(spread_jacobian, modulus)
         c = self.velocity_gradient(s, p)
         viscosity = self.liquid_viscosity
-        elastic = ti.Matrix.zero(f32, 3, 3)
+        diagonal = vec4(isotropic_stress)
+        beside = vec4(0.0)  # entries yz, xz and xy
         if ti.static(solid):
             viscosity = self.viscosity(s, p)
-            elastic = self.elastic_stress(s, p, isotropic_stress)
+            if self.matter[s, p][0] != LIQUID:
+                diagonal = self.elastic_diagonal[s, p]
+                beside = self.elastic_beside[s, p]
 
         # A node lies within 1.5 cells of the particle along each axis. This bounds the
         # speed that A adds at the node, along each axis.
@@ -198,10 +322,10 @@ class ParticleStress3D(FreeSurfaceKernels):
             for row in ti.static(_AXES):
                 shear_rate = c[row, column] + c[column, row]
                 tau = viscosity * shear_rate
-                if ti.static(solid):
-                    tau = tau + elastic[row, column]
-                elif ti.static(row == column):
-                    tau = tau + isotropic_stress
+                if ti.static(row == column):
+                    tau = tau + diagonal[row]
+                elif ti.static(solid):
+                    tau = tau + beside[3 - row - column]
                 speed_per_cell = self.dx * c[row, column]
                 a[row] = speed_per_cell - self.stress_factor * tau
                 affine_speed[row] = affine_speed[row] + 1.5 * ti.abs(a[row])
@@ -407,7 +531,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Return J of a liquid or det F of a solid."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
-        solid_jacobian = determinant(self.deformation(s, p))
+        solid_jacobian = determinant(rows_of(self.deformation(s, p)))
         return ti.select(kind == LIQUID, ratio, solid_jacobian)
 
     @ti.func
@@ -436,14 +560,42 @@ class ParticleStress3D(FreeSurfaceKernels):
         F from :meth:`deform` is the trial gradient. What it loses goes into Jp.
         """
         if self.matter[s, p][0] == SNOW:
-            trial = self.deformation(s, p)
-            f, growth = plastic_return(trial, self.yield_low, self.yield_high)
-            jp_min = self.parameters.snow_jp_min
-            jp_max = self.parameters.snow_jp_max
-            old_jp = self.matter[s, p][1]
-            jp = bounded(old_jp * growth, jp_min, jp_max)
-            self.keep_deformation(s, p, f)
-            self.keep_ratio(s, p, jp)
+            trial = rows_of(self.deformation(s, p))
+            rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
+            for axis in ti.static(_AXES):
+                column = vec4(rows[0][axis], rows[1][axis], rows[2][axis], 0.0)
+                self.deformation_columns[axis][s, p] = column
+            self.keep_plastic_ratio(s, p, growth)
+
+    @ti.func
+    def keep_plastic_ratio(self, s: i32, p: i32, growth: f32) -> None:
+        """Let Jp of a snow particle grow by a factor."""
+        jp_min = self.parameters.snow_jp_min
+        jp_max = self.parameters.snow_jp_max
+        old_jp = self.matter[s, p][1]
+        jp = bounded(old_jp * growth, jp_min, jp_max)
+        self.keep_ratio(s, p, jp)
+
+    @ti.func
+    def compute_listed_flow(self, block: i32) -> None:
+        """Compute the elastic F and the growth of Jp of a block of snow particles."""
+        trial = self.listed_rows(block)
+        rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
+        for row, column in ti.static(ti.ndrange(3, 3)):
+            keep_lanes(self.listed_gradient[row][column], block, rows[row][column])
+        keep_lanes(self.listed_growth, block, growth)
+
+    @ti.func
+    def keep_listed_flow(self, number: i32) -> None:
+        """Copy F and Jp of a snow particle from its place in the list."""
+        for axis in ti.static(_AXES):
+            x = self.listed_gradient[0][axis][number]
+            y = self.listed_gradient[1][axis][number]
+            z = self.listed_gradient[2][axis][number]
+            p = self.snow_particles[number]
+            self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
+        growth = self.listed_growth[number]
+        self.keep_plastic_ratio(0, self.snow_particles[number], growth)
 
     @ti.func
     def keep_deformation(self, s: i32, p: i32, f: mat3) -> None:
@@ -458,7 +610,13 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Advance scenario 0 by many substeps in one thread, on the nodes that
         particles touch.
         """
-        self._serial_substeps(substeps, self.particles, self.solid)
+        self._serial_substeps(
+            substeps,
+            self.particles,
+            self.solid_count,
+            self.snow_count,
+            self.solid,
+        )
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
@@ -466,8 +624,15 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.kernel
     def _serial_substeps(
-        self, substeps: i32, particles: i32, solid: Template
+        self,
+        substeps: i32,
+        particles: i32,
+        solid_count: i32,
+        snow_count: i32,
+        solid: Template,
     ) -> Nothing:
+        solid_blocks = block_count(solid_count)
+        snow_blocks = block_count(snow_count)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             particle_volume = self.particle_volume[0]
@@ -482,6 +647,14 @@ class ParticleStress3D(FreeSurfaceKernels):
                         self.clear_row(0, self.at(i, j, k))
             for p in range(particles):
                 self.locate(0, p)
+            if ti.static(solid):
+                for number in range(solid_count):
+                    self.list_gradient(self.solids, number)
+                    self.list_moduli(number)
+                for block in range(solid_blocks):
+                    self.compute_listed_stress(block)
+                for number in range(solid_count):
+                    self.keep_listed_stress(number)
             for p in range(particles):
                 self.stress(0, p, solid)
             for p in range(particles):
@@ -497,8 +670,12 @@ class ParticleStress3D(FreeSurfaceKernels):
             if ti.static(solid):
                 for p in range(particles):
                     self.deform(0, p)
-                for p in range(particles):
-                    self.apply_snow_plasticity(0, p)
+                for number in range(snow_count):
+                    self.list_gradient(self.snow_particles, number)
+                for block in range(snow_blocks):
+                    self.compute_listed_flow(block)
+                for number in range(snow_count):
+                    self.keep_listed_flow(number)
                 for p in range(particles):
                     self.keep_jacobian(0, p)
 
@@ -511,6 +688,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         ti.loop_config(parallelize=self.threads)
         for s, p in ti.ndrange(self.scenarios, particles):
             self.locate(s, p)
+            if ti.static(solid):
+                self.compute_elastic_stress(s, p)
             self.stress(s, p, solid)
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
@@ -539,6 +718,30 @@ class ParticleStress3D(FreeSurfaceKernels):
             jacobian = self.jacobian(s, p)
             speed = largest_component(velocity)
             self.extremes[s, p] = vec4(speed, jacobian, jacobian, 0.0)
+
+
+@ti.func
+def lanes_of(field: Template, block: i32) -> Value:
+    """Return the numbers of a block of particles as one vector."""
+    first = block * _LANES
+    values = ti.Vector.zero(f32, _LANES)
+    for lane in ti.static(range(_LANES)):
+        values[lane] = field[first + lane]
+    return values
+
+
+@ti.func
+def keep_lanes(field: Template, block: i32, values: Value) -> None:
+    """Store a vector as the numbers of a block of particles."""
+    first = block * _LANES
+    for lane in ti.static(range(_LANES)):
+        field[first + lane] = values[lane]
+
+
+@ti.func
+def block_count(count: i32) -> i32:
+    """Return how many blocks of lanes hold so many particles."""
+    return (count + _LANES - 1) // _LANES
 
 
 @ti.func
