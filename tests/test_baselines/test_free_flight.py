@@ -162,7 +162,7 @@ def test_bodies_of_the_data_fall_as_the_law_says(
     for path in scenario_paths(split, subset="train", size="tiny", root=root).values():
         position = scenario_batch(path).position
         sample = torch.zeros(len(position), dtype=torch.int64)
-        for frame in range(1, position.shape[1] - 1):
+        for frame in range(1, position.shape[1] - 1, 2):
             before, now, after = position[:, frame - 1 : frame + 2].double().unbind(1)
             body, flies = find_bodies(
                 now, now - before, sample, reach=4.0 * solver_cell, box=box

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from cluster_bench import everything
-from conftest import SIZE, SPLIT
+from conftest import PAINT_PICTURES, SIZE, SPLIT
 
 from lagbench.data.manifest import build_manifest, read_manifest, write_manifest
 from lagbench.data.registry import Registry
@@ -68,10 +68,20 @@ def gather(tmp_path: Path, unmeasured: Registry) -> Gather:
 
 
 @pytest.mark.slow
-def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) -> None:
+def test_two_processes_and_a_last_call(
+    tmp_path: Path,
+    unmeasured_path: Path,
+    unmeasured: Registry,
+    copied: Callable[[], Path],
+) -> None:
     """The recipe for job arrays: what two processes made is the one-machine data set,
     file for file.
     """
+    alone = copied()
+    manifest = read_manifest(alone, SPLIT, SIZE, 2)
+    assert manifest is not None
+    split = unmeasured.split(SPLIT)
+    PAINT_PICTURES(alone, unmeasured.size(SPLIT, SIZE), split, manifest)
 
     def start(*options: str) -> subprocess.Popen[str]:
         command = [
@@ -95,8 +105,7 @@ def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) ->
         )
         for k, ids in enumerate(("0-2", "3,4"))
     ]
-    jobs.append(start("--root", str(tmp_path / "alone"), "--workers", "1"))
-    assert [job.communicate()[0] and job.returncode for job in jobs] == [0, 0, 0]
+    assert [job.communicate()[0] and job.returncode for job in jobs] == [0, 0]
     sources = [str(tmp_path / f"part-{k}") for k in range(2)]
     last = start(
         "--gather",
@@ -109,9 +118,7 @@ def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) ->
     output, _ = last.communicate()
     assert last.returncode == 0
     assert "nothing to simulate" in output
-    assert everything(tmp_path / "whole" / FOLDER) == everything(
-        tmp_path / "alone" / FOLDER
-    )
+    assert everything(tmp_path / "whole" / FOLDER) == everything(alone / FOLDER)
 
 
 def test_what_no_part_holds_is_simulated(

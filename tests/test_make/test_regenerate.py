@@ -56,7 +56,7 @@ def test_tiny_is_made_to_the_bit(
     assert verified.warnings == ()
 
 
-TURNS = 4
+TURNS = 8
 
 
 def recorded_sizes() -> list[tuple[str, str]]:
@@ -77,7 +77,7 @@ def recorded_sizes() -> list[tuple[str, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("split", "name"), of_this_turn(recorded_sizes(), turns=TURNS))
 def test_one_scenario_is_made_to_the_bit(split: str, name: str, tmp_path: Path) -> None:
-    """One scenario of a quarter of all data sets; the turn picks both."""
+    """One scenario of an eighth of all data sets; the turn picks both."""
     size = load().size(split, name)
     scenario = size.scenarios[turn() // TURNS % len(size.scenarios)]
     result = generate(split, name, scenarios=(scenario,), root=tmp_path)
@@ -86,7 +86,7 @@ def test_one_scenario_is_made_to_the_bit(split: str, name: str, tmp_path: Path) 
 
 
 def test_every_data_set_has_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four turns in a row make a scenario of each of them."""
+    """Eight turns in a row make a scenario of each of them."""
     made = set()
     for number in range(TURNS):
         monkeypatch.setattr(turns, "turn", lambda number=number: number)
