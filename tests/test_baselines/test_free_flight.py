@@ -147,6 +147,7 @@ def test_the_centre_of_a_free_body_moves_along_a_parabola() -> None:
     assert np.abs(alone.mean(dim=0).numpy() - straight).max() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
 def test_bodies_of_the_data_fall_as_the_law_says(
     split: str, tiny_split: Callable[..., GenerationResult]

@@ -63,6 +63,7 @@ def coarse_size() -> Size:
     return coarse
 
 
+@pytest.mark.slow
 def test_without_changes_it_is_the_coarse_solver(
     root: Path, figures: DatasetInfo
 ) -> None:
@@ -277,6 +278,7 @@ def mean_distance(
     return float(np.sum(distances)) / len(first)
 
 
+@pytest.mark.slow
 def test_a_solver_that_breaks_down_ends_the_rollout(
     root: Path, figures: DatasetInfo, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -512,7 +512,7 @@ def test_what_is_not_given(own: BoardBench) -> None:
 
 def rounds(few: int, many: int) -> Any:
     """Return the first rounds for every run, and those of this turn for slow ones."""
-    slow = pytest.param(of_this_turn(range(many), turns=3), marks=pytest.mark.slow)
+    slow = pytest.param(of_this_turn(range(many), turns=6), marks=pytest.mark.slow)
     return pytest.mark.parametrize("numbers", [range(few), slow], ids=["few", "many"])
 
 

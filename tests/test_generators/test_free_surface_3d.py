@@ -92,7 +92,10 @@ def liquid(
 
 @functools.cache
 def compiled(device: Device, particle_count: int) -> FreeSurface3D:
-    """Return a solver; one of as many particles is taken again, since it compiles."""
+    """Return a solver; one of as many particles is taken again, since it compiles.
+
+    The first steps take ten seconds of compilation, so the tests with one are slow.
+    """
     constants = FreeSurface3DParameters(particles=particle_count, **CONSTANTS)
     solver = build(constants, device=device)
     assert isinstance(solver, FreeSurface3D)
@@ -188,6 +191,7 @@ def snapshot(solver: FreeSurface3D) -> list[NDArray[np.float32]]:
     return first_scenario
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", CASES)
 def test_numpy_gives_the_same_bits(state: InitialState) -> None:
     """An independent float32 implementation agrees in every bit, walls included."""
@@ -207,6 +211,7 @@ def test_numpy_gives_the_same_bits(state: InitialState) -> None:
         np.testing.assert_equal(snapshot(solver), expected)
 
 
+@pytest.mark.slow
 def test_scenarios_of_these_tests_reach_walls_and_yield() -> None:
     """The comparisons cover mirrored nodes, friction and plastic flow."""
     solver = start(MIXED)
@@ -224,6 +229,7 @@ def test_scenarios_of_these_tests_reach_walls_and_yield() -> None:
     assert snow_ratio.min() < 0.97
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", CASES)
 def test_threads_and_orders_of_particles_change_no_bit(state: InitialState) -> None:
     """The serial driver, the parallel one, and the serial one with permuted
@@ -260,6 +266,7 @@ def total_momentum(solver: FreeSurface3D) -> Array:
     return velocity.sum(axis=0, dtype=np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", Material)
 def test_momentum_and_spin_are_conserved(material: Material) -> None:
     """Far from walls momentum changes by the weight alone, and the angular momentum
@@ -309,6 +316,7 @@ def angular_momentum(solver: FreeSurface3D) -> Array:
     return np.asarray((orbital + spin).sum(axis=0))
 
 
+@pytest.mark.slow
 def test_energy_of_a_stretched_body_by_hand() -> None:
     """Moving, it has m v^2 / 2; stretched along x by s, V (mu + lambda / 2)
     (s - 1)^2.
@@ -343,6 +351,7 @@ def test_energy_of_a_stretched_body_by_hand() -> None:
     assert elastic == pytest.approx(expected, rel=2e-2)
 
 
+@pytest.mark.slow
 def test_friction_decelerates_by_mu_g() -> None:
     """A block that slides over a rough floor, askew, loses mu g of speed in a second
     along its way.
@@ -368,6 +377,7 @@ def test_friction_decelerates_by_mu_g() -> None:
     assert deceleration == pytest.approx(0.2 * 2.5, rel=0.15)
 
 
+@pytest.mark.slow
 def test_free_flight_is_a_parabola() -> None:
     """A ball without spin moves by v t - g t (t + dt) / 2, as semi-implicit steps."""
     ball = Ball(0.1)

@@ -105,6 +105,7 @@ def advanced(state: InitialState, substeps: int) -> Arrays:
     }
 
 
+@pytest.mark.slow
 def test_a_square_with_four_walls_has_the_bits_of_the_fast_solver() -> None:
     """Both formulations agree in every bit while four walls move."""
     low, high = box(NO_SLIP)
@@ -130,6 +131,7 @@ def test_a_square_with_four_walls_has_the_bits_of_the_fast_solver() -> None:
     solver.close()
 
 
+@pytest.mark.slow
 def test_numpy_agrees_in_three_dimensions_and_in_any_order() -> None:
     """An independent float64 solver agrees; a permutation of particles has the same
     bits.

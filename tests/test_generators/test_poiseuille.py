@@ -109,6 +109,7 @@ def greatest_momentum(solver: FullBox) -> float:
     return float(np.abs(mean).max())
 
 
+@pytest.mark.slow
 def test_a_steady_force_drives_the_parabola() -> None:
     """Within 2 % of the peak; as much fluid goes one way as the other."""
     viscosity = 0.01

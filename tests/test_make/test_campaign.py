@@ -88,6 +88,7 @@ def test_equal_hashes_are_told(
     assert result.simulated == ()
 
 
+@pytest.mark.slow
 def test_a_forged_file_is_made_anew(
     copied: Copy, unmeasured: Registry, generated: GenerationResult
 ) -> None:

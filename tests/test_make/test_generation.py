@@ -562,6 +562,7 @@ def counted_registry() -> Registry:
     return Registry({"cavity": split}, {})
 
 
+@pytest.mark.slow
 def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
     tmp_path: Path, draw_log: Path, counted_registry: Registry
 ) -> None:

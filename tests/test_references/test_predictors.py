@@ -576,6 +576,7 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     assert len(positions) == len(wall_velocities)
 
 
+@pytest.mark.slow
 def test_rollouts_that_take_turns_compile_each_solver_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

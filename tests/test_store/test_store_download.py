@@ -432,6 +432,7 @@ def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
         assert server.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
 
 
+@pytest.mark.slow
 def test_simulated_splits_come_from_a_store_or_are_simulated(
     generated: GenerationResult, tmp_path: Path
 ) -> None:
