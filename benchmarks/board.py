@@ -5,13 +5,13 @@ how large the page is.
 
 Entries stand on every split's `mini`, or on that of the first N splits: errors grow
 over the frames by a law of their own, films and maps are noise, so that nothing
-compresses away because two entries are alike. Every fifth has three seeds, some are superseded, withdrawn or flagged, and their
-texts hold markup. The same call gives the same bytes. Exit code 1 if
-`lagbench leaderboard check` finds anything, a page built again with other bytes
-included, if the page of 150 entries has more than 2 MB, or if `build`, `show` or
-`check` takes more than 500 MB of memory or too much processor time: 10 s with 150
-entries and 60 s with 1,000, three times as much for `check`, which forms all scores of
-all entries again. Child processes count in the time, not in the memory.
+compresses away because two entries are alike. Every fifth has three seeds, some are
+superseded, withdrawn or flagged, and their texts hold markup. The same call gives the
+same bytes. Exit code 1 if `lagbench leaderboard check` finds anything, a page built
+again with other bytes included, if the page of 150 entries has more than 2 MB, or if
+`build`, `show` or `check` takes more than 500 MB of memory or too much processor time:
+10 s with 150 entries and 60 s with 1,000, three times as much for `check`, which forms
+all scores of all entries again. Child processes count in the time, not in the memory.
 """
 
 from __future__ import annotations
