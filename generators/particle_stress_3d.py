@@ -92,8 +92,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         # of scenario 0: the particles that are solids, and those that are snow
         self.solids = ti.field(i32)
         self.snow_particles = ti.field(i32)
-        # of each member of such a list: rows of F, Lame's constants mu and lambda, the
-        # elastic stress, and the factor on Jp
+        # of each member of such a list: entries of F [1], Lame's constants mu and
+        # lambda [mass/(length s^2)], entries of the stress, and the factor on Jp [1]
         self.listed_gradient = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
         self.listed_moduli = [ti.field(f32), ti.field(f32)]
         self.listed_stress = [ti.field(f32) for _ in range(_ENTRIES)]
