@@ -4,10 +4,10 @@ The equations are those of :mod:`.constitutive`, with the same signs and units p
 length^3. Only ``+ - * /``, ``sqrt`` and comparisons are used, each a fixed number of
 times, so that every processor returns the same bits.
 
-A matrix is written as its three rows, a symmetric one as its entries in Voigt's order:
-xx, yy, zz, yz, xz and xy. An entry is a number, or a vector that holds the numbers of
-several particles: vector instructions then treat these particles at once, and the bits
-stay the same.
+A matrix is a list of its three rows. A symmetric matrix is a list of its entries in
+Voigt's order: xx, yy, zz, yz, xz and xy. An entry is the number of one particle, or a
+vector with the numbers of several particles. With vectors the processor computes these
+particles at once; the bits are the same.
 
 A deformation gradient F has the polar decomposition F = V R with the symmetric left
 stretch V; V^2 = B = F F^T. With the signed principal stretches s1, s2, s3 (one is
@@ -19,8 +19,9 @@ The total is the largest root of the quartic
 
     (total^2 - tr B)^2 - 8 J total - 4 minors(B) = 0,
 
-where ``minors`` is the sum of the principal minors; Newton's method falls towards it
-from sqrt(3 tr B). V then follows from the theorem of Cayley and Hamilton:
+where ``minors`` is the sum of the principal minors. Newton's method starts at
+sqrt(3 tr B), which is no smaller than the root, and descends to it. V then follows from
+the theorem of Cayley and Hamilton:
 
     V = ((pairs + tr B) B + total J I - B^2) / (pairs total - J).
 
@@ -39,17 +40,18 @@ from .transfer import Template, Value, bounded
 
 # Newton steps: relative error of V within 2e-6 for stretches from 0.3 to 2.5
 _NEWTON_STEPS = 6
-# pairs of axes that a sweep turns
+# pairs of axes that a sweep rotates, one pair after the other
 _AXIS_PAIRS = ((0, 1), (0, 2), (1, 2))
 # sweeps of Jacobi's method over the three pairs of axes
 _SWEEPS = 4
-# least derivative of the quartic, and least (s1 + s2) (s2 + s3) (s3 + s1)
+# lower bound of two divisors: the derivative of the quartic, and
+# pairs total - J = (s1 + s2) (s2 + s3) (s3 + s1)
 _EPSILON = 1e-6
 
 
 @ti.func
 def rows_of(f: mat3) -> Value:
-    """Return the rows of the matrix of one particle."""
+    """Return the matrix of one particle as a list of rows."""
     return [
         [f[0, 0], f[0, 1], f[0, 2]],
         [f[1, 0], f[1, 1], f[1, 2]],
@@ -59,7 +61,7 @@ def rows_of(f: mat3) -> Value:
 
 @ti.func
 def dot(a: Template, b: Template) -> Value:
-    """Return the sum of the products of three pairs of entries."""
+    """Return the dot product of two rows."""
     return (a[0] * b[0] + a[1] * b[1]) + a[2] * b[2]
 
 
@@ -104,31 +106,32 @@ def trace(b: Template) -> Value:
 def left_stretch(b: Template, jacobian: Value) -> Value:
     """Return V of the polar decomposition F = V R, from B = F F^T and J = det F.
 
-    It vanishes where the rotation is ambiguous: where two stretches are opposite.
+    Where two stretches are opposite, R is ambiguous. The result is then finite, but it
+    is no stretch.
     """
     b_trace = trace(b)
     minors = principal_minors(b)
     total = ti.sqrt(3.0 * b_trace)
     for _ in ti.static(range(_NEWTON_STEPS)):
-        gap = total * total - b_trace
-        quartic = (gap * gap - 8.0 * jacobian * total) - 4.0 * minors
-        slope = 4.0 * total * gap - 8.0 * jacobian
-        step = quartic / larger(slope, _EPSILON)
+        double_pairs = total * total - b_trace
+        quartic = (double_pairs * double_pairs - 8.0 * jacobian * total) - 4.0 * minors
+        derivative = 4.0 * total * double_pairs - 8.0 * jacobian
+        step = quartic / larger(derivative, _EPSILON)
         total = total - step
     pairs = 0.5 * (total * total - b_trace)
     divisor = larger(pairs * total - jacobian, _EPSILON)
     inverse = 1.0 / divisor
-    factor = pairs + b_trace
-    on_diagonal = total * jacobian
+    b_factor = pairs + b_trace
+    isotropic = total * jacobian
     xx, yy, zz, yz, xz, xy = b
-    square = times_transposed([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    b_square = times_transposed([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return [
-        inverse * ((factor * xx - square[0]) + on_diagonal),
-        inverse * ((factor * yy - square[1]) + on_diagonal),
-        inverse * ((factor * zz - square[2]) + on_diagonal),
-        inverse * (factor * yz - square[3]),
-        inverse * (factor * xz - square[4]),
-        inverse * (factor * xy - square[5]),
+        inverse * ((b_factor * xx - b_square[0]) + isotropic),
+        inverse * ((b_factor * yy - b_square[1]) + isotropic),
+        inverse * ((b_factor * zz - b_square[2]) + isotropic),
+        inverse * (b_factor * yz - b_square[3]),
+        inverse * (b_factor * xz - b_square[4]),
+        inverse * (b_factor * xy - b_square[5]),
     ]
 
 
@@ -154,60 +157,70 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
 
 
 @ti.func
-def tangent_of_turn(difference: Value, double: Value) -> Value:
-    """Return the tangent of the angle by which Jacobi's method turns a pair of axes.
+def rotation_tangent(difference: Value, double_entry: Value) -> Value:
+    """Return the tangent of the angle by which Jacobi's method rotates two axes.
 
-    It is 2 b_pq / (d +- sqrt(d^2 + 4 b_pq^2)) with the sign of d = b_qq - b_pp: then
-    the entry b_pq between the axes vanishes. ``double`` is 2 b_pq.
+    After the rotation of the axes p and q the entry b_pq is 0. With d = b_qq - b_pp the
+    tangent is
+
+        2 b_pq / (d + sign(d) sqrt(d^2 + 4 b_pq^2)),
+
+    and 0 where the divisor is 0: the matrix is diagonal there.
+
+    Args:
+        difference: d.
+        double_entry: 2 b_pq.
     """
-    root = ti.sqrt(difference * difference + double * double)
+    root = ti.sqrt(difference * difference + double_entry * double_entry)
     signed_root = ti.select(difference < 0.0, -root, root)
     divisor = difference + signed_root
     is_diagonal = divisor == 0.0
     safe_divisor = ti.select(is_diagonal, 1.0, divisor)
-    return ti.select(is_diagonal, 0.0, double / safe_divisor)
+    return ti.select(is_diagonal, 0.0, double_entry / safe_divisor)
 
 
 @ti.func
-def turned(along_p: Value, along_q: Value, cosine: Value, sine: Value) -> Value:
-    """Return the components along two axes after these have turned."""
-    new_p = cosine * along_p - sine * along_q
-    new_q = sine * along_p + cosine * along_q
-    return new_p, new_q
+def rotated(
+    p_component: Value, q_component: Value, cosine: Value, sine: Value
+) -> Value:
+    """Return two components after the axes p and q were rotated."""
+    new_p_component = cosine * p_component - sine * q_component
+    new_q_component = sine * p_component + cosine * q_component
+    return new_p_component, new_q_component
 
 
 @ti.func
 def principal_axes(b: Template) -> Value:
     """Return the eigenvalues of a symmetric matrix, and its eigenvectors.
 
-    Jacobi's method, four sweeps: each turns a pair of axes so that the entry between
-    them vanishes.
+    Jacobi's method rotates one pair of axes at a time, so that the off-diagonal entry
+    of the pair becomes 0. A sweep rotates the three pairs; there are four sweeps.
     """
     diagonal = [b[0], b[1], b[2]]
-    # the entries beside the diagonal; that of two axes stands at the place of the third
-    opposite = [b[3], b[4], b[5]]
+    # Entry r is the off-diagonal entry of the two other axes: yz, xz, xy.
+    off_diagonal = [b[3], b[4], b[5]]
     zero = 0.0 * b[0]
     one = zero + 1.0
     axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
     for _ in ti.static(range(_SWEEPS)):
         for p, q in ti.static(_AXIS_PAIRS):
-            r = ti.static(3 - p - q)
-            between = opposite[r]
-            tangent = tangent_of_turn(diagonal[q] - diagonal[p], 2.0 * between)
+            r = ti.static(3 - p - q)  # the third axis
+            entry_pq = off_diagonal[r]
+            difference = diagonal[q] - diagonal[p]
+            tangent = rotation_tangent(difference, 2.0 * entry_pq)
             cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
-            shift = tangent * between
+            shift = tangent * entry_pq
             diagonal[p] = diagonal[p] - shift
             diagonal[q] = diagonal[q] + shift
-            opposite[r] = zero
-            # the entries between p and r, and between q and r
-            along_p, along_q = turned(opposite[q], opposite[p], cosine, sine)
-            opposite[q] = along_p
-            opposite[p] = along_q
+            off_diagonal[r] = zero
+            entry_pr, entry_qr = rotated(off_diagonal[q], off_diagonal[p], cosine, sine)
+            off_diagonal[q] = entry_pr
+            off_diagonal[p] = entry_qr
             for row in ti.static(range(3)):
-                new_p, new_q = turned(axes[p][row], axes[q][row], cosine, sine)
-                axes[p][row] = new_p
-                axes[q][row] = new_q
+                p_entry, q_entry = rotated(axes[p][row], axes[q][row], cosine, sine)
+                axes[p][row] = p_entry
+                axes[q][row] = q_entry
     return diagonal, axes
 
 
@@ -221,55 +234,58 @@ def transposed(rows: Template) -> Value:
 
 
 @ti.func
-def dots(row: Template, others: Template) -> Value:
-    """Return the sums of the products of a row with three others."""
-    return [dot(row, others[0]), dot(row, others[1]), dot(row, others[2])]
+def dot_with_each(row: Template, rows: Template) -> Value:
+    """Return the dot products of a row with three rows."""
+    return [dot(row, rows[0]), dot(row, rows[1]), dot(row, rows[2])]
 
 
 @ti.func
-def clamped(square: Value, low: f32, high: f32) -> Value:
-    """Return clamped over trial stretch, and its inverse, from the squared stretch."""
-    positive = larger(square, 0.0)
-    trial = larger(ti.sqrt(positive), STRETCH_MIN)
-    stretch = bounded(trial, low, high)
-    return stretch / trial, trial / stretch
+def clamp_ratios(square: Value, low: f32, high: f32) -> Value:
+    """Return clamped over trial stretch, and trial over clamped stretch.
+
+    ``square`` is the squared trial stretch, an eigenvalue of B.
+    """
+    positive_square = larger(square, 0.0)
+    trial = larger(ti.sqrt(positive_square), STRETCH_MIN)
+    clamped = bounded(trial, low, high)
+    return clamped / trial, trial / clamped
 
 
 @ti.func
-def stretched_row(
-    i: Template, ratios: Template, components: Template, columns: Template
+def elastic_row(
+    i: Template, ratios: Template, q_rows: Template, f_columns: Template
 ) -> Value:
-    """Return a row of Q diag(ratios) Q^T F, from the rows of Q and the columns of F."""
-    row = components[i]
-    scaled = [ratios[0] * row[0], ratios[1] * row[1], ratios[2] * row[2]]
-    stretch = dots(scaled, components)
-    return dots(stretch, columns)
+    """Return row i of the elastic gradient Q diag(ratios) Q^T F."""
+    q_row = q_rows[i]
+    scaled = [ratios[0] * q_row[0], ratios[1] * q_row[1], ratios[2] * q_row[2]]
+    stretch_row = dot_with_each(scaled, q_rows)  # of Q diag(ratios) Q^T
+    return dot_with_each(stretch_row, f_columns)
 
 
 @ti.func
 def plastic_return(rows: Template, low: f32, high: f32) -> Value:
     """Clamp the principal stretches of the trial gradient F to [low, high].
 
-    With the principal axes Q of B = F F^T, the elastic gradient is Q diag(new / old)
-    Q^T F. The limits are 1 - theta_c and 1 + theta_s. Stretches below
-    :data:`.constitutive.STRETCH_MIN` count as that; a gradient that inverts is no trial
-    gradient of snow, whose stretches lie near 1.
+    The columns of Q are the principal axes of B = F F^T. The elastic gradient is
+    Q diag(ratios) Q^T F, where a ratio is clamped over trial stretch. The limits are
+    1 - theta_c and 1 + theta_s. Stretches are taken as positive, and as no smaller than
+    :data:`.constitutive.STRETCH_MIN`: those of snow lie near 1.
 
     Returns:
-        The rows of the elastic F, and the factor on Jp: trial stretches over clamped
-        ones.
+        The rows of the elastic gradient, and the factor on Jp: the product of trial
+        over clamped stretches.
     """
     squares, axes = principal_axes(times_transposed(rows))
-    first_ratio, first_growth = clamped(squares[0], low, high)
-    second_ratio, second_growth = clamped(squares[1], low, high)
-    third_ratio, third_growth = clamped(squares[2], low, high)
-    growth = (first_growth * second_growth) * third_growth
-    ratios = [first_ratio, second_ratio, third_ratio]
-    components = transposed(axes)  # row i: the components i of the three axes
-    columns = transposed(rows)
+    ratio_1, growth_1 = clamp_ratios(squares[0], low, high)
+    ratio_2, growth_2 = clamp_ratios(squares[1], low, high)
+    ratio_3, growth_3 = clamp_ratios(squares[2], low, high)
+    growth = (growth_1 * growth_2) * growth_3
+    ratios = [ratio_1, ratio_2, ratio_3]
+    q_rows = transposed(axes)
+    f_columns = transposed(rows)
     elastic = [
-        stretched_row(0, ratios, components, columns),
-        stretched_row(1, ratios, components, columns),
-        stretched_row(2, ratios, components, columns),
+        elastic_row(0, ratios, q_rows, f_columns),
+        elastic_row(1, ratios, q_rows, f_columns),
+        elastic_row(2, ratios, q_rows, f_columns),
     ]
     return elastic, growth

@@ -42,14 +42,19 @@ from .transfer import (
 _AXES = (0, 1, 2)
 _ENTRIES = 6  # of a symmetric matrix, in Voigt's order
 
-# Solids are computed in blocks of so many particles, one in each lane of a vector
-# register. LLVM finds vectors only where lanes are read from memory and written to it.
-# So loops of their own copy from particles to lists, and back.
+# The serial driver computes solids in blocks of this many particles, one in each lane
+# of a vector register. LLVM makes vector instructions only if a loop reads its lanes
+# from memory and writes them to memory. Therefore one loop copies the particles to
+# lists, a second one computes block by block, and a third one copies the results back.
 _LANES = 8
 
 
 def _fill_list(field: ti.ScalarField, is_member: NDArray[np.bool_]) -> int:
-    """Fill a list with the numbers of particles, and with zeros behind them."""
+    """Write the numbers of the member particles to a field, then zeros to its end.
+
+    Returns:
+        How many members there are.
+    """
     numbers = np.flatnonzero(is_member)
     filled = np.zeros(field.shape, np.int32)
     filled[: len(numbers)] = numbers
@@ -68,42 +73,47 @@ class ParticleStress3D(FreeSurfaceKernels):
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet.
 
-        P2G spreads v, and J of liquid or 1. Slopes are those of v and Jbar.
+        ``particle_state`` is v, and J of a liquid or 1. ``slopes`` are derivatives of v
+        and Jbar.
         """
         super()._declare_fields()
-        self.stride = (self.width**2, self.width, 1)  # of a node's number, by axis
-        # of each particle: columns of the deformation gradient of a solid [1], and a
-        # zero
+        # by how much the number of a node grows along each axis
+        self.stride = (self.width**2, self.width, 1)
+        # of each particle: columns of the deformation gradient of a solid [1]; the
+        # fourth entry of a column is 0
         self.deformation_columns = [vec4.field() for _ in _AXES]
-        # columns of A, scaled, and a zero
+        # columns of A times velocity_scale; the fourth entry is 0
         self.momentum_slopes = [vec4.field() for _ in _AXES]
-        # the three weights along each axis
+        # the three weights along each axis; the fourth entry is 0
         self.weights = [vec4.field() for _ in _AXES]
-        # offset from the middle node [cells], and the bits of the lowest node's number
+        # offset from the middle node of the stencil [cells]; the fourth entry has the
+        # bits of the number of the lowest node
         self.stencil_place = vec4.field()
         # v and Jbar of the nodes, at the particle
         self.grid_state = vec4.field()
         self.grid_density = ti.field(f32)  # r of the nodes, at the particle
         # Kirchhoff stress of a solid without damping [mass/(length s^2)]: entries xx,
-        # yy and zz, and a zero; entries yz, xz and xy, and a zero
+        # yy and zz; entries yz, xz and xy; the fourth entries are 0
         self.elastic_diagonal = vec4.field()
-        self.elastic_beside = vec4.field()
+        self.elastic_off_diagonal = vec4.field()
 
-        # of scenario 0: the particles that are solids, and those that are snow
+        # two lists of particles of scenario 0: those that are solids, and those that
+        # are snow
         self.solids = ti.field(i32)
         self.snow_particles = ti.field(i32)
-        # of each member of such a list: entries of F [1], Lame's constants mu and
-        # lambda [mass/(length s^2)], entries of the stress, and the factor on Jp [1]
+        # at the place of a particle in its list: entries of F [1], Lame's constants mu
+        # and lambda [mass/(length s^2)], entries of the Kirchhoff stress without
+        # damping [mass/(length s^2)], and the factor on Jp [1]
         self.listed_gradient = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
         self.listed_moduli = [ti.field(f32), ti.field(f32)]
         self.listed_stress = [ti.field(f32) for _ in range(_ENTRIES)]
         self.listed_growth = ti.field(f32)
 
-        # of each node: n v, n J
+        # of each node: n v and n J
         self.sums = ti.Vector.field(4, i64)
-        # n of three nodes in a row
+        # n of each row of three nodes along the third axis, at its last node
         self.row_sums = ti.Vector.field(4, i64)
-        # v, Jbar, r and three zeros: one address for what G2P reads
+        # v, Jbar, r and three zeros: G2P reads all of them from one address
         self.node_state = ti.Vector.field(8, f32)
 
     def _particle_fields(self) -> tuple[ti.Field, ...]:
@@ -115,7 +125,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.grid_state,
             self.grid_density,
             self.elastic_diagonal,
-            self.elastic_beside,
+            self.elastic_off_diagonal,
         )
 
     def _node_fields(self) -> tuple[ti.Field, ...]:
@@ -141,11 +151,15 @@ class ParticleStress3D(FreeSurfaceKernels):
         backend.place(((whole_blocks,), listed))
 
     def sort_by_material(self, material: NDArray[np.int32]) -> None:
-        """Note whether there are solids, and which particles of scenario 0 they are."""
+        """Note whether there are solids, and list those of scenario 0.
+
+        Args:
+            material: Material of each particle, shape [scenario, particle].
+        """
         super().sort_by_material(material)
-        first = material[0]
-        self.solid_count = _fill_list(self.solids, first != LIQUID)
-        self.snow_count = _fill_list(self.snow_particles, first == SNOW)
+        first_material = material[0]
+        self.solid_count = _fill_list(self.solids, first_material != LIQUID)
+        self.snow_count = _fill_list(self.snow_particles, first_material == SNOW)
 
     # The phases: each function is one phase at one particle or node.
 
@@ -161,12 +175,12 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def clear_row(self, s: i32, n: i32) -> None:
-        """Set the sums of the row that ends at a node to zero."""
+        """Set the sums of a row of three nodes to zero; ``n`` is the last of them."""
         self.row_sums[s, n] = ti.Vector.zero(i64, 4)
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
+        """Store the stencil of a particle for P2G and G2P: its nodes and weights."""
         x = self.x[s, p]
         number = 0
         offset = vec3(0.0)
@@ -222,10 +236,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         return mu, la
 
     @ti.func
-    def keep_elastic_stress(self, s: i32, p: i32, stress: Template) -> None:
+    def store_elastic_stress(self, s: i32, p: i32, stress: Template) -> None:
         """Store the Kirchhoff stress of a solid without damping."""
         self.elastic_diagonal[s, p] = vec4(stress[0], stress[1], stress[2], 0.0)
-        self.elastic_beside[s, p] = vec4(stress[3], stress[4], stress[5], 0.0)
+        self.elastic_off_diagonal[s, p] = vec4(stress[3], stress[4], stress[5], 0.0)
 
     @ti.func
     def compute_elastic_stress(self, s: i32, p: i32) -> None:
@@ -233,18 +247,18 @@ class ParticleStress3D(FreeSurfaceKernels):
         mu, la = self.moduli(s, p)
         rows = rows_of(self.deformation(s, p))
         stress = corotated_stress(rows, mu, la)
-        self.keep_elastic_stress(s, p, stress)
+        self.store_elastic_stress(s, p, stress)
 
     @ti.func
-    def list_gradient(self, members: Template, number: i32) -> None:
-        """Copy F of a member of a list to its place."""
+    def copy_gradient_to_list(self, members: Template, number: i32) -> None:
+        """Copy F of a particle to its place in a list."""
         f = self.deformation(0, members[number])
         for row, column in ti.static(ti.ndrange(3, 3)):
             self.listed_gradient[row][column][number] = f[row, column]
 
     @ti.func
-    def list_moduli(self, number: i32) -> None:
-        """Copy Lame's constants of a solid to its place in the list."""
+    def copy_moduli_to_list(self, number: i32) -> None:
+        """Copy Lame's constants of a solid to its place in the list of solids."""
         mu, la = self.moduli(0, self.solids[number])
         self.listed_moduli[0][number] = mu
         self.listed_moduli[1][number] = la
@@ -263,23 +277,23 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Return a row of F of a block of particles."""
         fields = ti.static(self.listed_gradient[row])
         return [
-            lanes_of(fields[0], block),
-            lanes_of(fields[1], block),
-            lanes_of(fields[2], block),
+            load_lanes(fields[0], block),
+            load_lanes(fields[1], block),
+            load_lanes(fields[2], block),
         ]
 
     @ti.func
     def compute_listed_stress(self, block: i32) -> None:
         """Compute the Kirchhoff stress of a block of solids without damping."""
-        mu = lanes_of(self.listed_moduli[0], block)
-        la = lanes_of(self.listed_moduli[1], block)
+        mu = load_lanes(self.listed_moduli[0], block)
+        la = load_lanes(self.listed_moduli[1], block)
         stress = corotated_stress(self.listed_rows(block), mu, la)
         for entry in ti.static(range(_ENTRIES)):
-            keep_lanes(self.listed_stress[entry], block, stress[entry])
+            store_lanes(self.listed_stress[entry], block, stress[entry])
 
     @ti.func
-    def keep_listed_stress(self, number: i32) -> None:
-        """Copy the stress of a solid from its place in the list."""
+    def copy_stress_from_list(self, number: i32) -> None:
+        """Copy the stress of a solid from the list of solids to the particle."""
         stress = [
             self.listed_stress[0][number],
             self.listed_stress[1][number],
@@ -288,7 +302,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.listed_stress[4][number],
             self.listed_stress[5][number],
         ]
-        self.keep_elastic_stress(0, self.solids[number], stress)
+        self.store_elastic_stress(0, self.solids[number], stress)
 
     @ti.func
     def viscosity(self, s: i32, p: i32) -> f32:
@@ -299,7 +313,7 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def stress(self, s: i32, p: i32, solid: Template) -> None:
-        """Compute A of a particle, and the largest speed that it spreads to a node."""
+        """Compute A of a particle, and a bound of the speeds that it gives to nodes."""
         state = self.particle_state[s, p]
         spread_jacobian = state[3]
         modulus = self.parameters.liquid_modulus
@@ -307,12 +321,12 @@ class ParticleStress3D(FreeSurfaceKernels):
         c = self.velocity_gradient(s, p)
         viscosity = self.liquid_viscosity
         diagonal = vec4(isotropic_stress)
-        beside = vec4(0.0)  # entries yz, xz and xy
+        off_diagonal = vec4(0.0)  # entries yz, xz and xy
         if ti.static(solid):
             viscosity = self.viscosity(s, p)
             if self.matter[s, p][0] != LIQUID:
                 diagonal = self.elastic_diagonal[s, p]
-                beside = self.elastic_beside[s, p]
+                off_diagonal = self.elastic_off_diagonal[s, p]
 
         # A node lies within 1.5 cells of the particle along each axis. This bounds the
         # speed that A adds at the node, along each axis.
@@ -325,7 +339,7 @@ class ParticleStress3D(FreeSurfaceKernels):
                 if ti.static(row == column):
                     tau = tau + diagonal[row]
                 elif ti.static(solid):
-                    tau = tau + beside[3 - row - column]
+                    tau = tau + off_diagonal[3 - row - column]
                 speed_per_cell = self.dx * c[row, column]
                 a[row] = speed_per_cell - self.stress_factor * tau
                 affine_speed[row] = affine_speed[row] + 1.5 * ti.abs(a[row])
@@ -341,7 +355,11 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
-        """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
+        """Add n v, n J and n of a particle to the nodes of its stencil.
+
+        What a node gets is linear in its place. So it is computed at the middle node,
+        and then stepped to the neighbours, dx away.
+        """
         place = self.stencil_place[s, p]
         lowest = node_number(place[3], self.node_count)
         step_x = self.momentum_slopes[0][s, p]
@@ -377,7 +395,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     def update(
         self, s: i32, i: i32, j: i32, k: i32, particle_volume: f32, friction: f32
     ) -> None:
-        """Divide by n, add gravity, meet the walls; an empty node is at rest."""
+        """Compute v, Jbar and r of a node from its sums, with gravity and walls.
+
+        A node without particles is at rest.
+        """
         node = self.at(i, j, k)
         u = 0.0
         v = 0.0
@@ -406,10 +427,17 @@ class ParticleStress3D(FreeSurfaceKernels):
     def contact(
         self, index: i32, normal: f32, first: f32, second: f32, friction: f32
     ) -> Value:
-        """Return the velocity behind the contact with a wall, in the same order.
+        """Return the velocity of a node after contact with one of two opposite walls.
 
-        ``index`` counts nodes along the normal of the two walls across an axis;
-        ``first`` and ``second`` are the tangential components.
+        Args:
+            index: place of the node along the normal of the walls.
+            normal: component of the velocity along the normal.
+            first: a tangential component.
+            second: the other one.
+            friction: Coulomb's coefficient of the walls.
+
+        Returns:
+            The normal and the two tangential components.
         """
         new_normal = normal
         new_first = first
@@ -425,9 +453,10 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32, k: i32) -> i64:
-        """Return n of a node with its mirror images.
+        """Return n of a node plus n of its mirror images.
 
-        Without them a wall node would hold half a cell and a corner an eighth.
+        Particles lie on one side of a wall only: without its images a node on a wall
+        would count half a cell, and a node in a corner an eighth.
         """
         image_i = self.image(i)
         image_j = self.image(j)
@@ -445,7 +474,7 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
-        """Gather v, Jbar and r with the slopes of v."""
+        """Interpolate v, Jbar and r of the nodes at a particle, and the slopes of v."""
         place = self.stencil_place[s, p]
         lowest = node_number(place[3], self.node_count)
         weight_x = self.weights[0][s, p]
@@ -480,7 +509,7 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def flow(self, s: i32, p: i32, solid: Template) -> None:
-        """Move a particle with the grid, and update J of a liquid."""
+        """Move a particle with the grid's velocity, and update J of a liquid."""
         grid_state = self.grid_state[s, p]
         grid_jacobian = grid_state[3]
         velocity = grid_state.xyz
@@ -507,18 +536,18 @@ class ParticleStress3D(FreeSurfaceKernels):
             spread_jacobian = ti.select(is_liquid, j, 1.0)
         new_state = vec4(velocity[0], velocity[1], velocity[2], spread_jacobian)
         self.particle_state[s, p] = new_state
-        self.keep_ratio(s, p, ratio)
+        self.store_ratio(s, p, ratio)
 
         extremes = self.extremes[s, p]
         speed = largest_component(velocity)
         extremes[0] = larger(speed, extremes[0])
         self.extremes[s, p] = extremes
         if ti.static(not solid):
-            self.keep_jacobian(s, p)
+            self.update_jacobian_extremes(s, p)
 
     @ti.func
-    def keep_ratio(self, s: i32, p: i32, ratio: f32) -> None:
-        """Keep J of a liquid or Jp of snow, and the extremes since the start."""
+    def store_ratio(self, s: i32, p: i32, ratio: f32) -> None:
+        """Store J of a liquid or Jp of snow, and its extremes since the start."""
         matter = self.matter[s, p]
         ratio_min = matter[2]
         matter[1] = ratio
@@ -535,8 +564,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         return ti.select(kind == LIQUID, ratio, solid_jacobian)
 
     @ti.func
-    def keep_jacobian(self, s: i32, p: i32) -> None:
-        """Keep the extremes of J of a liquid or det F of a solid in this advance."""
+    def update_jacobian_extremes(self, s: i32, p: i32) -> None:
+        """Update the extremes of J of a liquid or det F of a solid in this advance."""
         jacobian = self.jacobian(s, p)
         extremes = self.extremes[s, p]
         jacobian_min = extremes[1]
@@ -551,13 +580,14 @@ class ParticleStress3D(FreeSurfaceKernels):
         f = self.deformation(s, p)
         change = self.dt * (self.velocity_gradient(s, p) @ f)
         f = ti.select(is_liquid, f, f + change)
-        self.keep_deformation(s, p, f)
+        self.store_deformation(s, p, f)
 
     @ti.func
     def apply_snow_plasticity(self, s: i32, p: i32) -> None:
-        """Bring F of a snow particle back to its yield limits; others stay as they are.
+        """Bring F of a snow particle back to its yield limits.
 
-        F from :meth:`deform` is the trial gradient. What it loses goes into Jp.
+        F from :meth:`deform` is the trial gradient. The change of volume that it loses
+        goes into Jp. Particles of other materials stay as they are.
         """
         if self.matter[s, p][0] == SNOW:
             trial = rows_of(self.deformation(s, p))
@@ -565,29 +595,29 @@ class ParticleStress3D(FreeSurfaceKernels):
             for axis in ti.static(_AXES):
                 column = vec4(rows[0][axis], rows[1][axis], rows[2][axis], 0.0)
                 self.deformation_columns[axis][s, p] = column
-            self.keep_plastic_ratio(s, p, growth)
+            self.update_plastic_ratio(s, p, growth)
 
     @ti.func
-    def keep_plastic_ratio(self, s: i32, p: i32, growth: f32) -> None:
-        """Let Jp of a snow particle grow by a factor."""
+    def update_plastic_ratio(self, s: i32, p: i32, growth: f32) -> None:
+        """Multiply Jp of a snow particle by a factor, within its limits."""
         jp_min = self.parameters.snow_jp_min
         jp_max = self.parameters.snow_jp_max
         old_jp = self.matter[s, p][1]
         jp = bounded(old_jp * growth, jp_min, jp_max)
-        self.keep_ratio(s, p, jp)
+        self.store_ratio(s, p, jp)
 
     @ti.func
-    def compute_listed_flow(self, block: i32) -> None:
+    def compute_listed_plasticity(self, block: i32) -> None:
         """Compute the elastic F and the growth of Jp of a block of snow particles."""
         trial = self.listed_rows(block)
         rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
         for row, column in ti.static(ti.ndrange(3, 3)):
-            keep_lanes(self.listed_gradient[row][column], block, rows[row][column])
-        keep_lanes(self.listed_growth, block, growth)
+            store_lanes(self.listed_gradient[row][column], block, rows[row][column])
+        store_lanes(self.listed_growth, block, growth)
 
     @ti.func
-    def keep_listed_flow(self, number: i32) -> None:
-        """Copy F and Jp of a snow particle from its place in the list."""
+    def copy_plasticity_from_list(self, number: i32) -> None:
+        """Update F and Jp of a snow particle from its place in the list of snow."""
         for axis in ti.static(_AXES):
             x = self.listed_gradient[0][axis][number]
             y = self.listed_gradient[1][axis][number]
@@ -595,16 +625,16 @@ class ParticleStress3D(FreeSurfaceKernels):
             p = self.snow_particles[number]
             self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
         growth = self.listed_growth[number]
-        self.keep_plastic_ratio(0, self.snow_particles[number], growth)
+        self.update_plastic_ratio(0, self.snow_particles[number], growth)
 
     @ti.func
-    def keep_deformation(self, s: i32, p: i32, f: mat3) -> None:
+    def store_deformation(self, s: i32, p: i32, f: mat3) -> None:
         """Store F, column by column."""
         for axis in ti.static(_AXES):
             column = vec4(f[0, axis], f[1, axis], f[2, axis], 0.0)
             self.deformation_columns[axis][s, p] = column
 
-    # The drivers: the same phases in the same order.
+    # The drivers run the same phases in the same order.
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that
@@ -642,19 +672,20 @@ class ParticleStress3D(FreeSurfaceKernels):
                 for j in range(first[1], last[1]):
                     for k in range(first[2], last[2]):
                         self.clear(0, self.at(i, j, k))
-                    # The nodes at the end lie in rows that end two nodes behind.
+                    # A row has the number of its last node. So the numbers of rows with
+                    # a touched node are larger by at most two.
                     for k in range(first[2], last[2] + 2):
                         self.clear_row(0, self.at(i, j, k))
             for p in range(particles):
                 self.locate(0, p)
             if ti.static(solid):
                 for number in range(solid_count):
-                    self.list_gradient(self.solids, number)
-                    self.list_moduli(number)
+                    self.copy_gradient_to_list(self.solids, number)
+                    self.copy_moduli_to_list(number)
                 for block in range(solid_blocks):
                     self.compute_listed_stress(block)
                 for number in range(solid_count):
-                    self.keep_listed_stress(number)
+                    self.copy_stress_from_list(number)
             for p in range(particles):
                 self.stress(0, p, solid)
             for p in range(particles):
@@ -671,13 +702,13 @@ class ParticleStress3D(FreeSurfaceKernels):
                 for p in range(particles):
                     self.deform(0, p)
                 for number in range(snow_count):
-                    self.list_gradient(self.snow_particles, number)
+                    self.copy_gradient_to_list(self.snow_particles, number)
                 for block in range(snow_blocks):
-                    self.compute_listed_flow(block)
+                    self.compute_listed_plasticity(block)
                 for number in range(snow_count):
-                    self.keep_listed_flow(number)
+                    self.copy_plasticity_from_list(number)
                 for p in range(particles):
-                    self.keep_jacobian(0, p)
+                    self.update_jacobian_extremes(0, p)
 
     @ti.kernel
     def _parallel_substep(self, particles: i32, width: i32, solid: Template) -> Nothing:
@@ -704,7 +735,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             if ti.static(solid):
                 self.deform(s, p)
                 self.apply_snow_plasticity(s, p)
-                self.keep_jacobian(s, p)
+                self.update_jacobian_extremes(s, p)
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
@@ -721,8 +752,8 @@ class ParticleStress3D(FreeSurfaceKernels):
 
 
 @ti.func
-def lanes_of(field: Template, block: i32) -> Value:
-    """Return the numbers of a block of particles as one vector."""
+def load_lanes(field: Template, block: i32) -> Value:
+    """Read the numbers of a block of particles as one vector."""
     first = block * _LANES
     values = ti.Vector.zero(f32, _LANES)
     for lane in ti.static(range(_LANES)):
@@ -731,8 +762,8 @@ def lanes_of(field: Template, block: i32) -> Value:
 
 
 @ti.func
-def keep_lanes(field: Template, block: i32, values: Value) -> None:
-    """Store a vector as the numbers of a block of particles."""
+def store_lanes(field: Template, block: i32, values: Value) -> None:
+    """Write a vector to the numbers of a block of particles."""
     first = block * _LANES
     for lane in ti.static(range(_LANES)):
         field[first + lane] = values[lane]
@@ -740,7 +771,7 @@ def keep_lanes(field: Template, block: i32, values: Value) -> None:
 
 @ti.func
 def block_count(count: i32) -> i32:
-    """Return how many blocks of lanes hold so many particles."""
+    """Return how many blocks hold the particles of a list; the last may have gaps."""
     return (count + _LANES - 1) // _LANES
 
 
@@ -756,7 +787,7 @@ def largest_component(velocity: vec3) -> f32:
 
 @ti.func
 def columns(first: vec4, second: vec4, third: vec4) -> mat3:
-    """Return the matrix with these columns, of which the fourth entry is left out."""
+    """Return the matrix with these columns, without their fourth entries."""
     return mat3(
         [first[0], second[0], third[0]],
         [first[1], second[1], third[1]],

@@ -170,8 +170,8 @@ def add_shifted(
 ) -> None:
     """Add contributions, times their scales, and the bits of the shift.
 
-    Who reads the sums takes the shifts off, which saves a subtraction at each node of
-    each particle.
+    The reader of the sums subtracts the shifts. This saves a subtraction at each node
+    of each particle.
     """
     if ti.static(atomic):
         ti.atomic_add(sums[s, node], shifted(scaled))
@@ -184,9 +184,9 @@ def add_shifted(
 def row_count(rows: Template, s: i32, n: i32) -> Value:
     """Return the fixed-point sum of a node's weights, and the shifts in its sums.
 
-    Particles add to ``rows`` at n + 2 the weights of three nodes in a row along the
-    last axis, of which n is the first, and a zero. Each number that is added brings the
-    bits of one shift, so that the fourth sum of a row has only shifts.
+    A row is three nodes along the last axis, and has the number of its last node. A
+    particle adds to a row the weights of its three nodes, and a zero. Each added number
+    brings the bits of one shift, so the fourth sum of a row has only shifts.
     """
     first = rows[s, n + 2]
     second = rows[s, n + 1]

@@ -31,6 +31,7 @@ from lagbench.errors import (
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
+from lagbench.models.onnx_model import open_onnx
 from lagbench.scoring.scenario import measure_rows
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.score_layout import SUBMISSION
@@ -244,8 +245,6 @@ def open_model(
             fix="lagbench leaderboard check",
         )
     if path.suffix == ".onnx":
-        from lagbench.models.onnx_model import open_onnx
-
         return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
 
     check_installed("torch", extra="baselines")

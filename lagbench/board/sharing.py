@@ -1,7 +1,10 @@
-"""Weights that several entries share: each active entry uses them in a way of its own.
+"""Weights that several entries share. No two active entries use them in the same way.
 
-A use is a file of weights, a data set and the options of the prediction. Options are
-compared with the recipe in the weights: one that states what holds anyway is none.
+A use of weights consists of the file, the data set and the options of the prediction.
+Some options change nothing: they repeat a value of the recipe in the weights, or its
+default. Such options do not make two uses different.
+
+The *keeper* of weights is the entry beside which their file lies.
 """
 
 from __future__ import annotations
@@ -21,32 +24,32 @@ from .issues import make_issue
 
 
 @dataclass(frozen=True, kw_only=True)
-class Use:
+class WeightsUse:
     """How a prediction of an entry uses weights."""
 
     entry: Entry
-    number: int  # of the prediction
+    number: int  # of the prediction in the entry
     weights: Weights
-    settings: tuple[str, ...]  # as the entry writes them
+    settings: tuple[str, ...]  # options of the prediction, as the entry writes them
 
     @property
     def where(self) -> str:
-        """Path of the entry, and the key of the weights in it."""
-        return where_in(self.entry, self.number)
+        """Path of the entry, and the key of the weights in it, for messages."""
+        return weights_key(self.entry, self.number)
 
     @property
     def is_shared(self) -> bool:
-        """Whether another entry keeps the weights."""
+        """Whether the keeper of the weights is another entry."""
         return self.weights.shared_with is not None
 
 
-def where_in(entry: Entry, number: int) -> str:
-    """Return the path of an entry, and the key of the weights of a prediction."""
+def weights_key(entry: Entry, number: int) -> str:
+    """Return path and key of the weights of a prediction, for messages."""
     return f"{entry.yaml_path}, predictions.{number}.weights"
 
 
-def list_uses(entries: Sequence[Entry]) -> list[Use]:
-    """Return how active entries use weights; those that keep the weights come first."""
+def list_uses(entries: Sequence[Entry]) -> list[WeightsUse]:
+    """Return how active entries use weights; uses by keepers come first."""
     uses = []
     for entry in entries:
         if entry.status is not Status.ACTIVE:
@@ -54,7 +57,7 @@ def list_uses(entries: Sequence[Entry]) -> list[Use]:
         for number, prediction in enumerate(entry.predictions):
             if prediction.weights is None:
                 continue
-            use = Use(
+            use = WeightsUse(
                 entry=entry,
                 number=number,
                 weights=prediction.weights,
@@ -65,9 +68,11 @@ def list_uses(entries: Sequence[Entry]) -> list[Use]:
 
 
 def find_keeper(folder: Folder, place: Place, path: Path) -> Entry | None:
-    """Return the other entry beside which a file of weights lies on this board.
+    """Return the entry that keeps a file of weights on this board.
 
-    None where the file lies elsewhere, or beside the entry of this place.
+    Returns:
+        None where the file lies elsewhere, or where its keeper is the entry of this
+        place.
     """
     board = folder.path.resolve()
     whole_path = path.resolve()
@@ -78,42 +83,43 @@ def find_keeper(folder: Folder, place: Place, path: Path) -> Entry | None:
         return None
     _, split, size, _ = inner_path.parts
     method, _, _ = inner_path.stem.rpartition("_")
-    keeper = (split, size, method)
-    if keeper == place:
+    keeper_place = (split, size, method)
+    if keeper_place == place:
         return None
-    entry = read_entry_if_valid(folder.path / entry_path(keeper))
-    if entry is not None and inner_path in entry.files:
-        return entry
+    keeper = read_entry_if_valid(folder.path / entry_path(keeper_place))
+    if keeper is not None and inner_path in keeper.files:
+        return keeper
     return None
 
 
 def require_weights_stay(folder: Folder, entry: Entry, previous: Entry | None) -> None:
-    """Refuse to replace or remove weights that another entry shares.
+    """Refuse an entry without the weights of its previous version that others share.
 
     Raises:
-        UsageError: another entry predicts with weights that would go.
+        UsageError: another entry predicts with weights that the entry lacks.
     """
     if previous is None:
         return
-    staying = {
-        prediction.weights.sha256
-        for prediction in entry.predictions
-        if prediction.weights
-    }
-    keeper = "/".join(entry.place)
+    kept_hashes = set()
+    for prediction in entry.predictions:
+        if prediction.weights is not None:
+            kept_hashes.add(prediction.weights.sha256)
+    keeper_name = "/".join(entry.place)
     for path in folder.entries():
         if path.parts[1] != entry.split or path == entry.yaml_path:
             continue
         other = read_entry_if_valid(folder.path / path)
-        for prediction in () if other is None else other.predictions:
+        if other is None:
+            continue
+        for prediction in other.predictions:
             weights = prediction.weights
-            if weights is None or weights.shared_with != keeper:
+            if weights is None or weights.shared_with != keeper_name:
                 continue
-            if weights.sha256 not in staying:
+            if weights.sha256 not in kept_hashes:
                 raise UsageError(
                     "another entry predicts with the weights that would go",
                     where=str(folder.path / path),
-                    expected=f"the weights {weights.sha256[:16]} of {keeper} stay",
+                    expected=f"the weights {weights.sha256[:16]} of {keeper_name} stay",
                     got="other weights, or none",
                     fix="submit under a new --method, and set the old entry to "
                     "status: superseded",
@@ -123,17 +129,19 @@ def require_weights_stay(folder: Folder, entry: Entry, previous: Entry | None) -
 def check_sharing(
     entry: Entry, number: int, keepers: Mapping[Place, Entry]
 ) -> Iterator[ValidationIssue]:
-    """Yield why a prediction may not share the weights that another entry keeps."""
+    """Yield why a prediction may not share the weights that another entry keeps.
+
+    Args:
+        entry: the entry that shares them.
+        number: the prediction in it.
+        keepers: all entries, by place.
+    """
     weights = entry.predictions[number].weights
     if weights is None or weights.shared_with is None:
         return
-    where = where_in(entry, number)
+    where = weights_key(entry, number)
     keeper = keepers.get(weights.place_of(entry.place))
-    kept_hashes = set()
-    for kept in () if keeper is None else keeper.predictions:
-        if kept.weights is not None and kept.weights.shared_with is None:
-            kept_hashes.add(kept.weights.sha256)
-    if keeper is None or weights.sha256 not in kept_hashes:
+    if keeper is None or weights.sha256 not in _hashes_of_kept_weights(keeper):
         yield make_issue(
             "weights",
             where,
@@ -159,56 +167,67 @@ def check_sharing(
         )
 
 
+def _hashes_of_kept_weights(keeper: Entry) -> set[str]:
+    """Return the SHA-256 of the weights that lie beside an entry."""
+    hashes = set()
+    for prediction in keeper.predictions:
+        weights = prediction.weights
+        if weights is not None and weights.shared_with is None:
+            hashes.add(weights.sha256)
+    return hashes
+
+
 def check_uses(
     folder: Folder, entries: Sequence[Entry], *, isolated: bool
 ) -> Iterator[ValidationIssue]:
     """Yield shared weights that two active entries use in the same way."""
-    groups: dict[tuple[str, str, str], list[Use]] = {}
+    groups: dict[tuple[str, str, str], list[WeightsUse]] = {}
     for use in list_uses(entries):
         key = (use.weights.sha256, use.entry.split, use.entry.size)
         groups.setdefault(key, []).append(use)
-    compared = []
+    shared_groups = []
+    shared_uses = []
     for group in groups.values():
         if len(group) > 1 and any(use.is_shared for use in group):
-            compared.append(group)
+            shared_groups.append(group)
+            shared_uses.extend(group)
 
-    uses = [use for group in compared for use in group]
-    effective = _read_settings(folder, uses, isolated=isolated)
-    for group in compared:
-        first_uses: dict[tuple[str, ...], Use] = {}
+    effective_settings = _read_settings(folder, shared_uses, isolated=isolated)
+    for group in shared_groups:
+        first_uses: dict[tuple[str, ...], WeightsUse] = {}  # by effective settings
         for use in group:
-            first = first_uses.setdefault(effective[use.where], use)
-            if first is not use and use.is_shared:
+            first_use = first_uses.setdefault(effective_settings[use.where], use)
+            if first_use is not use and use.is_shared:
                 yield make_issue(
                     "weights",
                     use.where,
-                    f"used as in {first.entry.yaml_path}",
+                    f"used as in {first_use.entry.yaml_path}",
                     what="the same weights twice",
                     expected="another size, or options that change the model",
                 )
 
 
 def _read_settings(
-    folder: Folder, uses: Sequence[Use], *, isolated: bool
+    folder: Folder, uses: Sequence[WeightsUse], *, isolated: bool
 ) -> Mapping[str, tuple[str, ...]]:
-    """Return the settings of uses that change the model, by place of the use.
+    """Return the settings of each use that change the model, by ``use.where``.
 
-    They are those that the entry writes where torch is not installed, or the weights
-    are not those that the entry names: then another check finds them.
+    The settings are returned as the entry writes them if torch is not installed. So are
+    those of a file that the entry does not name: another check reports that file.
     """
-    effective = {}
-    read_uses = []
+    settings_of_uses = {}
+    uses_to_read = []
     requests = []
     for use in uses:
         path = Path(use.weights.path)
-        effective[use.where] = tuple(sorted(set(use.settings)))
+        settings_of_uses[use.where] = tuple(sorted(set(use.settings)))
         if path.suffix == ".onnx":  # it has no options
-            effective[use.where] = ()
+            settings_of_uses[use.where] = ()
         elif use.settings and is_unchanged(folder, path, use.weights.sha256):
-            read_uses.append(use)
+            uses_to_read.append(use)
             requests.append((str((folder.path / path).absolute()), *use.settings))
     if not requests or find_spec("torch") is None:
-        return effective
+        return settings_of_uses
 
     from lagbench.baselines.weights_check import (
         read_effective_settings,
@@ -219,6 +238,6 @@ def _read_settings(
         answers = read_in_child(requests)
     else:
         answers = [read_effective_settings(request) for request in requests]
-    for use, settings in zip(read_uses, answers, strict=True):
-        effective[use.where] = tuple(settings)
-    return effective
+    for use, settings in zip(uses_to_read, answers, strict=True):
+        settings_of_uses[use.where] = tuple(settings)
+    return settings_of_uses

@@ -1,16 +1,17 @@
 """Models beside their entries: weights of a training, or an ONNX file.
 
-``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them,
-``leaderboard reproduce`` runs them.
+``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them, and
+``leaderboard reproduce`` runs them. A model is one of these files:
 
-weights/<split>/<size>/<method>_<seed>.pt     parameters, which `lagbench predict` reads
-weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
-weights/<split>/<size>/<method>_<seed>.onnx   or a model of another code base
-weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
+weights/<split>/<size>/<method>_<seed>.pt            weights of `lagbench train`
+weights/<split>/<size>/<method>_<seed>.safetensors   weights with their recipe
+weights/<split>/<size>/<method>_<seed>.onnx          a model of another code base
 
-An entry may share the weights of another one (:mod:`.sharing`): it predicts with them
-at another size, or with other options, such as the mean over mirror images; or it takes
-the place of an inactive entry. Then no second copy is kept.
+A file with the ending .json beside it is the log of the training.
+
+An entry may share the weights of another entry (:mod:`.sharing`). It predicts with them
+at another size, or with other options, such as the mean over mirror images. Or it takes
+the place of an inactive entry. In each case the file lies on the board only once.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
@@ -29,15 +29,25 @@ from lagbench.errors import (
     check_installed,
     check_regular,
 )
+from lagbench.models.onnx_model import check_onnx
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
-from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
 from .entry_file import MOST_FILE_BYTES, is_unchanged
 from .folder import Folder, Place, weights_path
 from .issues import make_issue
-from .sharing import Use, check_sharing, check_uses, find_keeper, list_uses, where_in
+from .sharing import (
+    WeightsUse,
+    check_sharing,
+    check_uses,
+    find_keeper,
+    list_uses,
+    weights_key,
+)
+
+if TYPE_CHECKING:
+    from lagbench.baselines.weights_file import WeightsFile
 
 MOST_BYTES = 60_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
@@ -48,66 +58,6 @@ good.
 MOST_LOG_BYTES = 256 << 10
 
 TRAINING_LOG = "training.json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class WeightsFile:
-    """A file of weights that a submitter gives."""
-
-    path: Path
-    sha256: str
-    is_state: bool  # a state to go on from, with an optimiser
-    baseline: str
-    options: Mapping[str, Any]  # of the model, plain values
-    data_set: tuple[str, str, str]  # split, size and SHA-256
-    seed: int
-    provenance: TrainingProvenance
-    parameters: int | None  # None where the weights are not rounded
-
-    def describe_data_set(self) -> str:
-        """Return split, size, data set and seed in words."""
-        return f"{_describe_data_set(self.data_set)}, seed {self.seed}"
-
-    def list_effective_settings(self, settings: Sequence[str]) -> tuple[str, ...]:
-        """Return the settings of a prediction that change the model."""
-        from lagbench.baselines.recipe_changes import list_effective_settings
-
-        return list_effective_settings(self.baseline, self.options, settings)
-
-
-def _describe_data_set(data_set: tuple[str, str, str]) -> str:
-    split, size, sha256 = data_set
-    return f"{split} {size}, data set {sha256[:16]}"
-
-
-def inspect_weights(path: Path) -> WeightsFile:
-    """Read a file of weights; nothing in it is run.
-
-    Raises:
-        UnreadableFileError: the file is damaged or no weights.
-        UsageError: torch is not installed.
-    """
-    check_installed("torch", extra="baselines")
-    from lagbench.baselines.checkpoint import count_rounded_parameters, load
-    from lagbench.baselines.provenance import training_provenance
-    from lagbench.baselines.weights_check import check_in_child
-
-    if path.suffix == ".safetensors":
-        check_in_child(path)
-    checkpoint = load(path)
-    info = checkpoint.info
-    recipe = checkpoint.training.get("recipe", {})
-    return WeightsFile(
-        path=path,
-        sha256=file_sha256(path),
-        is_state=checkpoint.optimizer is not None,
-        baseline=checkpoint.baseline,
-        options=checkpoint.options,
-        data_set=(info.split, info.size, info.dataset_sha256),
-        seed=recipe.get("training", {}).get("seed", 0),
-        provenance=training_provenance(checkpoint),
-        parameters=count_rounded_parameters(checkpoint) or None,
-    )
 
 
 def require_weights(
@@ -128,8 +78,9 @@ def require_weights(
         place: split, size and method of the entry.
 
     Raises:
-        UsageError: the weights are too large, cannot have made the predictions, nothing
-            says that they have, or another entry has them and predicts in the same way.
+        UsageError: the weights are too large; they did not make the predictions, or
+            the predictions do not say so; another entry has the weights and predicts
+            with them in the same way; or torch is not installed.
         UnreadableFileError: a file is no file of weights.
     """
     paths = [Path(path) for path in weights]
@@ -146,7 +97,7 @@ def require_weights(
             _require_onnx(path, headers[index], uses, keeper)
             chosen[index] = path
             continue
-        file = inspect_weights(path)
+        file = _inspect_weights(path)
         _require_fit(file, headers[0], seeds, any_size=keeper is not None)
         index = seeds.index(file.seed)
         if chosen[index] is not None:
@@ -165,6 +116,18 @@ def require_weights(
     return tuple(chosen)
 
 
+def _inspect_weights(path: Path) -> WeightsFile:
+    check_installed("torch", extra="baselines")
+    from lagbench.baselines.weights_file import inspect_weights
+
+    return inspect_weights(path)
+
+
+def _describe_data_set(data_set: tuple[str, str, str]) -> str:
+    split, size, sha256 = data_set
+    return f"{split} {size}, data set {sha256[:16]}"
+
+
 def _require_small(paths: Sequence[Path]) -> None:
     length = sum(path.stat().st_size for path in paths if path.is_file())
     if length > MOST_BYTES:
@@ -179,15 +142,13 @@ def _require_small(paths: Sequence[Path]) -> None:
 
 
 def _require_onnx(
-    path: Path, header: Header, uses: Sequence[Use], keeper: Entry | None
+    path: Path, header: Header, uses: Sequence[WeightsUse], keeper: Entry | None
 ) -> None:
-    """Refuse an ONNX file that cannot be run, or is another entry's or seed's.
+    """Refuse an ONNX file that cannot be run, or that belongs to another prediction.
 
-    ONNX files belong to the predictions in their order. They have no options, so only
-    that of an inactive entry of the same data set can be shared.
+    ONNX files are given in the order of the predictions. An ONNX file has no options.
+    So an entry can share it only with an inactive entry of the same data set and seed.
     """
-    from lagbench.models.onnx_model import check_onnx
-
     declared = check_onnx(path)
     sha256 = file_sha256(path)
     for use in uses:
@@ -219,10 +180,12 @@ def _owned_error(path: Path, owner: str) -> UsageError:
     )
 
 
-def _require_new_use(file: WeightsFile, header: Header, uses: Sequence[Use]) -> None:
+def _require_new_use(
+    file: WeightsFile, header: Header, uses: Sequence[WeightsUse]
+) -> None:
     """Refuse predictions that an active entry makes with the same weights and options.
 
-    Options are compared with the recipe in the weights.
+    Options that change nothing in the recipe of the weights do not count.
     """
     settings: tuple[str, ...] = ()
     if header.provenance is not None:
@@ -247,7 +210,12 @@ def _require_fit(
 ) -> None:
     """Refuse a training state, and weights of another data set or seed.
 
-    Shared weights may be those of another size of the split.
+    Args:
+        file: the weights.
+        header: of the predictions.
+        seeds: of the predictions.
+        any_size: whether the weights may be of another size of the split; shared ones
+            may.
     """
     if file.is_state:
         raise UsageError(
@@ -266,14 +234,17 @@ def _require_fit(
             "the weights do not belong to these predictions",
             where=str(file.path),
             expected=f"{_describe_data_set(data_set)}, seeds {seeds}",
-            got=file.describe_data_set(),
+            got=f"{_describe_data_set(file.data_set)}, seed {file.seed}",
             fix="leave them out; of those of another size give the file that lies on "
             "the board",
         )
 
 
 def _require_made_by(file: WeightsFile, header: Header) -> None:
-    """Refuse weights that did not make the predictions, or of which nothing says so."""
+    """Refuse weights that did not make the predictions.
+
+    Predictions must state their training or their number of parameters, as evidence.
+    """
     if header.parameters is None and header.provenance is None:
         raise UsageError(
             "nothing says that these weights made the predictions",
@@ -317,8 +288,16 @@ def name_weights(
 ) -> tuple[Weights | None, ...]:
     """Return the weights that an entry names for each of its predictions.
 
-    Predictions without new weights keep those of the previous entry, where these lie
-    unchanged in their place and are nobody else's.
+    A prediction without new weights keeps those of the previous entry, if they lie
+    unchanged in their place and no other entry keeps them.
+
+    Args:
+        folder: the leaderboard.
+        place: split, size and method of the entry.
+        predictions: of the entry.
+        paths: new weights of each prediction; None where there are none.
+        previous: the entry as it was before, None for a new one.
+        rivals: other active entries of the data set, by path.
     """
     previous_weights = _sound_weights(folder, place, previous, rivals)
     named: list[Weights | None] = []
@@ -352,7 +331,7 @@ def _sound_weights(
 ) -> dict[tuple[int | None, str], Weights]:
     """Return the weights of the previous entry that may stay, by seed and predictions.
 
-    The entry's own words about them are not believed.
+    Path and hash are checked on the disk, because an entry is written by its submitter.
     """
     if previous is None:
         return {}
@@ -374,10 +353,7 @@ def _sound_weights(
 
 
 def _owners_of_weights(entries: Mapping[Path, Entry]) -> dict[str, str]:
-    """Return which entry holds each file of weights.
-
-    The path of the entry is found by the SHA-256 of the weights.
-    """
+    """Return the path of the entry that keeps each file of weights, by its SHA-256."""
     owners = {}
     for path, entry in entries.items():
         for prediction in entry.predictions:
@@ -393,7 +369,7 @@ def copy_weights(
     """Copy weights and the logs of their trainings to the staging folder.
 
     Returns:
-        Path of each copy, by its place in the leaderboard's folder.
+        Path of each copy, by the path that it gets in the leaderboard's folder.
     """
     copies = {}
     for number, (weights, path) in enumerate(zip(named, paths, strict=True)):
@@ -410,7 +386,11 @@ def copy_weights(
 
 
 def _find_training_log(path: Path) -> Path | None:
-    """Return the log beside weights on a board, else that beside weights of a run."""
+    """Return the log of a training, None where weights have none.
+
+    It is training.json in the folder of a run, or has the name of the weights, as on a
+    board.
+    """
     training_log = None
     for candidate in (path.with_suffix(".json"), path.with_name(TRAINING_LOG)):
         if not candidate.is_file() or reason_unfit_log(candidate) is not None:
@@ -438,10 +418,11 @@ def reason_unfit_log(path: Path) -> str | None:
 def check_weights(
     folder: Folder, entries: Sequence[Entry], *, isolated: bool = True
 ) -> Iterator[ValidationIssue]:
-    """Yield weights that are missing, edited, misplaced, without an entry or too many,
-    and those that two active entries use in the same way.
+    """Yield what is wrong with the weights of a board.
 
-    Unfit logs of trainings are reported, too; a log that is not there is no issue.
+    Weights may be missing, edited, misplaced, without an entry or too many, or two
+    active entries use them in the same way. Logs of trainings that are no logs are
+    reported too. A model needs no log.
 
     Args:
         folder: the leaderboard.
@@ -456,7 +437,7 @@ def check_weights(
             weights = prediction.weights
             if weights is None:
                 continue
-            where = where_in(entry, number)
+            where = weights_key(entry, number)
             place = weights.place_of(entry.place)
             path = weights_path(place, prediction.seed, weights.path)
             yield from _check_weights_file(folder, path, weights, where=where)
@@ -480,8 +461,8 @@ def check_weights(
                     )
     yield from check_uses(folder, entries, isolated=isolated)
 
-    lying_paths = folder.weight_files()
-    for path in lying_paths:
+    stored_paths = folder.weight_files()
+    for path in stored_paths:
         if path not in known_paths:
             yield make_issue(
                 "weights",
@@ -491,7 +472,7 @@ def check_weights(
                 expected="an entry",
             )
     lengths = []
-    for path in lying_paths:
+    for path in stored_paths:
         lengths.append((folder.path / path).stat().st_size)
     total = sum(lengths)
     if total > MOST_BYTES:

@@ -1,0 +1,59 @@
+"""What a file of weights that a submitter gives holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lagbench.data.checksums import file_sha256
+from lagbench.submission.provenance import TrainingProvenance
+
+from .checkpoint import count_rounded_parameters, load
+from .provenance import training_provenance
+from .recipe_changes import list_effective_settings
+from .weights_check import check_in_child
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsFile:
+    """What a file of weights holds."""
+
+    path: Path
+    sha256: str
+    is_state: bool  # a state to go on from, with an optimiser
+    baseline: str
+    options: Mapping[str, Any]  # of the model, plain values
+    data_set: tuple[str, str, str]  # split, size and SHA-256
+    seed: int
+    provenance: TrainingProvenance
+    parameters: int | None  # None where the weights are not rounded
+
+    def list_effective_settings(self, settings: Sequence[str]) -> tuple[str, ...]:
+        """Return the settings of a prediction that change the model."""
+        return list_effective_settings(self.baseline, self.options, settings)
+
+
+def inspect_weights(path: Path) -> WeightsFile:
+    """Read a file of weights; nothing in it is run.
+
+    Raises:
+        UnreadableFileError: the file is damaged or no weights.
+    """
+    if path.suffix == ".safetensors":
+        check_in_child(path)
+    checkpoint = load(path)
+    info = checkpoint.info
+    recipe = checkpoint.training.get("recipe", {})
+    return WeightsFile(
+        path=path,
+        sha256=file_sha256(path),
+        is_state=checkpoint.optimizer is not None,
+        baseline=checkpoint.baseline,
+        options=checkpoint.options,
+        data_set=(info.split, info.size, info.dataset_sha256),
+        seed=recipe.get("training", {}).get("seed", 0),
+        provenance=training_provenance(checkpoint),
+        parameters=count_rounded_parameters(checkpoint) or None,
+    )
