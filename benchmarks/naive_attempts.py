@@ -706,6 +706,15 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
     """Return the attempts on a data set; the first is our own, as a check."""
     own = Predictors(library)
     return (
+        *_variants_of_ballistic_analog(own),
+        *_attempts_with_other_analogs(own),
+        *_attempts_that_come_to_rest(own),
+    )
+
+
+def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
+    """Return ballistic-analog as it is shipped, and with other settings."""
+    return (
         Attempt(
             name="shipped",
             what="ballistic-analog as shipped, every fourth state",
@@ -732,6 +741,12 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
                 velocity_weight=(0.0, 5.0, 10.0, 40.0),
             ),
         ),
+    )
+
+
+def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
+    """Return attempts that choose or mix analogs in another way."""
+    return (
         Attempt(
             name="weighted",
             what="mixture of k analogs; nearer ones get more particles",
@@ -773,6 +788,12 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
                 velocity_weight=(0.0, 20.0, 60.0),
             ),
         ),
+    )
+
+
+def _attempts_that_come_to_rest(own: Predictors) -> tuple[Attempt, ...]:
+    """Return attempts with friction, or drawn towards a cloud at rest."""
+    return (
         Attempt(
             name="damped",
             what="free flight with bounces and friction",

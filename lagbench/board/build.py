@@ -27,7 +27,7 @@ from lagbench.errors import (
 )
 from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import Score, interval_in_range
-from lagbench.metrics.metric import mean
+from lagbench.metrics.metric import mean, mean_of_rows
 from lagbench.metrics.significance import (
     FEWEST_SCENARIOS,
     Standing,
@@ -876,9 +876,7 @@ def _make_value(
     low, high = interval
     at = {}
     if score.metric.per_frame and score.metric.name in AT_FRAMES:
-        for frame in reported_frames(size):
-            if frame in score.frames:
-                at[frame] = mean(score.at(frame))
+        at = _means_at_frames(score, reported_frames(size))
     return Value(
         mean=score.mean,
         std=std,
@@ -888,6 +886,20 @@ def _make_value(
         at=at,
         undefined=sum(score.undefined),
     )
+
+
+def _means_at_frames(score: Score, frames: Sequence[int]) -> dict[int, float]:
+    """Return the mean over scenarios at some absolute frames, by frame.
+
+    Frames that the score does not have are left out.
+    """
+    columns = {}
+    for column, frame in enumerate(score.frames):
+        if frame in frames:
+            columns[frame] = column
+    at_frames = score.per_frame[:, list(columns.values())]  # shape [scenario, frame]
+    means = mean_of_rows(at_frames.T)
+    return dict(zip(columns, means.tolist(), strict=True))
 
 
 def _names_of_curves(ranking: str) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ by nothing else: verified.yaml names the entries for which that was done.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from lagbench.work.progress import Progress
 
 from .base import check_base
 from .build import build
-from .entry import Entry
+from .entry import Entry, Verification
 from .folder import Folder
 from .folder_checks import FolderChecks
 from .issues import issue_from_error, make_issue
@@ -109,7 +109,7 @@ def check_board(
         isolated=isolated,
     )
     checks.run()
-    issues = checks.issues
+    issues = [*checks.issues]
     issues += check_seasons(
         folder,
         checks.entries,
@@ -119,22 +119,19 @@ def check_board(
     if base is not None:
         issues += check_base(folder, base, own)
 
+    score_predictions = partial(
+        score, root=root, registry=described, progress=progress, write=False
+    )
     rescoring = Rescoring(
         folder=folder,
         entries=checks.entries,
         readable_score_files=checks.readable_score_files,
-        score=partial(
-            score, root=root, registry=described, progress=progress, write=False
-        ),
+        score=score_predictions,
     )
     for path in predictions:
         issues += rescoring.rescore(path)
-
-    measured = {}
-    for size in floors:
-        names, differing = remeasure(size, resolve_root(root), progress=progress)
-        measured[f"{size.split} {size.name}"] = names
-        issues += _issues_of_measured(size, differing)
+    measured, issues_of_floors = _measure_floors(floors, root, progress)
+    issues += issues_of_floors
 
     confirmed, partly = _group_confirmed(checks.entries, rescoring.confirmations)
     recorded: list[Entry] = []
@@ -144,27 +141,18 @@ def check_board(
 
     is_page_checked = page and not issues
     if is_page_checked:
-        try:
-            build(folder.path, check=True, registry=described)
-        except LagbenchError as error:
-            issues.append(issue_from_error("page", error, error.where))
-    reproduced = []
-    for line in checks.verifications:
-        if line.is_reproduced:
-            reproduced.append(line.is_reproduced_wholly)
-    recorded_paths = []
-    for entry in recorded:
-        recorded_paths.append(entry.yaml_path.as_posix())
+        issues += _check_page(folder, described)
+    reproduced_wholly, reproduced_partly = _count_reproduced(checks.verifications)
     return CheckResult(
         folder=folder.path,
         entries=len(folder.entries()),
         findings=tuple(issues),
         page_checked=is_page_checked,
         confirmed=tuple(rescoring.confirmations),
-        recorded=tuple(recorded_paths),
+        recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
         partly=partly,
-        reproduced_wholly=reproduced.count(True),
-        reproduced_partly=reproduced.count(False),
+        reproduced_wholly=reproduced_wholly,
+        reproduced_partly=reproduced_partly,
         floors=measured,
     )
 
@@ -176,6 +164,46 @@ def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
     for path in paths:
         whole_paths.append(folder.path / path)
     return find_unreadable(whole_paths)
+
+
+def _measure_floors(
+    floors: Collection[Size],
+    root: str | Path | None,
+    progress: Callable[[Progress], None] | None,
+) -> tuple[dict[str, tuple[str, ...]], list[ValidationIssue]]:
+    """Measure reference predictors again.
+
+    Returns:
+        Names of the measured ones by data set, and those with other shipped scores.
+    """
+    measured = {}
+    issues = []
+    for size in floors:
+        names, differing = remeasure(size, resolve_root(root), progress=progress)
+        measured[f"{size.split} {size.name}"] = names
+        issues += _issues_of_measured(size, differing)
+    return measured, issues
+
+
+def _check_page(folder: Folder, registry: Registry) -> list[ValidationIssue]:
+    """Return the issue of a page that is not what the entries give, if it is one."""
+    try:
+        build(folder.path, check=True, registry=registry)
+    except LagbenchError as error:
+        return [issue_from_error("page", error, error.where)]
+    return []
+
+
+def _count_reproduced(verifications: Iterable[Verification]) -> tuple[int, int]:
+    """Return how many entries were reproduced on all scenarios, and on some."""
+    wholly = 0
+    partly = 0
+    for verification in verifications:
+        if verification.is_reproduced_wholly:
+            wholly += 1
+        elif verification.is_reproduced:
+            partly += 1
+    return wholly, partly
 
 
 def _issues_of_measured(

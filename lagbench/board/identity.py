@@ -73,10 +73,15 @@ def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
     the truth.
     """
     for scenario, tally in sorted(stored.scores.tallies.items()):
-        names = [name for name in tally.names if name in METRICS]
+        rows = []
+        names = []
+        for row, name in enumerate(tally.names):
+            if name in METRICS:
+                rows.append(row)
+                names.append(name)
         if not names:
             continue
-        values = np.stack([tally.series(name) for name in names])
+        values = tally.values[rows]
         for name, outlier in _values_out_of_range(names, values):
             yield f"{name} {outlier:.6g} in scenario {scenario}"
         for name in _false_zeros(names, values):
@@ -119,19 +124,14 @@ def _false_zeros(names: Sequence[str], values: Floats) -> list[str]:
         names: the metrics.
         values: NaN where undefined, shape [metric, frame].
     """
-    is_defined = ~np.isnan(values)
-    has_value = np.asarray(is_defined.any(axis=1))
-    has_error = np.asarray(((values != 0.0) & is_defined).any(axis=1))
-    zero_errors = []
-    is_truth = True
-    for i, name in enumerate(names):
-        if not name.endswith(("_mse", "_mae")) or not has_value[i]:
-            continue
-        if has_error[i]:
-            is_truth = False
-        else:
-            zero_errors.append(name)
-    return [] if is_truth else zero_errors
+    errors = [i for i, name in enumerate(names) if name.endswith(("_mse", "_mae"))]
+    error_values = values[errors]
+    is_defined = ~np.isnan(error_values)
+    is_error = (error_values != 0.0) & is_defined
+    if not is_error.any():  # the prediction is the truth
+        return []
+    is_zero = is_defined.any(axis=1) & ~is_error.any(axis=1)
+    return [names[errors[i]] for i in np.flatnonzero(is_zero).tolist()]
 
 
 LOOKALIKES = str.maketrans(

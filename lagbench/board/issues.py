@@ -124,9 +124,9 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "weights": BoardCheck(
         "weights that are missing, edited or in a wrong place; weights that no entry "
-        "names, or that two active entries use in the same way; shared weights that "
-        "their entry does not keep; more than 60 MB of weights, or a file of more than "
-        "40 MB; a training log that is too long or broken",
+        "names; weights that two active entries use in the same way; shared weights "
+        "that are not those of the entry in `shared_with`; more than 60 MB of weights, "
+        "or a file of more than 40 MB; a training log that is too long or broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "

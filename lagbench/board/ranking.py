@@ -58,7 +58,7 @@ class CombinedScore:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the mean, over scenarios and seeds together."""
-        values = np.stack([seed.values for seed in self.seeds])
+        values = np.array([seed.values for seed in self.seeds])
         return interval_in_range(values, self.score.value_range)
 
 

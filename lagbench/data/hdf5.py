@@ -177,12 +177,11 @@ def open_variable(group: h5py.Group, name: str) -> h5py.Dataset:
     return h5py.Dataset(h5py.h5d.open(group.id, name.encode()), readonly=True)
 
 
-def read_layout(dataset: h5py.Dataset) -> str:
-    """Return how the values are stored.
+def read_layout(creation_properties: h5py.h5p.PropDCID) -> str:
+    """Return how the values of a data set are stored.
 
     One of :data:`INSIDE`, "virtual", "external files" or "unknown".
     """
-    creation_properties = dataset.id.get_create_plist()
     if creation_properties.get_external_count():
         return "external files"
     return LAYOUTS.get(creation_properties.get_layout(), "unknown")
@@ -231,7 +230,7 @@ def list_variables(file: h5py.File) -> dict[str, h5py.Dataset]:
         if kind != "variable":
             continue
         variable = open_variable(file, name)
-        layout = read_layout(variable)
+        layout = read_layout(variable.id.get_create_plist())
         if layout not in INSIDE:
             raise DataError(f"the values of {name!r} lie elsewhere: {layout}")
         if not _is_bare_dimension(variable):

@@ -156,14 +156,14 @@ def describe_array(dataset: h5py.Dataset, *, has_dims: bool = True) -> ArrayInfo
         has_dims: whether the names of its dimensions are needed, each of which has to
             be looked up.
     """
-    layout = read_layout(dataset)
+    creation_properties = dataset.id.get_create_plist()
+    layout = read_layout(creation_properties)
     # HDF5 opens the sources of a virtual data set to tell its shape.
     is_inside = layout in INSIDE
     shape = None
     if is_inside and _has_simple_shape(dataset):
         shape = tuple(dataset.id.shape)
 
-    creation_properties = dataset.id.get_create_plist()
     chunks = None
     chunk_lengths: list[int] = []
     packed = 0

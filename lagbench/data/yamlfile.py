@@ -45,16 +45,16 @@ class _StrictLoader(yaml.CSafeLoader):
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, Any]:
-        seen: set[Hashable] = set()
-        for key_node, _ in node.value:
+        mapping: dict[Hashable, Any] = {}
+        for key_node, value_node in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, Hashable) or key in seen:
+            if not isinstance(key, Hashable) or key in mapping:
                 message = f"key {key!r} is given twice or cannot be a key"
                 raise yaml.constructor.ConstructorError(
                     None, None, message, key_node.start_mark
                 )
-            seen.add(key)
-        return super().construct_mapping(node, deep=deep)
+            mapping[key] = self.construct_object(value_node, deep=deep)
+        return mapping
 
 
 def _construct_integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import Self
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
-from .metric import Metric, identity, mean
+from .metric import Metric, identity, mean, mean_of_rows, root_mean_square
 
 LARGEST = float(np.finfo(np.float32).max)
 
@@ -105,35 +105,41 @@ class Tally:
         )
 
     @cached_property
-    def _rows(self) -> Mapping[str, tuple[Floats, NDArray[np.bool_]]]:
-        """Value and whether it was measured, by statistic, each of shape [frame]."""
+    def values(self) -> Floats:
+        """Statistics per frame, NaN without a value, [statistic, frame], read-only."""
         values = np.full(self.total.shape, np.nan)
         np.divide(self.total, self.weight, out=values, where=self.weight > 0)
-        is_measured = self.weight + self.undefined > 0
         values.flags.writeable = False
-        is_measured.flags.writeable = False
+        return values
 
-        rows = zip(values, is_measured, strict=True)
-        return dict(zip(self.names, rows, strict=True))
+    @cached_property
+    def _is_measured(self) -> NDArray[np.bool_]:
+        """Whether a value was measured, defined or not, shape [statistic, frame]."""
+        is_measured = self.weight + self.undefined > 0
+        is_measured.flags.writeable = False
+        return is_measured
+
+    @cached_property
+    def _row_numbers(self) -> Mapping[str, int]:
+        """Row of each statistic in the arrays."""
+        return {name: row for row, name in enumerate(self.names)}
 
     def __getstate__(self) -> dict[str, object]:
-        """Return the fields; another process forms the cached rows again."""
-        state = {}
-        for name, value in self.__dict__.items():
-            if name != "_rows":
-                state[name] = value
-        return state
+        """Return the fields; another process forms the cached arrays again."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def series(self, name: str) -> Floats:
         """Return a statistic per frame, NaN without a value, [frame], read-only."""
-        return self._rows[name][0]
+        series: Floats = self.values[self._row_numbers[name]]
+        return series
 
     def measured(self, name: str) -> NDArray[np.bool_]:
         """Return at which frames a statistic was measured, defined or not.
 
         The shape is [frame], read-only.
         """
-        return self._rows[name][1]
+        is_measured: NDArray[np.bool_] = self._is_measured[self._row_numbers[name]]
+        return is_measured
 
 
 def round_statistics(tally: Tally) -> Tally:
@@ -219,7 +225,7 @@ class Resampling:
             deviations.append(stretch * np.einsum("rn,n->r", shares, part))
         return np.asarray(np.sum(deviations, axis=0))
 
-    @property
+    @cached_property
     def _variances(self) -> list[float]:
         """Variance of the mean by part: ``sum(x^2) / (n (n - 1))``."""
         variances = []
@@ -352,7 +358,7 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
         seeds = method[:, defined]
         seed_mean = mean_over_seeds(seeds)
         over_seeds += sign * seed_mean
-        offsets = np.array([mean(row) for row in seeds - seed_mean])
+        offsets = mean_of_rows(seeds - seed_mean)
         over_scenarios.append(sign * offsets[~np.isnan(offsets)])
 
     parts = {}
@@ -430,7 +436,7 @@ class Score:
             f"{len(self.scenarios)} scenarios, {len(self.frames)} frames>"
         )
 
-    @property
+    @cached_property
     def mean(self) -> float:
         """Mean over the scenarios that have a value."""
         return mean(self.values)
@@ -483,14 +489,14 @@ class _SeriesByStatistic:
         """Return a statistic, NaN without a value."""
         if name not in self._values:
             rows = [tally.series(name) for tally in self._tallies]
-            self._values[name] = np.stack(rows)
+            self._values[name] = np.array(rows)
         return self._values[name]
 
     def measured(self, name: str) -> NDArray[np.bool_]:
         """Return where a statistic was measured."""
         if name not in self._measured:
             rows = [tally.measured(name) for tally in self._tallies]
-            self._measured[name] = np.stack(rows)
+            self._measured[name] = np.array(rows)
         return self._measured[name]
 
 
@@ -499,7 +505,9 @@ def _score(metric: Metric, statistics: _SeriesByStatistic) -> Score | None:
 
     None where it was measured nowhere or the task is too short.
     """
-    is_measured = np.all([statistics.measured(name) for name in metric.of], axis=0)
+    is_measured = statistics.measured(metric.of[0])
+    for name in metric.of[1:]:
+        is_measured = is_measured & statistics.measured(name)
     if metric.horizon > len(statistics.frames) or not is_measured.any():
         return None
     try:
@@ -532,14 +540,11 @@ def _series(metric: Metric, statistics: _SeriesByStatistic) -> Floats:
 
 def _over_frames(metric: Metric, series: Floats) -> Floats:
     """Return the value of a metric over the horizon, shape [scenario]."""
+    # all rows at once, to the same bits
     if metric.over_frames is mean:
-        is_defined = ~np.isnan(series)
-        # metrics that are measured at every tenth frame have the same gaps in all rows
-        has_same_gaps = bool((is_defined == is_defined[0]).all())
-        if has_same_gaps and is_defined[0].any():
-            # all rows at once, to the same bits
-            defined = np.compress(is_defined[0], series, axis=1)
-            return np.asarray(defined.mean(axis=1))
+        return mean_of_rows(series)
+    if metric.over_frames is root_mean_square:
+        return np.asarray(np.sqrt(mean_of_rows(series**2)))
     return np.array([metric.over_frames(row) for row in series])
 
 

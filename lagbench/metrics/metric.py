@@ -87,6 +87,23 @@ def mean(values: Floats) -> float:
     return float(np.mean(defined))
 
 
+def mean_of_rows(values: Floats) -> Floats:
+    """Return :func:`mean` of each row, to the same bits.
+
+    Most metrics have the same gaps in all rows. An example are those that are measured
+    at every tenth frame. Then all rows are taken at once.
+
+    >>> mean_of_rows(np.array([[1.0, math.nan, 3.0], [4.0, math.nan, 8.0]])).tolist()
+    [2.0, 6.0]
+    """
+    is_defined = ~np.isnan(values)
+    has_same_gaps = bool((is_defined == is_defined[:1]).all())
+    if has_same_gaps and is_defined[:1].any():
+        defined = np.compress(is_defined[0], values, axis=1)
+        return np.asarray(defined.mean(axis=1))
+    return np.array([mean(row) for row in values])
+
+
 def root_mean_square(values: Floats) -> float:
     """Return ``sqrt(mean(values^2))`` over the defined frames.
 

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.hdf5 import open_hdf5, read_attribute
+from lagbench.data.hdf5 import open_hdf5, open_variable, read_attribute
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
@@ -119,8 +119,8 @@ def _read_reference(file: h5py.File) -> tuple[str | None, NDArray[np.float64]]:
     name = read_attribute(file, "best_floor")
     if name is None:
         return None, np.empty(0)
-    values = np.asarray(file["best_floor_value"][...], np.float64)
-    has_right_shape = values.shape == file["scenario"].shape
+    values = np.asarray(open_variable(file, "best_floor_value")[...], np.float64)
+    has_right_shape = values.shape == open_variable(file, "scenario").shape
     is_known = isinstance(name, str) and name in NAIVE
     if not is_known or not has_right_shape or np.isinf(values).any():
         raise ValueError("not the scores of a reference")
@@ -133,11 +133,11 @@ def _read_tallies(file: h5py.File) -> dict[int, Tally]:
     if not isinstance(statistics, str):
         raise ValueError("statistics is no text")
     names = tuple(statistics.split())
-    frames = tuple(file["frame"][...].tolist())
-    scenarios = file["scenario"][...].tolist()
+    frames = tuple(open_variable(file, "frame")[...].tolist())
+    scenarios = open_variable(file, "scenario")[...].tolist()
     # shape [statistic, scenario, frame]
-    values = file["value"][...].astype(np.float64)
-    is_measured = file["measured"][...] != 0  # of the same shape
+    values = open_variable(file, "value")[...].astype(np.float64)
+    is_measured = open_variable(file, "measured")[...] != 0  # of the same shape
 
     tallies = {}
     for i, scenario in enumerate(scenarios):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
-from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.hdf5 import open_hdf5, open_variable
 from lagbench.data.registry import Size
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
@@ -150,21 +150,23 @@ def read_published_scores(path: Path) -> PublishedScores:
 
 def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
     """Return the preview and the step of its vorticity maps [1/frame]."""
-    vorticity, precision = _unpack(group["vorticity"])
-    histogram, _ = _unpack(group["histogram"])
-    film, _ = _unpack(group["film"])
+    vorticity, precision = _unpack(open_variable(group, "vorticity"))
+    histogram, _ = _unpack(open_variable(group, "histogram"))
+    film, _ = _unpack(open_variable(group, "film"))
     obstacle = None
     if "obstacle" in group.attrs:
         obstacle = _read_obstacle(group)
     preview = Preview(
         scenario=int(np.ravel(group.attrs["scenario"])[0]),
-        map_frames=_read_integers(group["map_frame"]),
+        map_frames=_read_integers(open_variable(group, "map_frame")),
         vorticity=vorticity,
         histogram=histogram,
-        histogram_range=np.asarray(group["histogram_range"][...], np.float32),
-        film_frames=_read_integers(group["film_frame"]),
-        particles=_read_integers(group["film_particle"]),
-        material=np.asarray(group["material"][...], np.int8),
+        histogram_range=np.asarray(
+            open_variable(group, "histogram_range")[...], np.float32
+        ),
+        film_frames=_read_integers(open_variable(group, "film_frame")),
+        particles=_read_integers(open_variable(group, "film_particle")),
+        material=np.asarray(open_variable(group, "material")[...], np.int8),
         film=film,
         obstacle=obstacle,
     )

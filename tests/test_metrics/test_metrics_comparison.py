@@ -13,6 +13,8 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.typing import NDArray
 from statsmodels.stats.multitest import multipletests
 
 from lagbench.errors import UsageError
@@ -28,8 +30,10 @@ from lagbench.metrics import (
     standings,
 )
 from lagbench.metrics.aggregate import quantiles
+from lagbench.metrics.metric import mean_of_rows
 from lagbench.metrics.significance import mean_loss, rank_ranges
 
+Floats = NDArray[np.float64]
 NUMBERS = st.integers(-5, 5).map(float)
 DIFFERENCES = st.lists(NUMBERS, min_size=1, max_size=9)
 
@@ -156,6 +160,27 @@ def test_quantiles_are_those_of_numpy(values: list[float], share: float) -> None
     shares = [share, 0.025, 0.975]
     expected = np.quantile(values, shares)
     assert quantiles(np.array(values), shares) == expected.tolist()
+
+
+@given(
+    arrays(
+        np.float64,
+        array_shapes(min_dims=2, max_dims=2, max_side=40),
+        elements=st.floats(-1e9, 1e9) | st.just(math.nan),
+    ),
+    st.booleans(),
+)
+def test_means_of_rows_are_those_of_numpy(values: Floats, has_same_gaps: bool) -> None:
+    """Bit by bit, with gaps and without; a row without a value has NaN."""
+    if has_same_gaps:
+        values[:, np.isnan(values[0])] = math.nan
+        values[:, ~np.isnan(values[0])] = np.nan_to_num(values[:, ~np.isnan(values[0])])
+    expected = []
+    for row in values:
+        defined = row[~np.isnan(row)]
+        expected.append(np.mean(defined) if defined.size else math.nan)
+    np.testing.assert_array_equal(mean_of_rows(values), expected)
+    np.testing.assert_array_equal(mean_of_rows(np.asfortranarray(values)), expected)
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:
