@@ -71,11 +71,11 @@ def use_threads(count: int | None, *, processes: int = 1) -> Iterator[None]:
 
 
 def bound_memory() -> None:
-    """Keep memory flat where every step has shapes of its own, as graphs do.
+    """Bound the memory of compiled kernels where each step has new array shapes.
 
-    oneDNN keeps the kernels of 1024 shapes unless told otherwise before its first:
-    hundreds of megabytes of kernels that no later step will use. What the user set
-    stays.
+    Graphs have new shapes in each step. By default oneDNN keeps the kernels of 1024
+    shapes: hundreds of megabytes that no later step uses. It reads this setting when it
+    makes its first kernel. A setting of the user stays.
     """
     os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "64")
 

@@ -197,7 +197,7 @@ class NeuralMPM(Baseline):
     def _push_forward(
         self, state: GridState, generator: torch.Generator
     ) -> tuple[GridState, int]:
-        """Return the state after a random number of calls, and their frames."""
+        """Return the state after a random number of calls, and the number of frames."""
         device = generator.device
         end = self.options.pushforward + 1
         drawn = torch.randint(end, (), generator=generator, device=device)

@@ -51,7 +51,13 @@ class TrainingLog:
         return cls(**{name: stored[name] for name in names if name in stored})
 
     def read_clocks(self, processes: int = 1, *, device: str = "cpu") -> None:
-        """Add the time since the last reading, times the number of processes."""
+        """Add the times since the last reading to the costs of the training.
+
+        Args:
+            processes: number of processes that train, each of which costs as much
+                processor time as this one, and a GPU.
+            device: device of the model.
+        """
         cpu = _processor_seconds()
         wall = time.monotonic()
         wall_elapsed = wall - self._wall

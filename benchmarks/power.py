@@ -200,8 +200,8 @@ one is better by 5, 10 and 20 % ({draws} draws).
 |---|---|---|---|---|---|---|---|
 {rows}
 
-More scenarios do not find a difference that is small beside the scatter of seeds; only
-more seeds do. A board that ranks by hundredths ranks by chance.
+If a difference is small compared with the scatter of seeds, more scenarios do not help
+to find it; more seeds do. A board that ranks by hundredths ranks by chance.
 
 ## Equal methods that are told apart
 

@@ -222,7 +222,7 @@ def describe(device: str, machine: str) -> list[str]:
         "roughly as q^2.",
         "",
         "All times are in milliseconds; fps is the number of frames per second. "
-        "t/frame is the time of one run of as many substeps as a frame has. t/substep "
+        "t/frame is the time of one run with all substeps of a frame. t/substep "
         f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each of the "
         "two runs ends with one copy of all positions. So t/substep contains a part of "
         "this copy, and t/frame may be less than t/substep times the substeps.",

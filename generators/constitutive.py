@@ -32,10 +32,11 @@ _SHEAR_EPSILON = 1e-12
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """Return Lame's constants of plane strain, mu and lambda [mass/s^2].
+    """Return Lame's constants mu and lambda, of plane strain and in three dimensions.
 
     mu = E / (2 (1 + nu)) and lambda = E nu / ((1 + nu) (1 - 2 nu)), with Young's
-    modulus E [mass/s^2] and Poisson's ratio nu below 1/2.
+    modulus E and Poisson's ratio nu below 1/2. The constants have the unit of E:
+    [mass/s^2] in the plane, [mass/(length s^2)] in three dimensions.
 
     >>> lame(40.0, 0.25)
     (16.0, 16.0)

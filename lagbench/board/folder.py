@@ -200,9 +200,9 @@ class Folder:
         return tuple(paths)
 
     def claimed_places(self) -> set[Place]:
-        """Return split, size and method of every path where an entry would lie.
+        """Return split, size and method of every path that has the name of an entry.
 
-        A link or a folder claims a place, too.
+        The path may also be a link, a folder or a file that cannot be read.
         """
         places = set()
         for path in self._files(SUBMISSIONS):

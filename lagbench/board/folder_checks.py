@@ -300,7 +300,7 @@ class FolderChecks:
         stated = entry.score.metrics
         differing = []
         for name in {**formed, **stated}:
-            if not _is_same(formed.get(name), stated.get(name)):
+            if not _is_same_summary(formed.get(name), stated.get(name)):
                 differing.append(name)
         if differing:
             name = differing[0]
@@ -464,7 +464,8 @@ def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...]
     return sorted(scores.tallies), first_tally.frames, scores.ranking
 
 
-def _is_same(first: Summary | None, second: Summary | None) -> bool:
+def _is_same_summary(first: Summary | None, second: Summary | None) -> bool:
+    """Tell whether two summaries of a metric agree; a missing one agrees with none."""
     if first is None or second is None:
         return False
     for (_, a), (_, b) in zip(first, second, strict=True):

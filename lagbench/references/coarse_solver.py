@@ -50,15 +50,17 @@ SOLVED = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
 
 
 def coarser(size: Size, times: int) -> Size | None:
-    """Return a size with so many times fewer cells along each axis.
+    """Return a size with fewer cells along each axis, by a factor.
 
-    Its time step is as many times longer, and its particles fill cells as densely.
-    None where the split is not solved, where a wall would lie between two nodes, or
-    where too few cells or particles would be left.
+    Its time step is longer by the same factor, and a cell has as many particles.
 
     Args:
         size: the split and size that is predicted.
-        times: cells of its grid over those of the coarser one, 2 or 4.
+        times: the factor, 2 or 4.
+
+    Returns:
+        None where the solver does not solve the split, where a wall would lie between
+        two nodes, or where too few cells or particles would be left.
     """
     if size.split not in SOLVED:
         return None

@@ -123,9 +123,9 @@ def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
 
 
 def read_published_scores(path: Path) -> PublishedScores:
-    """Return the scores of a score file as of a scores.json.
+    """Return the scores of a score file in the form of scores.json, with its digits.
 
-    Of the references it has the best, in the ranking metric.
+    The only reference is the best one, and it has the ranking metric only.
     """
     statistics = read_score_file(path).scores
     submission: dict[str, Score] = {}
