@@ -273,7 +273,7 @@ def _unreadable(file: Path, expected: str, got: str) -> UnreadableFileError:
         where=str(file),
         expected=expected,
         got=got,
-        fix="name weights.pt or checkpoint.pt of a run, or an ONNX file",
+        fix="name weights.pt or checkpoint.pt of a run, a .safetensors or an ONNX file",
     )
 
 
@@ -405,8 +405,9 @@ def check_data(
             f"{trained.split}, which the model was trained on, is not there",
             where=where,
             expected="its data, or its description",
-            got=f"in {root}",
-            fix="name its folder: --root",
+            got=f"in {root}: no such split",
+            fix="name the folder of the local split: --split FOLDER; or the folder "
+            "that holds it: --root FOLDER",
         ) from error
     if size is None or size == trained.size:
         target = read_dataset_info(

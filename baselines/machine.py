@@ -7,14 +7,12 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from platform import machine as architecture
 from typing import Any
 
 import torch
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.work.machine import available_cores
+from lagbench.work.machine import available_cores, processor_name, read_processor
 
 
 def choose_device(name: str) -> str:
@@ -126,7 +124,7 @@ def hardware(device: str = "cpu") -> dict[str, Any]:
     if device == "cuda":
         device_name = torch.cuda.get_device_name()
     return {
-        "processor": _read_processor("model name") or architecture(),
+        "processor": processor_name(),
         "cores": available_cores(),
         "threads": torch.get_num_threads(),
         "device": device_name,
@@ -137,8 +135,8 @@ def multiplies_bfloat16(device: str) -> bool:
     """Return whether the device has instructions for products of bfloat16."""
     if device == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    flags = _read_processor("flags").split()  # of x86
-    flags += _read_processor("Features").split()  # of Arm
+    flags = read_processor("flags").split()  # of x86
+    flags += read_processor("Features").split()  # of Arm
     return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 
@@ -153,16 +151,3 @@ def check_compiler(device: str) -> None:
             got=f"no {compiler}",
             fix="install it, or leave the option out",
         )
-
-
-def _read_processor(field: str) -> str:
-    """Return a field of Linux's first processor; nothing on other systems."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return ""
-    for line in lines:
-        name, _, value = line.partition(":")
-        if name.strip() == field:
-            return value.strip()
-    return ""

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from lagbench.atomic import check_output_file, write_atomically
-from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.format import PREDICTIONS_SIGNS
@@ -91,6 +91,7 @@ def predict(
     *,
     overwrite: bool = False,
     root: str | Path | None = None,
+    split: str | Path | None = None,
     size: str | None = None,
     subset: str = "test",
     settings: Sequence[str] = (),
@@ -119,6 +120,8 @@ def predict(
             are never replaced.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
+        split: folder of the local split that the model was trained on, in place of
+            ``root``; or the name of the training's split.
         size: size of the split to predict; that of the training when None.
         subset: the subset to predict: test, or shift, which lies outside train.
         settings: changes of options that have no weights, as in ``model.average=true``.
@@ -138,10 +141,10 @@ def predict(
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or of another version than that of
             the training.
-        UsageError: the baseline is not installed, there is no such device, the weights
-            cannot be run at that size or with those settings, or the output would
-            replace predictions without ``overwrite``, or a file of another kind, such
-            as the weights.
+        UsageError: the baseline is not installed, there is no such device, the model
+            was trained on another split than ``split``, the weights cannot be run at
+            that size or with those settings, or the output would replace predictions
+            without ``overwrite``, or a file of another kind, such as the weights.
         WorkFailedError: out of memory, or the disk is full.
     """
     checkpoint_path = Path(checkpoint)
@@ -151,6 +154,8 @@ def predict(
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = resolve_root(root)
+    if split is not None:
+        root_folder = _locate_trained_split(split, trained, root, registry)
     known_splits = load_rooted_registry(root_folder, registry)
     where = str(checkpoint)
     info = check_data(
@@ -207,6 +212,26 @@ def predict(
     )
     _write_costs(result)
     return result
+
+
+def _locate_trained_split(
+    split: str | Path,
+    trained: Checkpoint,
+    root: str | Path | None,
+    registry: Registry | None,
+) -> Path:
+    """Return the root folder of a split, which must be that of the training."""
+    location = locate_split(split, root=root, registry=registry)
+    trained_split = trained.info.split
+    if location.name != trained_split:
+        raise UsageError(
+            "the model was trained on another split",
+            where="--split",
+            expected=trained_split,
+            got=location.name,
+            fix="leave it out, or name the folder of the local split of the training",
+        )
+    return location.root
 
 
 def _summarise(

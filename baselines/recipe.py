@@ -627,6 +627,16 @@ def validate_options(
             fix=suggest_name(str(unknown_key), known_keys, prefix=prefix),
         )
 
+    if detail["type"] == "missing":
+        raise error_class(
+            f"{key} is missing",
+            where=where,
+            expected=f"the key {key}",
+            got="no such key",
+            fix="add it; docs/baselines.md has the keys and their values, and a file "
+            "of recipes begins with the line format: 1",
+        )
+
     value = detail["input"]
     got = repr(value)
     is_type_error = detail["type"].endswith("_type")

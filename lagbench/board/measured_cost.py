@@ -21,6 +21,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.references.predictor import Given, Kind, ReferencePredictor, given_in
 from lagbench.references.table import references_of
 from lagbench.scoring.task import ScoredTask
+from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter
 
 from .entry import Entry, MeasuredCost
@@ -143,6 +144,4 @@ def time_reference(reference: ReferencePredictor, given: Given) -> float:
 
 def describe_processor() -> str:
     """Return the processor and that one thread ran on it."""
-    from lagbench.baselines.machine import hardware
-
-    return f"{hardware()['processor']}, 1 thread"
+    return f"{processor_name()}, 1 thread"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from lagbench.data.local import locate
+from lagbench.errors import format_count
 from lagbench.exchange.exporting import ExportResult, export
 
 from .options import (
@@ -82,7 +83,8 @@ def _describe(result: ExportResult) -> list[str]:
     lines = [f"{result.split} {result.size} as {result.format} in {result.folder}"]
     for subset, count in result.trajectories.items():
         frame_count = result.frames[subset]
-        lines.append(f"  {subset:<6}{count} trajectories, {frame_count} frames")
+        trajectories = format_count(count, "trajectory")
+        lines.append(f"  {subset:<6}{trajectories}, {frame_count} frames")
     if result.left_out:
         lines.append(
             f"  {result.left_out} frames left out: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -51,15 +52,17 @@ def require_libraries(names: tuple[str, ...]) -> None:
         )
 
 
-def root_option(split: str, root: Path | None) -> str:
-    """Return " --root FOLDER" for the next command, if it needs that to find the data.
+def data_option(split: str, root: Path | None) -> str:
+    """Return the option with which the next command finds the data.
 
-    It does where the user named a root, and for a local split.
+    It is " --root FOLDER" where the user named a root, and " --split FOLDER/" of a
+    local split. Else no option is needed.
     """
     location = locate_split(split, root=root)
     entry = location.registry.split(location.name)
     if root is not None:
         return f" --root {quote_root(root)}"
     if entry.generator == NO_GENERATOR:
-        return f" --root {quote_root(location.root)}"
+        folder = location.root / location.name
+        return f" --split {shlex.quote(str(folder))}/"
     return ""

@@ -99,6 +99,9 @@ FoundBoardOption = Annotated[
         "Folder of the leaderboard; by default leaderboard here, or else in the clone.",
     ),
 ]
+ScoredSubsetOption = Annotated[
+    str, option("--subset NAME", "test, or shift, which lies outside train.")
+]
 OverwriteFlag = Annotated[bool, option("--overwrite", "Replace a file of that name.")]
 JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]
 QuietFlag = Annotated[bool, option("--quiet -q", "Print errors only.")]

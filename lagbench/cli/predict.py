@@ -20,13 +20,21 @@ from .model_options import (
     ThreadsOption,
     require_libraries,
 )
-from .options import JsonFlag, OverwriteFlag, QuietFlag, RootOption, option
+from .options import (
+    JsonFlag,
+    OverwriteFlag,
+    QuietFlag,
+    RootOption,
+    ScoredSubsetOption,
+    option,
+)
 from .output import print_result, print_warning
 from .progress import progress_bar
 from .solver_bench import SolverBench, bench_apart
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
+    from lagbench.models.predict_onnx import OnnxPredictionResult
 
 WeightsArgument = Annotated[
     Path,
@@ -35,19 +43,17 @@ WeightsArgument = Annotated[
     ),
 ]
 PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]
-OnnxSplitOption = Annotated[
+PredictedSplitOption = Annotated[
     str | None,
     option(
         "--split NAME",
-        "Split to predict; only for an ONNX file, which does not state it.",
+        "Split to predict: the folder of a local split; or a name, for an ONNX file, "
+        "which does not state its split.",
     ),
 ]
 PredictedSizeOption = Annotated[
     str | None,
     option("--size NAME", "Size to predict; by default that of the training."),
-]
-SubsetOption = Annotated[
-    str, option("--subset NAME", "test, or shift, which lies outside train.")
 ]
 ModelChangesOption = Annotated[
     list[str] | None,
@@ -76,9 +82,9 @@ def predict_command(
     checkpoint: WeightsArgument,
     output: PredictionsOption = Path("predictions.nc"),
     overwrite: OverwriteFlag = False,
-    split: OnnxSplitOption = None,
+    split: PredictedSplitOption = None,
     size: PredictedSizeOption = None,
-    subset: SubsetOption = "test",
+    subset: ScoredSubsetOption = "test",
     settings: ModelChangesOption = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
@@ -93,46 +99,48 @@ def predict_command(
 
     The predictions go into a predictions.nc.
     """
+    solver_clock = _SolverClock(quiet=quiet)
+    time_solver = solver_clock if bench else None
     if checkpoint.suffix == ".onnx":
-        _predict_onnx(
+        check_regular(checkpoint)
+        _refuse_options_of_weights(
+            settings=settings, device=device, threads=threads, batch=batch
+        )
+        result = _predict_onnx(
             checkpoint,
             output,
             overwrite=overwrite,
             split=split,
             size=size,
+            subset=subset,
             method=method,
             root=root,
-            as_json=as_json,
+            time_solver=time_solver,
             quiet=quiet,
         )
+        lines = [
+            f"{result.path}: {result.method}, "
+            f"{format_count(result.scenarios, 'scenario')}, {result.frames} frames",
+            f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of "
+            "one thread, mean over all predicted frames",
+            *_describe_solver(result.seconds_per_frame, solver_clock.bench),
+            _next_command(result.path, split, root),
+        ]
+        value = {**vars(result), "solver": solver_clock.bench}
+        print_result(value, lines, as_json=as_json, quiet=quiet)
         return
-    if split is not None:
-        raise UsageError(
-            "weights state their split themselves",
-            where="--split",
-            expected="no such option, as the model is no ONNX file",
-            got=split,
-            fix="leave it out; --size chooses another size",
-        )
+
     require_libraries(PREDICTION_LIBRARIES)
     from lagbench.baselines.predict import predict
 
     is_replaced = output.is_file()
-    solver: SolverBench | None = None
-
-    def time_solver(split: str, size: str) -> float | None:
-        nonlocal solver
-        solver = _bench_solver(split, size, quiet=quiet)
-        if solver is None:
-            return None
-        return solver.seconds_per_frame
-
     with progress_bar(quiet=quiet) as progress:
-        result = predict(
+        prediction = predict(
             checkpoint,
             output,
             overwrite=overwrite,
             root=root,
+            split=split,
             size=size,
             subset=subset,
             settings=tuple(settings or ()),
@@ -140,12 +148,43 @@ def predict_command(
             threads=threads,
             batch=batch,
             method=method,
-            time_solver=time_solver if bench else None,
+            time_solver=time_solver,
             progress=progress,
         )
-    lines = _describe(result, solver=solver, is_replaced=is_replaced, root=root)
-    value = {**vars(result), "solver": solver}
-    print_result(value, lines, as_json=as_json, quiet=quiet)
+    solver = solver_clock.bench
+    description = [
+        *_describe(prediction, solver=solver, is_replaced=is_replaced),
+        _next_command(prediction.path, split, root),
+    ]
+    content = {**vars(prediction), "solver": solver}
+    print_result(content, description, as_json=as_json, quiet=quiet)
+
+
+def _refuse_options_of_weights(
+    *,
+    settings: list[str] | None,
+    device: str,
+    threads: int | None,
+    batch: int | None,
+) -> None:
+    """Refuse options that change nothing for an ONNX file."""
+    given: dict[str, object] = {}
+    if settings:
+        given["--set"] = " ".join(settings)
+    if device not in {"auto", "cpu"}:
+        given["--device"] = device
+    if threads not in {None, 1}:
+        given["--threads"] = threads
+    if batch is not None:
+        given["--batch"] = batch
+    for name, value in given.items():
+        raise UsageError(
+            "an ONNX file has no such option",
+            where=name,
+            expected="one thread of the CPU, a scenario at a time, the model as it is",
+            got=str(value),
+            fix="leave it out",
+        )
 
 
 def _predict_onnx(
@@ -155,15 +194,15 @@ def _predict_onnx(
     overwrite: bool,
     split: str | None,
     size: str | None,
+    subset: str,
     method: str | None,
     root: Path | None,
-    as_json: bool,
+    time_solver: _SolverClock | None,
     quiet: bool,
-) -> None:
+) -> OnnxPredictionResult:
     """Predict with an ONNX file, which does not state its split."""
     from lagbench.models.predict_onnx import predict_onnx
 
-    check_regular(model)
     if split is None:
         raise UsageError(
             "an ONNX file does not state its split",
@@ -173,24 +212,33 @@ def _predict_onnx(
             fix="name it: --split cavity --size mini",
         )
     with progress_bar(quiet=quiet) as progress:
-        result = predict_onnx(
+        return predict_onnx(
             model,
             output,
             overwrite=overwrite,
             split=split,
             size=size,
+            subset=subset,
             method=method,
             root=root,
+            time_solver=time_solver,
             progress=progress,
         )
-    lines = [
-        f"{result.path}: {result.method}, {result.scenarios} scenarios, "
-        f"{result.frames} frames",
-        f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of one "
-        "thread, mean over all predicted frames",
-        _next_command(result.path, root),
-    ]
-    print_result(result, lines, as_json=as_json, quiet=quiet)
+
+
+class _SolverClock:
+    """Times our solver when it is called, and keeps the result."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self.quiet = quiet
+        self.bench: SolverBench | None = None
+
+    def __call__(self, split: str, size: str) -> float | None:
+        """Return the time of a frame [s]; None where the solver cannot run."""
+        self.bench = _bench_solver(split, size, quiet=self.quiet)
+        if self.bench is None:
+            return None
+        return self.bench.seconds_per_frame
 
 
 def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:
@@ -214,7 +262,6 @@ def _describe(
     *,
     solver: SolverBench | None,
     is_replaced: bool,
-    root: Path | None,
 ) -> Iterator[str]:
     method_parts = [result.method]
     if result.trained_size != result.size:
@@ -227,23 +274,34 @@ def _describe(
     )
     if is_replaced:
         yield "  in place of the predictions that were there"
-    yield (
-        f"  model   {result.seconds_per_frame:.3g} s per frame "
-        f"({result.seconds_without_search:.3g} s without the neighbour search) "
-        f"on {result.device}"
-    )
+    cost = f"{result.seconds_per_frame:.3g} s per frame"
+    without_search = f"{result.seconds_without_search:.3g} s"
+    if not cost.startswith(without_search):
+        cost += f" ({without_search} without the neighbour search)"
+    yield f"  model   {cost} on {result.device}"
     yield f"          {_describe_clock(result)}"
-    if solver is not None:
-        yield (
-            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
-            f"machine: {_compare_speed(result, solver)}"
-        )
+    yield from _describe_solver(result.seconds_per_frame, solver)
     if result.diverged:
         marks = []
         for scenario, frame in result.diverged.items():
             marks.append(f"scenario {scenario} at frame {frame}")
         yield f"  frozen  {', '.join(marks)}: not finite from there on"
-    yield _next_command(result.path, root)
+
+
+def _describe_solver(
+    seconds_per_frame: float, solver: SolverBench | None
+) -> Iterator[str]:
+    """Yield the time of our solver, and how much faster one of both is."""
+    if solver is None:
+        return
+    ratio = seconds_per_frame / solver.seconds_per_frame
+    comparison = f"the model is {_format_ratio(1 / ratio)} times as fast"
+    if ratio > 1:
+        comparison = f"{_format_ratio(ratio)} times as fast as the model"
+    yield (
+        f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
+        f"machine: {comparison}"
+    )
 
 
 def _describe_clock(result: PredictionResult) -> str:
@@ -257,19 +315,14 @@ def _describe_clock(result: PredictionResult) -> str:
     return f"processor time of {threads}; {wall}"
 
 
-def _next_command(path: Path, root: Path | None) -> str:
+def _next_command(path: Path, split: str | None, root: Path | None) -> str:
     """Return the line that says how to score the predictions."""
-    root_option = ""
-    if root:
-        root_option = f" --root {quote_root(root)}"
-    return f"next: lagbench score {shlex.quote(str(path))}{root_option}"
-
-
-def _compare_speed(result: PredictionResult, solver: SolverBench) -> str:
-    ratio = result.seconds_per_frame / solver.seconds_per_frame
-    if ratio > 1:
-        return f"{_format_ratio(ratio)} times as fast as the model"
-    return f"the model is {_format_ratio(1 / ratio)} times as fast"
+    options = ""
+    if split is not None and split not in load().splits:
+        options = f" --split {shlex.quote(split)}"
+    elif root:
+        options = f" --root {quote_root(root)}"
+    return f"next: lagbench score {shlex.quote(str(path))}{options}"
 
 
 def _format_ratio(ratio: float) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,7 @@ from lagbench.board.season_table import (
 )
 from lagbench.errors import ChecksFailedError, UsageError, format_count
 from lagbench.figures.tables import Table
+from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL
 from lagbench.scoring.boards import board_option, find_board
 
 from .options import (
@@ -192,19 +194,35 @@ def run_command(
     }
     if result.comparison is not None:
         plain["comparison"] = result.comparison
-    lines = _describe_run(result, blind_entries)
+    unmeasured = []
+    for row in rows:
+        if math.isnan(row.low):
+            unmeasured.append(row.name)
+    lines = _describe_run(result, blind_entries, unmeasured)
     print_result(plain, lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
 
 def _describe_run(
-    result: SeasonResult, blind_entries: tuple[str, ...]
+    result: SeasonResult, blind_entries: tuple[str, ...], unmeasured: Sequence[str]
 ) -> Iterator[str]:
+    """Yield what was predicted, or compared; ``unmeasured`` gaps have no interval."""
     predicted = format_count(len(result.predicted), "model")
     if result.comparison is None:
-        yield f"{result.path}: {predicted} predicted, the rest was scored before"
+        frozen_count = 0
+        for data_set in result.scores.data_sets:
+            frozen_count += len(data_set.models)
+        earlier = ""
+        if len(result.predicted) < frozen_count:
+            earlier = f", {frozen_count - len(result.predicted)} scored before"
+        yield f"{result.path}: {predicted} predicted{earlier}"
         entries = format_count(len(blind_entries), "entry")
         yield f"verified.yaml: {entries} at level blind"
+        if unmeasured:
+            yield (
+                f"not in verified.yaml: {', '.join(unmeasured)}; with fewer than "
+                f"{FEWEST_FOR_INTERVAL} public or blind scenarios a gap has no interval"
+            )
         return
     comparison = result.comparison
     if comparison.has_same_bytes:

@@ -14,6 +14,7 @@ from .options import (
     PresentSizeOption,
     QuietFlag,
     RootOption,
+    ScoredSubsetOption,
     accept_split,
     option,
 )
@@ -24,6 +25,7 @@ from .output import format_bytes, print_result
 def template_command(
     split: str,
     size: PresentSizeOption = None,
+    subset: ScoredSubsetOption = "test",
     output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
         "predictions.nc"
     ),
@@ -33,7 +35,9 @@ def template_command(
     quiet: QuietFlag = False,
 ) -> None:
     """Write a valid predictions.nc for you to fill in; in it nothing moves."""
-    result = template(split, size, output=output, overwrite=overwrite, root=root)
+    result = template(
+        split, size, subset=subset, output=output, overwrite=overwrite, root=root
+    )
     first, last = result.frames
     scenarios = format_count(len(result.scenarios), "scenario")
     fewest, most = result.particle_range

@@ -23,8 +23,8 @@ from .model_options import (
     TRAINING_LIBRARIES,
     DeviceOption,
     ThreadsOption,
+    data_option,
     require_libraries,
-    root_option,
 )
 from .options import (
     JsonFlag,
@@ -158,7 +158,7 @@ def train_command(
             threads=threads,
             progress=progress,
         )
-    lines = _describe(result, root_option(split, root))
+    lines = _describe(result, data_option(split, root))
     print_result(result, lines, as_json=as_json, quiet=quiet)
 
 
@@ -214,7 +214,7 @@ def _has_mini(split: str) -> bool:
     return split in splits and "mini" in splits[split].sizes
 
 
-def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
+def _describe(result: TrainingResult, data_option: str) -> Iterator[str]:
     yield (
         f"{result.baseline} on {result.recipe}: {result.state}, "
         f"step {result.step} of {result.steps}, {_describe_time(result)}"
@@ -239,7 +239,7 @@ def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
             hint += "; try --size mini"
         yield hint
     weights = shlex.quote(str(result.weights))
-    yield f"next: lagbench predict {weights}{root_option} -o predictions.nc"
+    yield f"next: lagbench predict {weights}{data_option} -o predictions.nc"
 
 
 def _describe_time(result: TrainingResult) -> str:

@@ -301,7 +301,7 @@ class Size(BaseModel):
         description of a local split.
         """
         if self.draw_seed is not None:
-            return "the scores of the season"
+            return "scores.yaml of the season"
         if self.package_file:
             return f"{self.file.parent.name}/{self.file.name}"
         return self.file.name

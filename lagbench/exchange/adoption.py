@@ -16,7 +16,12 @@ from lagbench.arguments import check_arguments
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.structure import Structure, check_structure
-from lagbench.errors import ErrorCollector, UnreadableFileError, UsageError
+from lagbench.errors import (
+    ErrorCollector,
+    UnreadableFileError,
+    UsageError,
+    format_count,
+)
 from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.work.progress import Progress
 
@@ -212,8 +217,8 @@ def _divide_into_subsets(
             "each subset needs a trajectory",
             where="--valid and --test",
             expected="at least 3 trajectories: one each, and one left for train",
-            got=f"{len(rows)} trajectories, {valid_count} for valid, {test_count} for "
-            f"test",
+            got=f"{format_count(len(rows), 'trajectory')}, {valid_count} for valid, "
+            f"{test_count} for test",
             fix="name more files, or a .npy of shape [trajectory, frame, particle, "
             "axis]",
         )

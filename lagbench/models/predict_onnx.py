@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.atomic import check_output_file
-from lagbench.data.local import load_rooted_registry, locate, resolve_root
+from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.store.copy import scenario_files
 from lagbench.submission.format import PREDICTIONS_SIGNS
 from lagbench.submission.writer import PredictionsWriter
+from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress
 
 from .onnx_model import LEAST_SECONDS, open_onnx
@@ -30,6 +30,7 @@ class OnnxPredictionResult:
     frames: int  # frames of each
     seconds_per_frame: float  # processor time on one thread [s]
     parameters: int  # numbers in the initialisers of the model
+    solver_seconds_per_frame: float | None  # our solver's time on one core [s]
 
 
 def predict_onnx(
@@ -39,40 +40,44 @@ def predict_onnx(
     overwrite: bool = False,
     split: str,
     size: str | None = None,
+    subset: str = "test",
     method: str | None = None,
     seed: int = 0,
     root: str | Path | None = None,
     registry: Registry | None = None,
+    time_solver: Callable[[str, str], float | None] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> OnnxPredictionResult:
-    """Predict every test scenario with an ONNX model, in child processes with limits.
+    """Predict a subset with an ONNX model, in child processes with limits.
 
     Args:
         model: the ONNX file, docs/submitting.md describes it.
         output: the predictions.nc to write.
         overwrite: whether to replace predictions of that name; files of another kind,
             such as the model, are never replaced.
-        split: name of the split.
+        split: name of the split, or the folder of a local one.
         size: name of the size; the only one that is there when None.
+        subset: the subset to predict: test, or shift, which lies outside train.
         method: name of the method; by default the stem of the file.
         seed: seed of the training.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         registry: where splits are described; ours when None.
+        time_solver: function that returns the solver's time for a frame of a split and
+            size on one core of this machine [s], or None where it cannot run; called
+            after the rollouts.
         progress: called as the work advances.
 
     Raises:
-        UsageError: no such split or size, there is such a file, or onnx is not
+        UsageError: no such split, size or subset, there is such a file, or onnx is not
             installed.
         UnreadableFileError: the model is refused, or cannot be run.
-        DataError: the test subset is missing.
+        DataError: the subset is missing.
         WorkFailedError: the model needs more time or memory than allowed.
     """
     check_output_file(Path(output), overwrite=overwrite, signs=PREDICTIONS_SIGNS)
-    root_folder = resolve_root(root)
-    known = load_rooted_registry(root_folder, registry)
-    tier, folder, _ = locate(split, size, root=root, registry=known)
+    tier, folder, known = locate(split, size, root=root, registry=registry)
+    paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(Path(model), size=tier, root=folder)
-    paths = scenario_files(tier, folder, ("test",))
     label = method or Path(model).stem
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
@@ -81,11 +86,12 @@ def predict_onnx(
         split=tier.split,
         size=tier.name,
         method=label,
-        root=root_folder,
+        subset=subset,
+        root=folder,
         registry=known,
         seed=seed,
         parameters=runner.parameters,
-        device=f"{platform.processor() or platform.machine()}, 1 thread",
+        device=f"{processor_name()}, 1 thread",
     )
     seconds = 0.0
     with writer:
@@ -96,6 +102,11 @@ def predict_onnx(
             meter.count(1, scenarios=1)
         seconds_per_frame = seconds / (len(paths) * tier.task.horizon)
         writer.label(seconds_per_frame=seconds_per_frame)
+        solver_seconds = None
+        if time_solver is not None:
+            solver_seconds = time_solver(tier.split, tier.name)
+        if solver_seconds is not None:
+            writer.label(solver_seconds_per_frame=solver_seconds)
     return OnnxPredictionResult(
         path=Path(output),
         split=tier.split,
@@ -105,4 +116,5 @@ def predict_onnx(
         frames=tier.task.horizon,
         seconds_per_frame=seconds_per_frame,
         parameters=runner.parameters,
+        solver_seconds_per_frame=solver_seconds,
     )

@@ -69,7 +69,7 @@ class ScoreCard:
     def __repr__(self) -> str:
         """Return method, ranking metric and skill; the values are too many."""
         header = self.header
-        subject = f"{header.method!r} on {header.split} {header.size}"
+        subject = f"{header.method!r} on {self.data_name}"
         ranking = f"{self.ranking} {self.submission[self.ranking].mean:.4g}"
         return f"<{type(self).__name__}: {subject}, {ranking}, skill {self.skill}>"
 
@@ -85,8 +85,16 @@ class ScoreCard:
                 cell += f" [{low:.3g}, {high:.3g}]"
             lines.append((f"{name} [{score.metric.unit}]", cell))
         rows = [tag("tr", *(tag("td", cell) for cell in line)) for line in lines]
-        caption = f"{header.method} on {header.split} {header.size}"
+        caption = f"{header.method} on {self.data_name}"
         return str(tag("table", tag("caption", caption), *rows))
+
+    @property
+    def data_name(self) -> str:
+        """Split and size of the predictions, and their subset if it is not test."""
+        name = f"{self.header.split} {self.header.size}"
+        if self.header.subset != "test":
+            name += f" {self.header.subset}"
+        return name
 
     @property
     def chosen_metrics(self) -> list[str]:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.arguments import check_arguments
+from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, locate_split, suggest_split_of
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
@@ -308,6 +309,7 @@ def compare(
     if not is_reference:
         _check_overlap(between, one, two)
     comparisons = _compare_metrics(one, two, metrics)
+    _check_scenarios(between, one, two)
     return _describe(one, two, comparisons, is_reference=is_reference)
 
 
@@ -552,6 +554,22 @@ def _check_overlap(where: str, one: Contestant, two: Contestant) -> None:
             expected="different trainings of the two methods",
             got=f"{len(shared)} in common",
             fix="compare seeds of one method with those of another",
+        )
+
+
+def _check_scenarios(where: str, one: Contestant, two: Contestant) -> None:
+    """Refuse predictions of two subsets: they have no scenario in common."""
+    of_one = one.scores[one.ranking][0].scenarios
+    of_two = two.scores[one.ranking][0].scenarios
+    if set(of_one).isdisjoint(of_two):
+        raise UsageError(
+            "the two methods have no scenario in common",
+            where=where,
+            expected=f"scenarios {format_ids(of_one)}",
+            got=f"scenarios {format_ids(of_two)}",
+            fix="compare predictions of one subset; entries of the leaderboard are "
+            "predictions of test, so predict with --subset test, or with --subset "
+            "shift both times",
         )
 
 

@@ -142,9 +142,8 @@ def _over_horizon(
             means.append(_mean_cell(card, row, name))
         rows.append((_label(score.metric), cell, *means))
 
-    header = card.header
-    task = f"{header.split} {header.size}, {card.config.horizon} frames"
-    title = f"{header.method} on {task}, mean over scenarios"
+    task = f"{card.data_name}, {card.config.horizon} frames"
+    title = f"{card.header.method} on {task}, mean over scenarios"
     heads = [_break_name(row) for row in references]
     return Table(title, ("metric", f"{SUBMISSION} [95 %]", *heads), tuple(rows))
 

@@ -604,6 +604,7 @@ def template(
     split: str | Path,
     size: str | None = None,
     *,
+    subset: str = "test",
     output: str | Path = "predictions.nc",
     overwrite: bool = False,
     root: str | Path | None = None,
@@ -615,20 +616,22 @@ def template(
         split: name of the split.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
+        subset: the subset to predict: test, or shift, which lies outside train.
         output: file to write.
         overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split or size, or there is such a file.
-        DataError: test scenarios are missing or damaged, or their data set has no
-            recorded hash.
+        UsageError: unknown split, size or subset, or there is such a file.
+        DataError: scenarios of the subset are missing or damaged, or their data set
+            has no recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
-    entry, folder, splits = locate(split, size, root=root, registry=registry)
+    any_size, folder, splits = locate(split, size, root=root, registry=registry)
+    entry = any_size.scored_on(subset)
     check_output_file(Path(output), overwrite=overwrite)
-    update_working_copy(entry, folder, entry.subsets["test"])
+    update_working_copy(entry, folder, entry.subsets[subset])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
@@ -636,10 +639,11 @@ def template(
         split=entry.split,
         size=entry.name,
         method="persistence",
+        subset=subset,
         root=folder,
         registry=splits,
     )
-    scenarios = tuple(sorted(entry.subsets["test"]))
+    scenarios = tuple(sorted(entry.subsets[subset]))
     particle_counts = []
     with writer:
         for scenario in scenarios:

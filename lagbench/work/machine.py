@@ -29,6 +29,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from lagbench.errors import UsageError, WorkFailedError
@@ -102,6 +103,24 @@ def may_differ(device: str, environments: Iterable[Mapping[str, str]]) -> bool:
         if environment.get("device") == device and not promises_bits(environment):
             return True
     return False
+
+
+def processor_name() -> str:
+    """Return the model of the processor, or its kind where the system tells no more."""
+    return read_processor("model name") or platform.machine()
+
+
+def read_processor(field: str) -> str:
+    """Return a field of Linux's first processor; nothing on other systems."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return ""
+    for line in lines:
+        name, _, value = line.partition(":")
+        if name.strip() == field:
+            return value.strip()
+    return ""
 
 
 def available_cores() -> int:

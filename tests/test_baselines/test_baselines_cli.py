@@ -19,17 +19,19 @@ import netCDF4
 import pytest
 import torch
 from click.testing import Result
+from hostile_onnx import straight_on
 from turns import of_this_turn
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
-from lagbench.cli.model_options import root_option
+from lagbench.cli.model_options import data_option
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.submission.validation import validate
+from lagbench.work.machine import processor_name
 
 Command = Callable[..., Result]
 
@@ -228,6 +230,81 @@ def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
     result = lagbench("predict", str(weights))
     assert result.exit_code == 4
     assert "another version" in result.stderr
+
+
+def test_an_onnx_file_predicts_what_the_options_ask_for(
+    lagbench: Command, tmp_path: Path
+) -> None:
+    """The subset and the clock of the solver count; options of other models are
+    refused.
+    """
+    straight_on(tmp_path / "lines.onnx")
+    command = ("predict", "lines.onnx", "--split", "curl-noise", "--size", "tiny")
+    no_shift = lagbench(*command, "--subset", "shift")
+    assert no_shift.exit_code == 2
+    assert "no subset 'shift'" in no_shift.stderr
+    for words in (
+        ("--set", "model.average=true"),
+        ("--batch", "2"),
+        ("--device", "cuda"),
+        ("--threads", "2"),
+    ):
+        refused = lagbench(*command, *words)
+        assert refused.exit_code == 2
+        assert f"where: {words[0]}" in refused.stderr
+    predicted = lagbench(*command, "--no-bench", "--device", "cpu", "--threads", "1")
+    assert predicted.exit_code == 0, predicted.output
+    assert "next: lagbench score predictions.nc\n" in predicted.stdout
+    with netCDF4.Dataset("predictions.nc") as data:
+        assert data.getncattr("device") == f"{processor_name()}, 1 thread"
+
+
+@pytest.mark.slow
+def test_an_onnx_file_is_timed_beside_the_solver(
+    lagbench: Command, tmp_path: Path
+) -> None:
+    """The predictions state both times, so an entry can be compared with solvers."""
+    straight_on(tmp_path / "lines.onnx")
+    predicted = lagbench(
+        "predict", "lines.onnx", "--split", "curl-noise", "--size", "tiny"
+    )
+    assert predicted.exit_code == 0, predicted.output
+    assert "the model is" in predicted.stdout
+    with netCDF4.Dataset("predictions.nc") as data:
+        solver_seconds = data.getncattr("solver_seconds_per_frame")
+        seconds = data.getncattr("seconds_per_frame")
+    assert 0 < seconds < solver_seconds
+
+
+def test_a_local_split_is_predicted_by_its_folder(
+    lagbench: Command, original: LocalSplit, tmp_path: Path
+) -> None:
+    """--split names the folder, for weights and for ONNX; another split is refused."""
+    folder = f"{original.folder}/"
+    recipe = "{format: 1, recipes: {own/full: {training: {steps: 1}}}}"
+    (tmp_path / "recipe.yaml").write_text(recipe)
+    trained = lagbench(
+        *("train", "--baseline", "mlp", "--split", folder, "--threads", "1"),
+        *("--recipe", "recipe.yaml", "--set", "training.validate_every=0", "-o", "run"),
+    )
+    assert trained.exit_code == 0, trained.output
+    assert f"next: lagbench predict run/weights.pt --split {folder} " in trained.stdout
+    weights = ("predict", "run/weights.pt", "--threads", "1", "--overwrite")
+    lost = lagbench(*weights)
+    assert lost.exit_code == 4
+    assert "--split FOLDER" in lost.stderr
+    straight_on(tmp_path / "lines.onnx")
+    for words in (weights, ("predict", "lines.onnx", "--overwrite")):
+        predicted = lagbench(*words, "--split", folder)
+        assert predicted.exit_code == 0, predicted.output
+        assert f"next: lagbench score predictions.nc --split {folder}" in (
+            predicted.stdout
+        )
+        root = original.folder.parent
+        assert validate("predictions.nc", root=root, isolated=False).valid
+    other = lagbench(*weights, "--split", "curl-noise")
+    assert other.exit_code == 2
+    assert "where: --split" in other.stderr
 
 
 @pytest.mark.filterwarnings("default")
@@ -450,4 +527,4 @@ def test_a_root_with_a_space_is_quoted_in_the_next_command(tmp_path: Path) -> No
     """A reader copies the command as it stands."""
     root = tmp_path / "my data"
     root.mkdir()
-    assert shlex.split(root_option("cavity", root)) == ["--root", str(root)]
+    assert shlex.split(data_option("cavity", root)) == ["--root", str(root)]

@@ -428,6 +428,7 @@ def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
             "did you mean 'gns'",
         ),
         ("[1, 2]", "the file does not fit"),
+        ("{recipes: {cavity/tiny: {}}}", "format is missing"),
         ("{format: 1, a: &x 1, b: *x}", "aliases"),
     ],
 )

@@ -422,6 +422,11 @@ def test_the_commands_say_what_is_wrong(
     table = run("season", "show", SEASON, "--board", own.folder)
     assert table.stdout.count("entry") == 1
     (own.folder / "seasons" / SEASON / "scores.yaml").unlink()
+    rerun = run("season", "run", SEASON, "--threads", 1, *board)
+    assert rerun.exit_code == 0, rerun.output
+    # its two public scenarios give no interval
+    assert f"not in verified.yaml: {NAME}" in rerun.stdout
+    (own.folder / "seasons" / SEASON / "scores.yaml").unlink()
     early = run("season", "show", SEASON, "--board", own.folder)
     assert early.exit_code == 1
     assert f"generate --season {SEASON} --board {own.folder}" in early.stderr

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from hostile_onnx import straight_on
 from model_board import ModelBoard, make_bench
 from typer.testing import Result
 
@@ -22,9 +23,12 @@ from lagbench.board.shift_run import score_on_shift
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
+from lagbench.figures.report.report import write_report
 from lagbench.make.generate import GenerationResult
+from lagbench.models.predict_onnx import predict_onnx
 from lagbench.references.shipped import shipped
 from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.submission.predictions import open_predictions
 
 pytestmark = pytest.mark.slow
 """Their leaderboard takes ten seconds to make."""
@@ -69,6 +73,12 @@ def test_the_values_are_those_of_predict_and_score(
         threads=1,
     )
     card = lagbench.score(path, root=run_board.root, workers=1)
+    assert f"{SPLIT} tiny shift" in repr(card)
+    page = write_report(tmp_path / "report", [card], [path], root=run_board.root)
+    assert f"on {SPLIT} tiny shift" in page.read_text()
+    with pytest.raises(UsageError) as caught:
+        lagbench.compare(path, "gns", board=run_board.folder, root=run_board.root)
+    assert "--subset" in caught.value.fix
     expected = card.scores[SUBMISSION][card.ranking]
     line = read_shift(Folder(run_board.folder))[PATH]
     (one,) = line.models
@@ -76,6 +86,41 @@ def test_the_values_are_those_of_predict_and_score(
     assert tuple(one.values) == expected.scenarios
     values = list(one.values.values())
     assert values == pytest.approx(expected.values, rel=1e-6)
+
+
+def test_an_onnx_file_predicts_shift(run_board: ModelBoard, tmp_path: Path) -> None:
+    """The scenarios of the file are those of shift, and the file says so."""
+    path = tmp_path / "shift.nc"
+    predict_onnx(
+        straight_on(tmp_path / "lines.onnx"),
+        path,
+        split=SPLIT,
+        size="tiny",
+        subset="shift",
+        root=run_board.root,
+    )
+    with open_predictions(path) as predictions:
+        header = predictions.header
+    assert header.subset == "shift"
+    assert set(header.scenarios) == set(load().size(SPLIT, "tiny").subsets["shift"])
+
+
+def test_a_template_of_shift_is_scored_there(
+    run_board: ModelBoard, tmp_path: Path
+) -> None:
+    """In another language, models of shift begin with a template too."""
+    path = tmp_path / "template.nc"
+    made = lagbench.template(
+        SPLIT, "tiny", subset="shift", output=path, root=run_board.root
+    )
+    size = load().size(SPLIT, "tiny")
+    assert set(made.scenarios) == set(size.subsets["shift"])
+    card = lagbench.score(path, root=run_board.root, workers=1)
+    assert card.header.subset == "shift"
+    with pytest.raises(UsageError):
+        lagbench.template(
+            "cavity", "tiny", subset="shift", output=path, root=run_board.root
+        )
 
 
 def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:

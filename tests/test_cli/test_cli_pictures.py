@@ -55,6 +55,10 @@ def test_python_draws_the_same_picture(
     lagbench.plot(file, output=pictures[1], **options)
     words = ("plot", file, "--frame", 5, "--kind", "speed", "-o", pictures[2])
     assert run(*words).exit_code == 0
+    with pytest.raises(UsageError) as caught:
+        lagbench.plot(file, output=pictures[1], **options)
+    assert "overwrite" in caught.value.fix
+    lagbench.plot(file, output=pictures[1], overwrite=True, **options)
     assert len({picture.read_bytes() for picture in pictures}) == 1
     with pytest.raises(UsageError):
         lagbench.animate(file, beside=4, output=tmp_path / "none" / "film.gif")
@@ -212,6 +216,8 @@ def test_whole_numbers_of_numpy_name_scenarios_and_steps(
         quiet=True,
     )
     assert film.is_file()
+    with pytest.raises(UsageError):
+        lagbench.animate(SPLIT, size=SIZE, root=generated.root, output=film)
 
 
 @pytest.mark.parametrize(("option", "number"), [("--scenario", 4), ("--frame", 5)])

@@ -91,12 +91,12 @@ def _draw_scenarios(subject: Subject, number: int, name: str) -> ReportFigure:
     last = subject.frames[-1]
     drawn = plot.svg(
         f"{score.metric.name} over frames",
-        f"Lines of {len(series)} test scenarios of {entry.name} from frame {first} to "
+        f"Lines of {len(series)} scenarios of {entry.name} from frame {first} to "
         f"{last}.",
     )
 
-    title = f"{words(name, capital=True)}, every test scenario"
-    caption = f"{sentence(score.metric)} One line per test scenario."
+    title = f"{words(name, capital=True)}, every scenario"
+    caption = f"{sentence(score.metric)} One line per scenario."
     if len(subject.entries) > 1:
         title += f": {entry.name}"
         caption += " The axis is shared by all files."
@@ -112,7 +112,7 @@ def _draw_scenarios(subject: Subject, number: int, name: str) -> ReportFigure:
 
 def method_curves(subject: Subject) -> Iterator[ReportFigure]:
     """Yield means over scenarios with their intervals, by method (Fig. 5.11)."""
-    note = f"Mean over {len(subject.scenarios)} test scenarios"
+    note = f"Mean over {len(subject.scenarios)} scenarios"
     if len(subject.scenarios) >= FEWEST_FOR_INTERVAL:
         note += "; the bands are 95 % bootstrap intervals over scenarios"
     note += ". Grey: reference predictors, which learn nothing."
@@ -246,7 +246,7 @@ def _retained_energy(subject: Subject) -> ReportFigure:
         title="Kinetic energy kept",
         thesis="Fig. 5.19",
         caption="Kinetic energy relative to the last given frame, mean over "
-        f"{len(subject.scenarios)} test scenarios. A surrogate that damps falls below "
+        f"{len(subject.scenarios)} scenarios. A surrogate that damps falls below "
         "the truth, one that blows up rises above it; more energy than the truth is no "
         "merit.",
     )

@@ -91,7 +91,7 @@ def _bar_figure(
         title=whole_title,
         thesis=thesis,
         body=drawn,
-        caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios "
+        caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} scenarios "
         f"at frame {frame}, dots are the scenarios of entries. {better} is better; "
         f"perfect is {metric.perfect:g}. A dash means undefined, as for a prediction "
         "at rest.",

@@ -258,7 +258,7 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
         columns.append(join([f"scenario {moment.scenario}", *details], tag("br")))
     return ReportFigure(
         name="every-scenario",
-        title=f"Every test scenario at frame {frame}",
+        title=f"Every scenario at frame {frame}",
         thesis="Figs. 5.26, 5.27",
         body=draw_panel_grid(columns, rows, width=5.0),
         caption=f"{what}; each column has a colour scale of its own, set by its "

@@ -38,7 +38,7 @@ OPEN_SECTIONS = 2
 """Sections that are unfolded when the page is opened: the scores and the rollout."""
 
 FOOT = (
-    "Intervals are 95 % bootstrap intervals over test scenarios. Velocity and "
+    "Intervals are 95 % bootstrap intervals over scenarios. Velocity and "
     "vorticity are per frame; lengths are in units of the box. This page is one file "
     "and asks nothing of the network."
 )
@@ -148,7 +148,7 @@ def _score_tables(subject: Subject) -> Markup:
     ranking = subject.ranking.name
     parts = [
         paragraph(
-            "Mean over the horizon and the test scenarios, 95 % interval below; bold "
+            "Mean over the horizon and the scenarios, 95 % interval below; bold "
             "is best."
         ),
         tables.score_table(subject),
@@ -156,7 +156,7 @@ def _score_tables(subject: Subject) -> Markup:
         tables.ranking_table(subject),
         tag("h4", f"At frame {subject.key_frame}"),
         tables.frame_table(subject),
-        tag("h4", f"{words(ranking, capital=True)} per test scenario"),
+        tag("h4", f"{words(ranking, capital=True)} per scenario"),
         tables.scenario_table(subject),
         tag("h4", "Flags and warnings"),
         summary.draw_flags(subject),
@@ -166,8 +166,7 @@ def _score_tables(subject: Subject) -> Markup:
 
 def _metric_tables(subject: Subject) -> Markup:
     lead = paragraph(
-        "Means over the horizon and the test scenarios, with 95 % intervals; bold is "
-        "best."
+        "Means over the horizon and the scenarios, with 95 % intervals; bold is best."
     )
     return join([lead, tables.every_metric(subject)])
 

@@ -39,7 +39,7 @@ TIMES = 6  # columns of the pictures over time
 
 TOP_PERCENTILE = 99.5  # full colour is this percentile of the truth's magnitudes
 
-SAME_FIELDS = ("split", "size", "dataset_version", "dataset_sha256")
+SAME_FIELDS = ("split", "size", "subset", "dataset_version", "dataset_sha256")
 """Fields of the header that all entries of a report share."""
 
 
@@ -72,7 +72,7 @@ class ReportRow:
 class Subject:
     """All that the figures are drawn from."""
 
-    task: ScoredTask  # the test subset
+    task: ScoredTask  # the predicted subset
     title: str  # title of the split
     entries: tuple[ReportEntry, ...]  # in the order in which the files were given
 
@@ -125,13 +125,18 @@ class Subject:
         return rows[int(np.argmin(finite_losses))]
 
     @property
+    def data_name(self) -> str:
+        """Split and size, and the subset if it is not test."""
+        return self.entries[0].card.data_name
+
+    @property
     def is_full_box(self) -> bool:
         """Whether one fluid fills the box; else the material has a free surface."""
         return self.task.config.is_full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
-        """Ids of the test scenarios, ascending."""
+        """Ids of the scenarios, ascending."""
         return self.task.scenarios
 
     @property
@@ -207,7 +212,7 @@ def load_subject(
 
     Raises:
         UsageError: there is no entry, or entries do not belong together.
-        DataError: the test subset is missing or damaged.
+        DataError: the predicted subset is missing or damaged.
     """
     if not cards or len(cards) != len(predictions):
         raise UsageError(
@@ -221,7 +226,8 @@ def load_subject(
     header = cards[0].header
     folder = resolve_root(root)
     splits = load_rooted_registry(folder, registry)
-    task = load_scored_task(splits.size(header.split, header.size), folder)
+    size = splits.size(header.split, header.size).scored_on(header.subset)
+    task = load_scored_task(size, folder)
 
     methods = [card.header.method for card in cards]
     names = number_methods(methods, taken=cards[0].scores)

@@ -46,8 +46,7 @@ NARROW_SPACE = "\u202f"
 
 def format_title(subject: Subject) -> str:
     """Return the title of the window."""
-    size = subject.task.size
-    return f"{', '.join(subject.names)} on {size.split} {size.name}"
+    return f"{', '.join(subject.names)} on {subject.data_name}"
 
 
 def draw_head(subject: Subject) -> Markup:
@@ -56,11 +55,12 @@ def draw_head(subject: Subject) -> Markup:
     header = subject.entries[0].card.header
     config = subject.task.config
     intro = (
-        f"Given {config.input_frames} frames of each of {len(subject.scenarios)} test "
-        f"scenarios, predict the next {config.horizon}. {subject.title}, "
-        f"{size.particles} particles, data set version {header.dataset_version}."
+        f"Given {config.input_frames} frames of each of {len(subject.scenarios)} "
+        f"{header.subset} scenarios, predict the next {config.horizon}. "
+        f"{subject.title}, {size.particles} particles, data set version "
+        f"{header.dataset_version}."
     )
-    brand = f"lagbench · score report · {size.split} {size.name}"
+    brand = f"lagbench · score report · {subject.data_name}"
     parts = [
         tag("p", brand, class_="brand"),
         tag("h1", " · ".join(subject.names)),
