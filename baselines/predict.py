@@ -161,6 +161,7 @@ def predict(
     info = check_data(
         trained, root=root_folder, registry=known_splits, size=size, where=where
     )
+    known_splits.size(info.split, info.size).scored_on(subset)
     machine = choose_device(device)
     bound_memory()
     tests = scenario_paths(

@@ -268,7 +268,8 @@ class Size(BaseModel):
                 where=f"{self.split} {self.name}",
                 expected=" or ".join(choices),
                 got=ascii(subset),
-                fix=suggest_name(subset, choices),
+                fix=f"{suggest_name(subset, choices)}; `lagbench info {self.split}` "
+                "shows the subsets of each size",
             )
         return self.model_copy(update={"scored_subset": subset})
 

@@ -75,7 +75,8 @@ def predict_onnx(
         WorkFailedError: the model needs more time or memory than allowed.
     """
     check_output_file(Path(output), overwrite=overwrite, signs=PREDICTIONS_SIGNS)
-    tier, folder, known = locate(split, size, root=root, registry=registry)
+    any_tier, folder, known = locate(split, size, root=root, registry=registry)
+    tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(Path(model), size=tier, root=folder)
     label = method or Path(model).stem

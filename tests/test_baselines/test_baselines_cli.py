@@ -242,7 +242,7 @@ def test_an_onnx_file_predicts_what_the_options_ask_for(
     command = ("predict", "lines.onnx", "--split", "curl-noise", "--size", "tiny")
     no_shift = lagbench(*command, "--subset", "shift")
     assert no_shift.exit_code == 2
-    assert "no subset 'shift'" in no_shift.stderr
+    assert "no scored subset 'shift'" in no_shift.stderr
     for words in (
         ("--set", "model.average=true"),
         ("--batch", "2"),
