@@ -9,9 +9,14 @@ it damps what its grid hardly sees. The textbook solver of
 :mod:`lagbench.references.projection` does not; a, b and c say by how much it should.
 With all three 0 the model is that solver, up to the rounding of float32.
 
+In a channel with a fixed body there is a fourth coefficient d: the fluid stops within
+the radius (1 + d) R of the centre, where R is the radius of the body. On their grids
+both solvers stop the fluid at points inside the body only, so each has a body of its
+own size. Particles stay outside of R.
+
 The coefficients are fitted to rollouts of the solver over many frames of ``train``: a
 solver with a learned part that is trained through its own steps (Um et al. 2020,
-arXiv 2007.00016; Kochkov et al. 2021, PNAS 118). Three numbers need no gradient: the
+arXiv 2007.00016; Kochkov et al. 2021, PNAS 118). So few numbers need no gradient: the
 simplex method of Nelder and Mead (1965) finds them. The error that they minimise is
 that of the vorticity on the score grid, seen through the particles of the truth: a
 finer grid has about one particle a cell, and there sampling noise hides the error.
@@ -31,8 +36,12 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from lagbench.data.box import Box
+from lagbench.data.obstacle import keep_outside
+from lagbench.data.registry import Size
+from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UsageError
-from lagbench.references.staggered import StaggeredGrid, Velocity
+from lagbench.references.projection import forcing_of
+from lagbench.references.staggered import Forcing, StaggeredGrid, Velocity
 
 from .baseline import Batch, DatasetInfo, Options
 from .hybrid import Hybrid
@@ -42,7 +51,9 @@ Floats = NDArray[np.float64]
 STABLE_DECAY = 1.6
 """Time step times the fastest rate of decay, at most; Heun's scheme allows 2."""
 
-FIRST_STEP = 0.02  # of the simplex method, in each coefficient
+CLOSURE = 3  # number of the coefficients a, b, c
+FIRST_STEP = 0.02  # of the simplex method, in a, b and c
+FIRST_RADIUS_STEP = 0.1  # the same in d: less moves no point of the grid out of the body
 LARGEST = 2.0  # magnitude of a coefficient; more would need very many time steps
 WORST_ERROR = 10.0  # error of coefficients with which the solver breaks down
 
@@ -55,12 +66,19 @@ class ClosedGrid(StaggeredGrid):
         cells: cells along each axis.
         no_slip: whether walls hold the fluid.
         hyperviscosity: mu [length^4/s].
+        forcing: what draws the velocity to given values; None for nothing.
     """
 
     def __init__(
-        self, box: Box, *, cells: Sequence[int], no_slip: bool, hyperviscosity: float
+        self,
+        box: Box,
+        *,
+        cells: Sequence[int],
+        no_slip: bool,
+        hyperviscosity: float,
+        forcing: Forcing | None = None,
     ) -> None:
-        super().__init__(box, cells=cells, no_slip=no_slip)
+        super().__init__(box, cells=cells, no_slip=no_slip, forcing=forcing)
         self.hyperviscosity = hyperviscosity
 
     def acceleration(
@@ -130,6 +148,7 @@ class WindowForcing:
     # acceleration of the fluid in layers [length/s^2], shape [frame, layer, axis]; None
     # without a force
     forces: Floats | None
+    obstacle: Floats | None  # centre and radius [length], shape [axis + 1]
 
     @classmethod
     def of(cls, batch: Batch, window: int) -> WindowForcing:
@@ -141,7 +160,10 @@ class WindowForcing:
         forces = None
         if batch.body_force is not None:
             forces = batch.body_force[window].double().cpu().numpy()
-        return cls(walls=walls, forces=forces)
+        obstacle = None
+        if batch.obstacle is not None:
+            obstacle = batch.obstacle[window].double().cpu().numpy()
+        return cls(walls=walls, forces=forces, obstacle=obstacle)
 
     @property
     def has_moving_walls(self) -> bool:
@@ -278,12 +300,18 @@ class HybridProjection(Hybrid):
 
     def __init__(self, options: HybridOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        self.register_buffer("coefficients", torch.zeros(3))  # a, b, c
+        self.channel = _find_channel(info)
+        count = CLOSURE
+        if self.channel is not None:
+            count += 1
+        self.register_buffer("coefficients", torch.zeros(count))  # a, b, c and d
 
     @property
     def forcing_seen(self) -> frozenset[str]:
-        """The force that drives the flow; no obstacle."""
-        return frozenset({"body_force"})
+        """The force that drives the flow, and the obstacle of a channel."""
+        if self.channel is None:
+            return frozenset({"body_force"})
+        return frozenset({"body_force", "obstacle"})
 
     # --- the solver ---------------------------------------------------------------
 
@@ -314,6 +342,7 @@ class HybridProjection(Hybrid):
             cells=self._cell_counts(self.options.resolution),
             no_slip=forcing.has_moving_walls,
             hyperviscosity=hyperviscosity,
+            forcing=self._forcing(forcing.obstacle, coefficients),
         )
         frames = given.position[is_inside].double().cpu().numpy()
         before = frames[:, -2]
@@ -340,6 +369,17 @@ class HybridProjection(Hybrid):
         field = flow.later_field(frame=last_frame, duration=0.5 * interval)
         return replace(flow, field=field)
 
+    def _forcing(
+        self, obstacle: Floats | None, coefficients: Floats
+    ) -> Forcing | None:
+        """Return the fringe of a channel and its body, with the radius (1 + d) R."""
+        if self.channel is None or obstacle is None:
+            return None
+        relative_change = float(coefficients[CLOSURE])  # d
+        body = obstacle.copy()
+        body[-1] *= max(0.0, 1.0 + relative_change)
+        return forcing_of(self.channel, body)
+
     def _closure(
         self, given: Batch, window: int, coefficients: Floats
     ) -> tuple[float, float]:
@@ -354,7 +394,7 @@ class HybridProjection(Hybrid):
             )
         # In float64, as the solver computes: its steps may hang on the last digit.
         stated = float(given.viscosity[window])
-        relative, added, hyper = coefficients.tolist()  # a, b, c
+        relative, added, hyper = coefficients[:CLOSURE].tolist()  # a, b, c
         cell_counts = np.asarray(self._cell_counts(self.options.resolution))
         cell_lengths = self.info.box.lengths / cell_counts
         spacing = float(cell_lengths.min())
@@ -400,6 +440,9 @@ class HybridProjection(Hybrid):
             duration=interval,
             wall_velocity=flow.forcing.wall_velocity(next_frame),
         )
+        if flow.forcing.obstacle is not None:
+            position = flow.grid.box.inside(position)
+            position = keep_outside(position, flow.forcing.obstacle)
         return replace(later, position=position)
 
     # --- the fit ------------------------------------------------------------------
@@ -437,13 +480,11 @@ class HybridProjection(Hybrid):
                 got="none",
                 fix="train on a data set with longer scenarios",
             )
-        size = 1
-        if self.options.numerical:
-            size = 3
+        is_fitted = self._fitted_coefficients()
 
         def measure(values: NDArray[np.float64]) -> float:
-            coefficients = np.zeros(3)
-            coefficients[:size] = values
+            coefficients = np.zeros(len(is_fitted))
+            coefficients[is_fitted] = values
             if np.abs(coefficients).max() > LARGEST:
                 return WORST_ERROR
             errors = [self._error(sample, coefficients) for sample in samples]
@@ -451,10 +492,12 @@ class HybridProjection(Hybrid):
                 count(1)
             return float(np.mean(errors))
 
-        start = np.zeros(size)
+        first_steps = np.full(len(is_fitted), FIRST_STEP)
+        first_steps[CLOSURE:] = FIRST_RADIUS_STEP
+        start = np.zeros(int(is_fitted.sum()))
         plain_error = measure(start)
-        steps = FIRST_STEP * np.eye(size)
-        simplex = np.vstack([start, steps])
+        corners = np.diag(first_steps[is_fitted])
+        simplex = np.vstack([start, corners])
         minimum = minimize(
             measure,
             start,
@@ -466,18 +509,22 @@ class HybridProjection(Hybrid):
                 "fatol": 1e-5,
             },
         )
-        best = torch.zeros(3)
+        best = np.zeros(len(is_fitted))
         if minimum.fun < plain_error:
-            best[:size] = torch.from_numpy(minimum.x).float()
-        self.coefficients.copy_(best)
-        relative, added, hyper = best.tolist()
-        return {
-            "error_without": plain_error,
-            "error": float(minimum.fun),
-            "relative": relative,
-            "added": added,
-            "hyper": hyper,
-        }
+            best[is_fitted] = minimum.x
+        self.coefficients.copy_(torch.from_numpy(best))
+        numbers = {"error_without": plain_error, "error": float(minimum.fun)}
+        names = ("relative", "added", "hyper", "radius")
+        for name, value in zip(names, self.coefficients.tolist(), strict=False):
+            numbers[name] = value
+        return numbers
+
+    def _fitted_coefficients(self) -> NDArray[np.bool_]:
+        """Return which coefficients the fit changes, shape [coefficient]."""
+        is_fitted = np.ones(len(self.coefficients), dtype=bool)
+        if not self.options.numerical:
+            is_fitted[1:CLOSURE] = False
+        return is_fitted
 
     def _prepare(self, scenario: Batch) -> Sample:
         """Return the first frames of a scenario, and what its particles show later."""
@@ -531,6 +578,18 @@ class HybridProjection(Hybrid):
             return WORST_ERROR
         relative_error = float(np.sqrt(squared_error / squared_truth))
         return min(WORST_ERROR, relative_error)
+
+
+def _find_channel(info: DatasetInfo) -> Size | None:
+    """Return the description of a channel in datasets.yaml; None for other data."""
+    registry = load_registry()
+    split = registry.splits.get(info.split)
+    if split is None or info.size not in split.sizes:
+        return None
+    size = registry.size(info.split, info.size)
+    if "fringe_rate" not in size.parameters:
+        return None
+    return size
 
 
 def compute_vorticity(velocity: Velocity, grid: StaggeredGrid) -> Floats:

@@ -16,6 +16,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size
 
 from .predictor import (
     Floats,
@@ -36,15 +39,20 @@ def cell_counts(given: Given, resolution: float) -> tuple[int, ...]:
     return tuple(max(4, round(density * length)) for length in given.box.lengths)
 
 
-def forcing_of(given: Given) -> Forcing | None:
-    """Return the fixed body and the fringe that the scenario's file states, if any."""
-    size = given.size
-    if given.obstacle is None or "fringe_rate" not in size.parameters:
+def forcing_of(size: Size, obstacle: NDArray[np.floating] | None) -> Forcing | None:
+    """Return the fixed body and the fringe of a channel; None for other boxes.
+
+    Args:
+        size: the split and size; a channel states a fringe and a speed of its stream.
+        obstacle: centre and radius of the body [length], shape [axis + 1]; None without
+            a body.
+    """
+    if obstacle is None or "fringe_rate" not in size.parameters:
         return None
-    stream = np.zeros(given.box.dimension)
+    stream = np.zeros(size.dimension)
     stream[0] = float(size.value("speed"))
     return Forcing(
-        obstacle=given.obstacle,
+        obstacle=obstacle,
         fringe_length=float(size.value("fringe_length")),
         fringe_rate=float(size.value("fringe_rate")),
         stream=stream,
@@ -65,7 +73,7 @@ def predict(given: Given, resolution: float) -> Prediction:
         given.box,
         cells=cell_counts(given, resolution),
         no_slip=given.driven,
-        forcing=forcing_of(given),
+        forcing=forcing_of(given.size, given.obstacle),
     )
     first = given.predicted_frames[0]
     forces: Sequence[Floats | None] = [None] * len(walls)

@@ -51,7 +51,8 @@ VISCOUS_SHARE = 0.8
 class Forcing:
     """What draws the velocity of a fluid to given values: a fixed body, a fringe."""
 
-    obstacle: NDArray[np.float32]  # centre and radius of the body [length], [axis + 1]
+    # centre and radius of the body [length], shape [axis + 1]
+    obstacle: NDArray[np.floating]
     fringe_length: float  # of the fringe at the end of the box along x [length]
     fringe_rate: float  # in its middle [1/s]
     stream: Floats  # velocity to which the fringe draws [length/s], shape [axis]

@@ -132,6 +132,101 @@ def test_without_a_closure_it_is_the_reference_solver() -> None:
     np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-7)
 
 
+def channel() -> Size:
+    """The description of cylinder tiny."""
+    return load().size("cylinder", "tiny")
+
+
+def channel_model(**options: object) -> HybridProjection:
+    """The hybrid of cylinder tiny."""
+    size = channel()
+    figures = info(
+        split="cylinder",
+        size="tiny",
+        bounds=size.bounds,
+        periodic=("x",),
+        frame_interval=size.frame_interval,
+        score_cells=size.task.score_grid.cells,
+        input_frames=size.task.input_frames,
+    )
+    return HybridProjection.build(options, figures)
+
+
+def stream_around_a_disc(frames: int) -> tuple[Array, Array]:
+    """Return particles of a stream and the disc in it, that are still at the start.
+
+    Positions have the shape [frame, particle, 2], the disc [3]. Between the frames each
+    particle goes along x by the speed of the stream.
+    """
+    size = channel()
+    low_y, high_y = size.bounds[1]
+    along = (np.arange(32) + 0.5) / 32
+    across = low_y + (high_y - low_y) * (np.arange(16) + 0.5) / 16
+    columns, rows = np.meshgrid(along, across, indexing="ij")
+    place = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    radius = 0.5 * float(size.value("obstacle_diameter"))
+    disc = np.array([float(size.value("obstacle_x")), 0.5 * (low_y + high_y), radius])
+    distance = np.hypot(*(place - disc[:2]).T)
+    place = place[distance > 1.5 * radius]
+    step = float(size.value("speed")) * size.frame_interval
+    path = np.repeat(place[None], frames, axis=0)
+    path[:, :, 0] += step * (np.arange(frames) - (frames - 1))[:, None]
+    box = size.box
+    return rounded(box.inside(path.reshape(-1, 2)).reshape(path.shape)), rounded(disc)
+
+
+def window_with_disc(path: Array, disc: Array, viscosity: float = VISCOSITY) -> Batch:
+    """Return one window of liquid around a disc."""
+    window = batch_of(path, None, viscosity)
+    return replace(window, obstacle=torch.from_numpy(disc).float()[None])
+
+
+def test_a_disc_stops_it_as_it_stops_the_reference_solver() -> None:
+    """The fringe and the stream are those of the registry; no particle enters."""
+    size = channel()
+    frames = size.task.input_frames + size.task.horizon
+    path, disc = stream_around_a_disc(size.task.input_frames)
+    given = Given(
+        size=size,
+        root=Path(),
+        position=path,
+        material=np.zeros(path.shape[1], np.int8),
+        walls=np.zeros((frames, 4, 2)),
+        area=0.5,
+        parameters={
+            "viscosity": VISCOSITY,
+            "obstacle_x": disc[0],
+            "obstacle_y": disc[1],
+            "obstacle_diameter": 2.0 * disc[2],
+        },
+    )
+    expected = np.array(list(projection.predict(given, 2)))
+    model = channel_model()
+    assert "obstacle" in model.forcing_seen
+    window = window_with_disc(path, disc)
+    (rollout,) = roll_out(model, window, size.task.horizon)
+    predicted = rollout.position.numpy()
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-6)
+    distance = np.hypot(*(predicted.reshape(-1, 2) - disc[:2]).T)
+    assert distance.min() > disc[2] - 1e-6
+
+
+def test_a_fit_finds_the_radius_of_a_flow_that_it_made_itself() -> None:
+    """The disc that the fluid feels is a third larger than the disc that is told."""
+    true_model = channel_model()
+    true_model.coefficients[3] = 0.33
+    path, disc = stream_around_a_disc(channel().task.input_frames)
+    (rollout,) = roll_out(true_model, window_with_disc(path, disc), 10)
+    predicted = rollout.position.double().numpy()
+    whole_path = np.concatenate([path, predicted])
+
+    model = channel_model(numerical=False, evaluations=30)
+    numbers = model.fit([window_with_disc(whole_path, disc)])
+
+    assert numbers["error"] < 0.5 * numbers["error_without"]
+    assert numbers["radius"] == pytest.approx(0.33, abs=0.12)
+
+
 def test_a_force_drives_it_as_it_drives_the_reference_solver() -> None:
     """Two layers of a periodic square are pushed opposite ways, harder each frame."""
     size = load().size("poiseuille", "tiny")

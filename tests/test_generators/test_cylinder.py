@@ -131,7 +131,7 @@ def test_the_disc_is_told_and_no_particle_enters_it(
         given = given_in(file, size, root)
     assert given.obstacle is not None
     np.testing.assert_array_equal(given.obstacle, told[0])
-    forcing = forcing_of(given)
+    forcing = forcing_of(given.size, given.obstacle)
     assert forcing is not None
     assert forcing.stream[0] == size.value("speed")
 
