@@ -53,7 +53,7 @@ STABLE_DECAY = 1.6
 
 CLOSURE = 3  # number of the coefficients a, b, c
 FIRST_STEP = 0.02  # of the simplex method, in a, b and c
-FIRST_RADIUS_STEP = 0.1  # the same in d: less moves no point of the grid out of the body
+FIRST_RADIUS_STEP = 0.1  # the same in d; less might change no point of the grid
 LARGEST = 2.0  # magnitude of a coefficient; more would need very many time steps
 WORST_ERROR = 10.0  # error of coefficients with which the solver breaks down
 
@@ -369,9 +369,7 @@ class HybridProjection(Hybrid):
         field = flow.later_field(frame=last_frame, duration=0.5 * interval)
         return replace(flow, field=field)
 
-    def _forcing(
-        self, obstacle: Floats | None, coefficients: Floats
-    ) -> Forcing | None:
+    def _forcing(self, obstacle: Floats | None, coefficients: Floats) -> Forcing | None:
         """Return the fringe of a channel and its body, with the radius (1 + d) R."""
         if self.channel is None or obstacle is None:
             return None

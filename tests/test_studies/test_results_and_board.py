@@ -89,10 +89,16 @@ def test_the_interval_of_a_ratio_decides(
 def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats() -> (
     None
 ):
-    """On cylinder mini a frame of NeuralMPM costs less than one of any solver: its
-    scores beside theirs say which it beats.
+    """Where a frame of the only model costs less than one of any solver, its scores
+    beside theirs say which it beats: NeuralMPM on cylinder mini, made ten times faster.
     """
     results = SplitResults(Sources(), "cylinder", "mini")
+    del results.methods["hybrid-projection"]
+    method = results.methods["neuralmpm"]
+    assert method.measured is not None
+    seconds = 0.1 * method.measured.seconds_per_frame
+    faster = method.measured.model_copy(update={"seconds_per_frame": seconds})
+    results.methods["neuralmpm"] = replace(method, measured=faster)
     scores = {}
     for name, method in results.methods.items():
         scores[name] = method.scores[results.ranking].mean
