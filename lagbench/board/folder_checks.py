@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
+from lagbench.errors import (
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    format_count,
+)
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.score_file import SubmissionStatistics
 from lagbench.scoring.score_file_checks import (
@@ -66,13 +71,26 @@ class FolderChecks:
         for path in self.folder.reference_files():
             self._guard(path, self._check_reference)
         self._check_misplaced_files()
-        self.issues += check_weights(self.folder, self.entries, isolated=self.isolated)
+        # what belongs to an entry that cannot be read is not reported too
+        readable_places = {entry.place for entry in self.entries}
+        unreadable_places = self.folder.claimed_places() - readable_places
+        self.issues += check_weights(
+            self.folder,
+            self.entries,
+            unreadable_places=unreadable_places,
+            isolated=self.isolated,
+        )
         self._check_successors()
         self._check_twins()
         self._check_names()
-        self._check_stray_score_files()
-        self._check_verified()
-        self.issues += check_shift(self.folder, self.entries, self.registry)
+        self._check_stray_score_files(unreadable_places)
+        self._check_verified(unreadable_places)
+        self.issues += check_shift(
+            self.folder,
+            self.entries,
+            self.registry,
+            unreadable_places=unreadable_places,
+        )
 
     def _add(
         self,
@@ -306,7 +324,8 @@ class FolderChecks:
             name = differing[0]
             got = _format_summary(stated.get(name))
             if len(differing) > 1:
-                got += f", and {len(differing) - 1} more metrics differ"
+                others = format_count(len(differing) - 1, "other metric")
+                got += f"; and {others}"
             expected = f"{name}: {_format_summary(formed.get(name))}"
             self._add("score", where, got, expected=expected)
 
@@ -395,28 +414,25 @@ class FolderChecks:
                 owner = f"that of {first.method}, {first.name!a}"
                 self._add("name", entry.yaml_path, owner)
 
-    def _check_stray_score_files(self) -> None:
+    def _check_stray_score_files(self, unreadable_places: Set[Place]) -> None:
         """Check that every score file has an entry."""
         named_paths: set[Path] = set()
         for entry in self.entries:
             named_paths.update(entry.score_paths)
-        # score files of entries that cannot be read are no strays
-        readable_places = {entry.place for entry in self.entries}
-        unreadable_places = self.folder.claimed_places() - readable_places
         for path in self.folder.score_files():
             method = path.stem.partition("_")[0]
             place = (path.parts[1], path.parts[2], method)
             if path not in named_paths and place not in unreadable_places:
                 self._add("stray", path, "none")
 
-    def _check_verified(self) -> None:
+    def _check_verified(self, unreadable_places: Set[Place]) -> None:
         """Check that every line of verified.yaml has an entry with its scores."""
         try:
             verified = read_verified(self.folder)
         except LagbenchError as error:
             self.issues.append(issue_from_error("verified", error, VERIFIED))
             return
-        names = set()
+        names = {entry_path(place).as_posix() for place in unreadable_places}
         for entry in self.entries:
             line = verification_of(entry, verified)
             if line is not None:

@@ -7,7 +7,7 @@ while the entry has the very models that the line names and the data are the sam
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Annotated
 
 import numpy as np
@@ -23,7 +23,7 @@ from lagbench.submission.issues import ValidationIssue
 from .entry import Entry, Strict
 from .entry_file import examine, format_issues, load_plain, yaml_bytes
 from .fields import Hash, Label, Number, Seed
-from .folder import SHIFT, Folder
+from .folder import SHIFT, Folder, Place, entry_path
 from .issues import issue_from_error, make_issue
 from .lock import board_lock
 
@@ -196,16 +196,26 @@ def shift_without_stale_line(folder: Folder, entry: Entry) -> bytes | None:
 
 
 def check_shift(
-    folder: Folder, entries: Sequence[Entry], registry: Registry
+    folder: Folder,
+    entries: Sequence[Entry],
+    registry: Registry,
+    *,
+    unreadable_places: Set[Place] = frozenset(),
 ) -> Iterator[ValidationIssue]:
-    """Yield lines that belong to no entry, or to other models, data or scenarios."""
+    """Yield lines that belong to no entry, or to other models, data or scenarios.
+
+    Lines of entries that cannot be read are passed over.
+    """
     try:
         shift = read_shift(folder)
     except LagbenchError as error:
         yield issue_from_error("shift", error, SHIFT)
         return
     by_path = {entry.yaml_path.as_posix(): entry for entry in entries}
+    unreadable_names = {entry_path(place).as_posix() for place in unreadable_places}
     for name, scores in shift.items():
+        if name in unreadable_names:
+            continue
         where = f"{SHIFT}, {ascii(name)[1:-1][:120]}"
         entry = by_path.get(name)
         if entry is None:

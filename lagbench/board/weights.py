@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -416,7 +416,11 @@ def reason_unfit_log(path: Path) -> str | None:
 
 
 def check_weights(
-    folder: Folder, entries: Sequence[Entry], *, isolated: bool = True
+    folder: Folder,
+    entries: Sequence[Entry],
+    *,
+    unreadable_places: Set[Place] = frozenset(),
+    isolated: bool = True,
 ) -> Iterator[ValidationIssue]:
     """Yield what is wrong with the weights of a board.
 
@@ -427,6 +431,8 @@ def check_weights(
     Args:
         folder: the leaderboard.
         entries: entries that fit the schema.
+        unreadable_places: places of entries that cannot be read: nothing is said of
+            their weights.
         isolated: whether a child process reads the recipes of shared weights.
     """
     keepers = {entry.place: entry for entry in entries}
@@ -442,7 +448,8 @@ def check_weights(
             path = weights_path(place, prediction.seed, weights.path)
             yield from _check_weights_file(folder, path, weights, where=where)
             if weights.shared_with is not None:
-                yield from check_sharing(entry, number, keepers)
+                if place not in unreadable_places:
+                    yield from check_sharing(entry, number, keepers)
                 continue
             log = path.with_suffix(".json")
             known_paths |= {path, log}
@@ -463,7 +470,9 @@ def check_weights(
 
     stored_paths = folder.weight_files()
     for path in stored_paths:
-        if path not in known_paths:
+        method = path.stem.rpartition("_")[0]
+        owner = (path.parts[1], path.parts[2], method)
+        if path not in known_paths and owner not in unreadable_places:
             yield make_issue(
                 "weights",
                 path,

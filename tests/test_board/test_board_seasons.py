@@ -288,6 +288,10 @@ def test_the_line_of_a_reproduced_entry_becomes_blind(own: ModelBoard) -> None:
     assert line.blind is not None
     assert line.blind.low < line.blind.gap < line.blind.high
     assert own.find().findings == ()
+    # a mistake in the entry is no mistake in the line
+    own.edit(own.folder / PATH, lambda content: content.update(authors=[]))
+    (finding,) = own.find().findings
+    assert finding.check == "schema"
 
 
 def test_the_run_says_which_gaps_are_not_recorded(

@@ -105,6 +105,13 @@ def test_an_onnx_file_predicts_shift(run_board: ModelBoard, tmp_path: Path) -> N
     assert set(header.scenarios) == set(load().size(SPLIT, "tiny").subsets["shift"])
 
 
+def test_an_unreadable_entry_keeps_its_weights_and_its_line(own: ModelBoard) -> None:
+    """Only the entry is reported: nobody is told to remove what belongs to it."""
+    own.edit(own.folder / PATH, lambda content: content.update(authors=[]))
+    (finding,) = own.find().findings
+    assert finding.check == "schema"
+
+
 def test_a_template_of_shift_is_scored_there(
     run_board: ModelBoard, tmp_path: Path
 ) -> None:
