@@ -11,6 +11,7 @@ dependencies and the modules that other packages add.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import importlib.util
@@ -308,10 +309,10 @@ def check_regular(
             fix="check the path and that you may read the file",
         ) from error
     if not stat.S_ISREG(status.st_mode):
+        kind = "a device, socket or pipe"
         if stat.S_ISDIR(status.st_mode):
             kind = "a folder"
-        else:
-            kind = "a device, socket or pipe"
+            fix = _name_files_in(path)
         raise UnreadableFileError(
             "not a file",
             where=str(path),
@@ -328,6 +329,18 @@ def check_regular(
             fix=fix or "name a file that lagbench wrote",
         )
     return status.st_size
+
+
+def _name_files_in(folder: Path) -> str:
+    """Return a hint that names the first files of a folder."""
+    names = []
+    with contextlib.suppress(OSError):
+        for file in sorted(folder.iterdir()):
+            if file.is_file():
+                names.append(ascii(file.name)[1:-1])
+    if not names:
+        return "name a file"
+    return f"name a file in it: {', '.join(names[:3])[:120]}"
 
 
 def suggest_file(path: Path) -> str | None:
