@@ -39,6 +39,7 @@ LARGE_RELATIVES = (
     "decaying-vortices",
     "poiseuille",
     "curl-noise-3d",
+    "cavity-3d",
     "cylinder",
     "fluid-3d",
 )
@@ -54,6 +55,7 @@ LARGE_RELATIVES = (
         ("decaying-vortices", 0.1, (16_384, 64, 48, 14_400, 48, 8, 16)),
         ("poiseuille", 0.1, (16_384, 64, 48, 8_640, 48, 8, 16)),
         ("curl-noise-3d", 0.1, (54_872, 24, 18, 6_912, 48, 8, 16)),
+        ("cavity-3d", 0.1, (54_872, 24, 36, 6_912, 48, 8, 16)),
         ("cylinder", 1 / 16, (40_512, 128, 60, 7_200, 48, 8, 16)),
         ("fluid-3d", 1 / 60, (20_736, 48, 24, 10_800, 48, 8, 16)),
     ],
