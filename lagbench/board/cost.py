@@ -200,7 +200,8 @@ def cost_figure(tab: Tab) -> Markup:
     caption = (
         "Further left is cheaper, further down more accurate; the line joins the "
         "methods that no other beats in both. The full grey line joins the classical "
-        "solvers: an entry below it is more accurate than every solver of its cost. "
+        "solvers that are more accurate than every cheaper one: an entry below it is "
+        "more accurate than every solver of its cost. "
         "The upright line is the time of the simulator that made the data. Costs of "
         "entries are measured or self-reported, as the table says, and brought to the "
         "machine of the reference predictors by the simulator's time on both."

@@ -240,13 +240,15 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
 def _option_error(detail: ErrorDetails, *, where: str) -> UsageError:
     """Return what is wrong with one key of the options."""
     key = quote(".".join(map(str, detail["loc"])))[1:-1]
+    expected = describe_expectation(detail)
     fix = "docs/exchange.md has the keys"
     if detail["type"] == "extra_forbidden":
+        expected = "a key of a description"
         fix = suggest_name(key, DataOptions.__annotations__)
     return UsageError(
         "this does not describe data",
         where=f"{where}{key or '(whole file)'}",
-        expected=describe_expectation(detail),
+        expected=expected,
         got=describe_input(detail),
         fix=fix,
     )

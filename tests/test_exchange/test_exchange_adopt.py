@@ -993,6 +993,10 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
     for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
         description.write_text(line)
         assert run(*words).exit_code == 2
+    description.write_text("radios: 0.1")
+    refused = run(*words).output
+    assert "expected: a key of a description" in refused
+    assert "radius" in refused
     assert not (tmp_path / "mine").exists()
     description.write_text(
         "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
