@@ -7,12 +7,13 @@ with the viscosity nu that is given, the spacing h of the grid and the frame int
 The solver that made the data carries momentum through particles and a grid of its own:
 it damps what its grid hardly sees. The textbook solver of
 :mod:`lagbench.references.projection` does not; a, b and c say by how much it should.
-With all three 0 the model is that solver, up to the rounding of float32.
+With all coefficients 0 the model is that solver, up to the rounding of float32.
 
 In a channel with a fixed body there is a fourth coefficient d: the fluid stops within
 the radius (1 + d) R of the centre, where R is the radius of the body. On their grids
 both solvers stop the fluid at points inside the body only, so each has a body of its
-own size. Particles stay outside of R.
+own size. The error changes in steps with d, as points of the grid leave or enter the
+body: a range of d gives the same flow. Particles stay outside of R.
 
 The coefficients are fitted to rollouts of the solver over many frames of ``train``: a
 solver with a learned part that is trained through its own steps (Um et al. 2020,
@@ -282,7 +283,7 @@ class HybridOptions(Options):
 
     # cells over those of the score grid, along each axis
     resolution: float = Field(default=2.0, gt=0.0, le=4.0, allow_inf_nan=False)
-    # whether b and c are fitted; else a alone
+    # whether b and c are fitted; else a alone, in a channel a and d
     numerical: bool = True
     scenarios: int = Field(default=12, ge=1)  # of train, to fit on, at most
     frames: int = Field(default=60, ge=2)  # that each of them is rolled out
@@ -304,7 +305,7 @@ class HybridProjection(Hybrid):
         count = CLOSURE
         if self.channel is not None:
             count += 1
-        self.register_buffer("coefficients", torch.zeros(count))  # a, b, c and d
+        self.register_buffer("coefficients", torch.zeros(count))  # a, b, c, d
 
     @property
     def forcing_seen(self) -> frozenset[str]:
@@ -438,9 +439,10 @@ class HybridProjection(Hybrid):
             duration=interval,
             wall_velocity=flow.forcing.wall_velocity(next_frame),
         )
-        if flow.forcing.obstacle is not None:
+        obstacle = flow.forcing.obstacle
+        if obstacle is not None and flow.grid.forcing is not None:
             position = flow.grid.box.inside(position)
-            position = keep_outside(position, flow.forcing.obstacle)
+            position = keep_outside(position, obstacle)
         return replace(later, position=position)
 
     # --- the fit ------------------------------------------------------------------

@@ -135,7 +135,7 @@ def advise_on_baselines(words: Sequence[str]) -> str | None:
 
 
 def check_typed_settings(words: Sequence[str]) -> None:
-    """Refuse a setting without its =, whose value looks like an argument.
+    """Refuse a setting without its =: its value was taken for the argument SPLIT.
 
     Raises:
         UsageError: there is one.

@@ -346,7 +346,7 @@ def draw_contact_sheet(
 
 
 def scenario_files(size: Size, root: Path) -> list[Path]:
-    """Return the scenario files that exist: train, valid, test, extra, each by id."""
+    """Return the scenario files that exist, subset by subset, each by id."""
     files = []
     for ids in size.subsets.values():
         for scenario in sorted(ids):

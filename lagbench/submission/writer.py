@@ -70,7 +70,8 @@ class PredictionsWriter:
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
             one.
-        root: folder of all data sets; asked only where no hash is recorded.
+        root: folder of all data sets; read where no size is named, where the split is a
+            folder of its own, or where no hash is recorded.
         registry: where splits are described; ours when None.
         **labels: see :meth:`label`.
 
@@ -504,7 +505,8 @@ def write(
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
         dataset_sha256: hash of the data set that the model was given; else the recorded
             one.
-        root: folder of all data sets; asked only where no hash is recorded.
+        root: folder of all data sets; read where no size is named, where the split is a
+            folder of its own, or where no hash is recorded.
         registry: where splits are described; ours when None.
         **labels: see :meth:`PredictionsWriter.label`.
 
