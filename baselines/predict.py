@@ -153,25 +153,15 @@ def predict(
     check_outputs(output_path, overwrite=overwrite)
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
-    root_folder = resolve_root(root)
-    if split is not None:
-        root_folder = _locate_trained_split(split, trained, root, registry)
+    root_folder = _find_root(split, trained, root, registry)
     known_splits = load_rooted_registry(root_folder, registry)
     where = str(checkpoint)
     info = check_data(
         trained, root=root_folder, registry=known_splits, size=size, where=where
     )
-    known_splits.size(info.split, info.size).scored_on(subset)
+    paths = _find_scenarios(info, subset, root_folder, known_splits)
     machine = choose_device(device)
     bound_memory()
-    tests = scenario_paths(
-        info.split,
-        subset=subset,
-        size=info.size,
-        root=root_folder,
-        registry=known_splits,
-    )
-    paths = list(tests.values())
 
     with use_threads(threads), explain_memory_errors("lower --batch"):
         model = restore_for_size(trained, info, settings, known_splits, where=where)
@@ -215,13 +205,19 @@ def predict(
     return result
 
 
-def _locate_trained_split(
-    split: str | Path,
+def _find_root(
+    split: str | Path | None,
     trained: Checkpoint,
     root: str | Path | None,
     registry: Registry | None,
 ) -> Path:
-    """Return the root folder of a split, which must be that of the training."""
+    """Return the root folder of the data: that of a local split, if one is named.
+
+    Raises:
+        UsageError: the model was trained on another split.
+    """
+    if split is None:
+        return resolve_root(root)
     location = locate_split(split, root=root, registry=registry)
     trained_split = trained.info.split
     if location.name != trained_split:
@@ -233,6 +229,22 @@ def _locate_trained_split(
             fix="leave it out, or name the folder of the local split of the training",
         )
     return location.root
+
+
+def _find_scenarios(
+    info: DatasetInfo, subset: str, root: Path, registry: Registry
+) -> list[Path]:
+    """Return the scenario files of a subset that can be scored.
+
+    Raises:
+        DataError: a file is not there.
+        UsageError: the subset is not scored.
+    """
+    registry.size(info.split, info.size).scored_on(subset)
+    paths = scenario_paths(
+        info.split, subset=subset, size=info.size, root=root, registry=registry
+    )
+    return list(paths.values())
 
 
 def _summarise(

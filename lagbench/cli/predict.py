@@ -106,7 +106,7 @@ def predict_command(
         _refuse_options_of_weights(
             settings=settings, device=device, threads=threads, batch=batch
         )
-        result = _predict_onnx(
+        onnx_result = _predict_onnx(
             checkpoint,
             output,
             overwrite=overwrite,
@@ -119,14 +119,10 @@ def predict_command(
             quiet=quiet,
         )
         lines = [
-            f"{result.path}: {result.method}, "
-            f"{format_count(result.scenarios, 'scenario')}, {result.frames} frames",
-            f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of "
-            "one thread, mean over all predicted frames",
-            *_describe_solver(result.seconds_per_frame, solver_clock.bench),
-            _next_command(result.path, split, root),
+            *_describe_onnx(onnx_result, solver=solver_clock.bench),
+            _next_command(onnx_result.path, split, root),
         ]
-        value = {**vars(result), "solver": solver_clock.bench}
+        value = {**vars(onnx_result), "solver": solver_clock.bench}
         print_result(value, lines, as_json=as_json, quiet=quiet)
         return
 
@@ -135,7 +131,7 @@ def predict_command(
 
     is_replaced = output.is_file()
     with progress_bar(quiet=quiet) as progress:
-        prediction = predict(
+        result = predict(
             checkpoint,
             output,
             overwrite=overwrite,
@@ -152,12 +148,12 @@ def predict_command(
             progress=progress,
         )
     solver = solver_clock.bench
-    description = [
-        *_describe(prediction, solver=solver, is_replaced=is_replaced),
-        _next_command(prediction.path, split, root),
+    lines = [
+        *_describe(result, solver=solver, is_replaced=is_replaced),
+        _next_command(result.path, split, root),
     ]
-    content = {**vars(prediction), "solver": solver}
-    print_result(content, description, as_json=as_json, quiet=quiet)
+    value = {**vars(result), "solver": solver}
+    print_result(value, lines, as_json=as_json, quiet=quiet)
 
 
 def _refuse_options_of_weights(
@@ -255,6 +251,18 @@ def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:
         if not quiet:
             print_warning(f"no speed-up over the solver: {error}")
         return None
+
+
+def _describe_onnx(
+    result: OnnxPredictionResult, *, solver: SolverBench | None
+) -> Iterator[str]:
+    scenarios = format_count(result.scenarios, "scenario")
+    yield f"{result.path}: {result.method}, {scenarios}, {result.frames} frames"
+    yield (
+        f"  model   {result.seconds_per_frame:.3g} s per frame: processor time of one "
+        "thread, mean over all predicted frames"
+    )
+    yield from _describe_solver(result.seconds_per_frame, solver)
 
 
 def _describe(

@@ -49,7 +49,6 @@ __all__ = [
     "describe",
     "draw_contact_sheet",
     "plot_frame",
-    "scenario_files",
 ]
 
 ALL = "all"
@@ -326,7 +325,7 @@ def draw_contact_sheet(
     Raises:
         DataError: no scenario is there, or a file is damaged.
     """
-    files = scenario_files(tier, folder)
+    files = _list_existing_files(tier, folder)
     if not files:
         where = f"{tier.split} {tier.name} under {folder}"
         raise DataError(
@@ -345,7 +344,7 @@ def draw_contact_sheet(
     return _draw_sheet(sheet, title, output, dpi=dpi)
 
 
-def scenario_files(size: Size, root: Path) -> list[Path]:
+def _list_existing_files(size: Size, root: Path) -> list[Path]:
     """Return the scenario files that exist, subset by subset, each by id."""
     files = []
     for ids in size.subsets.values():

@@ -1,10 +1,10 @@
 """Projection solver: incompressible Navier-Stokes on a staggered grid, in full boxes.
 
 A textbook solver (:mod:`.staggered`) that is told what a model is told: the given
-frames, the motion of the walls, the body force and the viscosity. It starts from the
-velocities of the last two given frames, which hold half a frame before the last one,
-and brings them there. From then on its field carries the particles, two readings a
-frame (Heun).
+frames, the motion of the walls, the body force and the viscosity; in a channel also
+the disc, the stream and the fringe. It starts from the velocities of the last two given
+frames, which hold half a frame before the last one, and brings them there. From then on
+its field carries the particles, two readings a frame (Heun).
 
 It learns nothing. It knows the equations, which are not quite those of the data: their
 fluid is weakly compressible. What a surrogate of a full box must be compared with:
