@@ -40,8 +40,8 @@ EXPECTATIONS = {
     "frozen_set_type": "a list in brackets",
     "iterable_type": "a list in brackets",
     "sequence_str": "a list in brackets",
-    "too_short": "at least {min_values}",
-    "too_long": "at most {max_values}",
+    "too_short": "a {collection} of at least {min_values}",
+    "too_long": "a {collection} of at most {max_values}",
     "dict_type": "keys with values",
     "mapping_type": "keys with values",
     "model_type": "keys with values",
@@ -129,7 +129,9 @@ def describe_expectation(detail: ErrorDetails) -> str:
         return PATTERN_WORDS.get(context["pattern"], OTHER)
     if detail["type"] == "is_instance_of":
         return CLASS_WORDS.get(context.get("class", ""), OTHER)
-    words = dict(context)
+    words = {**context, "collection": "list"}
+    if context.get("field_type") == "Dictionary":
+        words["collection"] = "mapping"
     for end in ("min", "max"):
         count = context.get(f"{end}_length")
         if isinstance(count, int):

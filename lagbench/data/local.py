@@ -26,6 +26,7 @@ import platformdirs
 from lagbench.atomic import write_atomically
 from lagbench.errors import (
     SPLIT_NAMED,
+    DataError,
     UnreadableFileError,
     UsageError,
     check_regular,
@@ -379,7 +380,8 @@ def locate(
 
     Raises:
         UsageError: see :func:`locate_split`; the split has no such size, or none is
-            named where no size has data, or several but not mini.
+            named where several sizes have data, but not mini.
+        DataError: no size is named, and none has data.
         UnreadableFileError: the description of the local split is not right.
     """
     location = locate_split(split, root=root, registry=registry)
@@ -439,27 +441,32 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
 
 def _size_error(
     location: SplitLocation, sizes: Sequence[Size], sizes_with_data: Sequence[Size]
-) -> UsageError:
+) -> UsageError | DataError:
     url = url_of(location.root)
+    size_names = ", ".join(size.name for size in sizes)
     if sizes_with_data:
-        what = "several sizes are there: name one"
-        data = ", ".join(size.name for size in sizes_with_data)
-        hint = f"--size {sizes_with_data[0].name}"
-    elif url is not None:
+        names_with_data = ", ".join(size.name for size in sizes_with_data)
+        return UsageError(
+            "several sizes are there: name one",
+            where="--size",
+            expected=size_names,
+            got=f"{names_with_data} in {url or location.root}",
+            fix=f"--size {sizes_with_data[0].name}",
+        )
+
+    if url is not None:
         # The store may hold it: only what was fetched is known.
         what = "no size is named, and none was fetched from the store"
-        data = f"no data of {location.name}"
         hint = "name it with --size"
     else:
         what = "no size is named, and none is there"
-        data = f"no data of {location.name}"
         size = location.registry.size(location.name, _size_to_make(location))
         hint = suggest_repair(size, root=location.root)
-    return UsageError(
+    return DataError(
         what,
         where="--size",
-        expected=", ".join(size.name for size in sizes),
-        got=f"{data} in {url or location.root}",
+        expected=size_names,
+        got=f"no data of {location.name} in {url or location.root}",
         fix=hint,
     )
 

@@ -153,7 +153,8 @@ def adopt(
         counts=counts,
         progress=progress,
     )
-    return replace(local_split, notes=tuple(_notes_of_counts(counts)))
+    notes = (*local_split.notes, *_notes_of_counts(counts))
+    return replace(local_split, notes=notes)
 
 
 def _require_option(options: DataOptions, name: str, meaning: str) -> None:

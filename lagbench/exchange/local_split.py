@@ -236,7 +236,17 @@ def _summarise(
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
+        notes=tuple(_describe_motion(manifest.statistics)),
     )
+
+
+def _describe_motion(statistics: Mapping[str, Sequence[float]]) -> Iterator[str]:
+    """Yield a note for the user if all particles of train stand still."""
+    if not any(statistics["velocity_std"]) and not any(statistics["velocity_mean"]):
+        yield (
+            "no particle of train moves from one frame to the next: check the order of "
+            "the axes, and that the frames differ"
+        )
 
 
 @contextmanager

@@ -160,7 +160,7 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     """One size there: that one; of several mini. None, or several without mini: an
     error that names them. What is to be made: mini.
     """
-    with pytest.raises(UsageError) as none:
+    with pytest.raises(DataError) as none:
         lagbench.open_split("cavity", root=tmp_path)
     assert none.value.where == "--size"
     assert "--size mini" in str(none.value.fix)

@@ -373,6 +373,20 @@ def test_test_has_enough_trajectories_for_a_p_value(
     assert has_note == (test_count < 6)
 
 
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_set_in_which_nothing_moves_has_a_note(
+    tmp_path: Path, moves: bool, adopt_here: Adopt
+) -> None:
+    run = straight_runs(1)[0]
+    if not moves:
+        run = np.broadcast_to(run[0], run.shape)
+    path = tmp_path / "runs.npy"
+    np.save(path, np.stack([run] * 20))
+    own_split = adopt_here(path)
+    has_note = any("no particle of train moves" in note for note in own_split.notes)
+    assert has_note != moves
+
+
 def test_without_bounds_the_extent_of_all_positions_is_fitted(
     tmp_path: Path, adopt_here: Adopt
 ) -> None:

@@ -645,7 +645,7 @@ def test_an_interrupt_says_how_to_go_on(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not of_this_turn([0], turns=3, shift=2), reason="not in this turn")
+@pytest.mark.skipif(not of_this_turn([0], turns=3, shift=1), reason="not in this turn")
 def test_everything_is_made_at_tiny(
     tmp_path: Path,
     unmeasured: Registry,
