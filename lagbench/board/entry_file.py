@@ -208,8 +208,10 @@ def _join_description_lines(value: object) -> None:
         return
     for key, member in value.items():
         if key == "description" and isinstance(member, str):
-            paragraphs = member.split("\n\n")
-            value[key] = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
+            paragraphs = []
+            for paragraph in member.split("\n\n"):
+                paragraphs.append(" ".join(paragraph.split()))
+            value[key] = "\n\n".join(paragraphs)
         else:
             _join_description_lines(member)
 

@@ -157,17 +157,20 @@ def reproduce(
         DataError: the data of a named entry are missing or others.
         UnreadableFileError: a model of a named entry cannot be read.
         WorkFailedError: the disk or the memory is full.
+
+    If no entry is named, an error of one entry is kept in the result, and the other
+    entries are run.
     """
     folder = Folder(board)
     folder.require()
     data_root = resolve_root(root)
-    described = load_rooted_registry(data_root, registry)
-    chosen = choose_entries(folder, entries, described, split=split, size=size)
+    rooted_registry = load_rooted_registry(data_root, registry)
+    chosen = choose_entries(folder, entries, rooted_registry, split=split, size=size)
 
     run = _Reproduction(
         folder=folder,
         root=data_root,
-        registry=described,
+        registry=rooted_registry,
         scenarios=scenarios,
         again=again,
         recording=recording,

@@ -21,7 +21,7 @@ from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import FILM_RANGE, LEVELS, SUBMISSION
+from lagbench.scoring.score_layout import FILM_RANGE, LAST_STEP, SUBMISSION
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
@@ -32,7 +32,7 @@ from .ranking import TOLERANCE, scored_file
 from .scores_compared import compare
 
 # step of packed film positions [length]
-FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
+FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LAST_STEP
 
 # Pictures may differ by the steps in which they are packed, and by rounding.
 PICTURE_STEPS = 1.01

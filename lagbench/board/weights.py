@@ -109,7 +109,7 @@ def require_weights(
                 fix="give one of each seed at most",
             )
         if file.sha256 in owners and keeper is None:
-            raise _owned_error(path, owners[file.sha256])
+            raise _error_of_owned_weights(path, owners[file.sha256])
         _require_new_use(file, headers[index], uses)
         _require_made_by(file, headers[index])
         chosen[index] = path
@@ -153,12 +153,12 @@ def _require_onnx(
     sha256 = file_sha256(path)
     for use in uses:
         if use.weights.sha256 == sha256:
-            raise _owned_error(path, str(use.entry.yaml_path))
+            raise _error_of_owned_weights(path, str(use.entry.yaml_path))
     if keeper is not None:
         data_set = (header.split, header.size)
         kept_path = weights_path(keeper.place, header.seed, path)
         if keeper.place[:2] != data_set or kept_path.name != path.name:
-            raise _owned_error(path, str(keeper.yaml_path))
+            raise _error_of_owned_weights(path, str(keeper.yaml_path))
     if header.parameters is not None and header.parameters != declared.parameters:
         raise UsageError(
             "the model did not make these predictions",
@@ -169,11 +169,11 @@ def _require_onnx(
         )
 
 
-def _owned_error(path: Path, owner: str) -> UsageError:
+def _error_of_owned_weights(path: Path, owner: str) -> UsageError:
     return UsageError(
         "these weights lie beside another entry",
         where=str(path),
-        expected="weights that no other active entry has",
+        expected="weights that lie beside no other entry",
         got=f"those of {owner}",
         fix="give those of this method; to share them, give the file that lies on the "
         "board, and predictions that another option or size made",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -78,20 +79,20 @@ def generate_command(
         split = choose_split(split_argument, split_option)
         if size is None and not quiet:
             print_note(_describe_default_size(split, root))
-        places = [Place(split=split, size=size, root=root, registry=None)]
+        targets = [GenerationTarget(split=split, size=size, root=root, registry=None)]
     else:
         split_name = None
         if split_argument or split_option:
             split_name = choose_split(split_argument, split_option)
-        places = _season_places(season, board, root, split_name, size)
-    for place in places:
+        targets = _season_targets(season, board, root, split_name, size)
+    for target in targets:
         with progress_bar(quiet=quiet or dry_run) as progress:
             result = generate(
-                place.split,
-                place.size,
+                target.split,
+                target.size,
                 subset=subset,
                 scenarios=scenarios,
-                root=place.root,
+                root=target.root,
                 workers=workers,
                 device=device,
                 scheduler=scheduler,
@@ -100,7 +101,7 @@ def generate_command(
                 dry_run=dry_run,
                 progress=progress,
                 on_wait=lambda holder: print_note(f"waiting for {holder}"),
-                registry=place.registry,
+                registry=target.registry,
             )
         if result.dry_run:
             lines = _describe_plan(result)
@@ -112,7 +113,7 @@ def generate_command(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class GenerationTarget:
     """A data set to generate, and where it is described and kept."""
 
     split: str
@@ -121,13 +122,13 @@ class Place:
     registry: Registry | None
 
 
-def _season_places(
+def _season_targets(
     name: str,
     board: Path | None,
     root: Path | None,
     split: str | None,
     size: str | None,
-) -> list[Place]:
+) -> list[GenerationTarget]:
     """Return the data sets of a season, or those of a split and size.
 
     Raises:
@@ -141,23 +142,24 @@ def _season_places(
     folder = Folder(find_board(board, reads=True))
     season = read_season(folder, name)
     scores = read_scores(folder, season)
-    registry = season_registry(
-        season, load(), {} if scores is None else scores.recorded
-    )
-    places = []
+    recorded_hashes: Mapping[tuple[str, str], Mapping[int, str]] = {}
+    if scores is not None:
+        recorded_hashes = scores.recorded
+    registry = season_registry(season, load(), recorded_hashes)
+    targets = []
     known = []
     for data_set in season.data_sets:
         known.append(f"{data_set.split} {data_set.size}")
         if split in (None, data_set.split) and size in (None, data_set.size):
-            places.append(
-                Place(
+            targets.append(
+                GenerationTarget(
                     split=data_set.split,
                     size=data_set.size,
                     root=season_root(name, root),
                     registry=registry,
                 )
             )
-    if not places:
+    if not targets:
         raise UsageError(
             "the season has no such data set",
             where="--split, --size",
@@ -166,7 +168,7 @@ def _season_places(
             fix=f"name one of these, or leave both out; `lagbench season show {name}` "
             "describes the season",
         )
-    return places
+    return targets
 
 
 def _describe_default_size(split: str, root: Path | None) -> str:

@@ -75,15 +75,18 @@ def keep_outside(
 ) -> NDArray[np.float64]:
     """Return positions of which those inside an obstacle are put on its surface.
 
+    A point at the very centre stays there. Points outside are computed anew too, so
+    they may change by a rounding: the bits of recorded predictions depend on it.
+
     Args:
         position: points [length], shape [point, axis].
         obstacle: centre and radius [length], shape [axis + 1].
     """
     centre = obstacle[:-1].astype(np.float64)
     radius = float(obstacle[-1])
-    way = position - centre
-    distance = np.sqrt((way * way).sum(axis=1))
+    offset = position - centre
+    distance = np.sqrt((offset * offset).sum(axis=1))
     is_inside = (distance < radius) & (distance > 0.0)
     stretch = np.ones(len(position))
     stretch[is_inside] = radius / distance[is_inside]
-    return np.asarray(centre + stretch[:, None] * way)
+    return np.asarray(centre + stretch[:, None] * offset)

@@ -339,7 +339,7 @@ def _chunk_shape(
 def _check_parameters(
     parameters: Mapping[str, object], path: Path
 ) -> dict[str, object]:
-    """Return parameters as plain values; refuse names that the format needs itself."""
+    """Return parameters as plain values; refuse reserved names and other values."""
     plain_values: dict[str, object] = {}
     for name, value in parameters.items():
         if name in _RESERVED or not name.isidentifier():

@@ -332,10 +332,10 @@ class WallParticles:
         self._along = along
         self._across = across
 
-    def append_to_frame(
+    def read_with_walls(
         self, file: ScenarioFile, travel: NDArray[np.float64], frame: int
     ) -> NDArray[np.float32]:
-        """Return the positions of a frame and, behind them, of the walls.
+        """Return positions of a frame's particles and, behind them, of wall particles.
 
         ``travel`` is how far walls have gone [length], shape [frame, wall].
         """
@@ -365,7 +365,7 @@ def _read_runs(
             wall_velocity = file.read("wall_velocity")
             wall_kinds = _wall_kinds(form, wall_velocity, walls)
             travel = _wall_travel(wall_velocity, interval)
-            read_position = partial(walls.append_to_frame, file, travel)
+            read_position = partial(walls.read_with_walls, file, travel)
             kinds = np.concatenate([kinds, wall_kinds])
             yield file.header.frames, read_position, kinds
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 
 from .assignment import assign_particles
-from .ballistic_analog import Choice, FollowedAnalog, predict_positions
+from .ballistic_analog import Choice, FollowedAnalog, fly_then_follow
 from .predictor import Floats, Given, Kind, Prediction, ReferencePredictor
 from .train_library import state_library
 
@@ -45,7 +45,7 @@ A state of train is at distance 0 of itself.
 class BarycentreChoice:
     """What is chosen on train."""
 
-    flight: Choice  # frames after contact, and analogs
+    after_contact: Choice  # frames after contact, and analogs
     sharpness: float  # power s of the distance
 
 
@@ -129,9 +129,9 @@ def predict(given: Given) -> Prediction:
     """Yield positions on parabolas, and after contact the mean of the analogs."""
     choice = CHOSEN[key_of(given.size)]
     library = state_library(given.size, given.root, np.unique(given.material).tolist())
-    for position in predict_positions(
+    for position in fly_then_follow(
         given,
-        choice.flight,
+        choice.after_contact,
         library=library,
         divide=follow_all,
         combine=MeanCloud(choice.sharpness),

@@ -193,7 +193,7 @@ def follow_own_analog(
     return position
 
 
-def predict_positions(
+def fly_then_follow(
     given: Given,
     choice: Choice,
     *,
@@ -277,7 +277,7 @@ def _analogs_of(
 def predict(given: Given) -> Prediction:
     """Yield positions on parabolas, and after contact those of the analogs."""
     library = state_library(given.size, given.root, np.unique(given.material).tolist())
-    for position in predict_positions(given, choice_for(given.size), library=library):
+    for position in fly_then_follow(given, choice_for(given.size), library=library):
         yield position.astype("float32")
 
 
@@ -290,7 +290,7 @@ def cloud_error(given: Given, choice: Choice, scenario: int) -> float:
     library = state_library(given.size, given.root, np.unique(given.material).tolist())
     truth = read_train_scenario(given.size.path(given.root, scenario))
     errors = []
-    predicted = predict_positions(given, choice, library=library, without=scenario)
+    predicted = fly_then_follow(given, choice, library=library, without=scenario)
     for frame, position in zip(given.predicted_frames, predicted, strict=True):
         if frame % CHOSEN_STRIDE:
             continue

@@ -42,6 +42,9 @@ COURANT = 0.5
 BODY_PASSES = 2
 """Further projections around a fixed body in each stage of a time step."""
 
+LEAST_WEIGHT = 1e-9
+"""A face with less weight than this has no value of its own."""
+
 VISCOUS_SHARE = 0.8
 """Time step over h^2 / (2 d nu), at most, with d axes; Heun's scheme is stable up to 1.
 """
@@ -648,11 +651,12 @@ def _blend(
 
 
 def fill_gaps(sums: Floats, weight: Floats) -> Floats:
-    """Return ``sums / weight``; where the weight is 0, the mean of known neighbours.
+    """Return ``sums / weight`` at the faces of a grid, with gaps filled.
 
+    A face without weight gets the mean of its neighbours that have a value.
     Gaps close from their edges, layer by layer. Without any weight all values are 0.
     """
-    has_value = weight > 1e-9
+    has_value = weight > LEAST_WEIGHT
     divisor = np.where(has_value, weight, 1.0)
     values = np.where(has_value, sums / divisor, 0.0)
     if not has_value.any():

@@ -14,7 +14,15 @@ from lagbench.data.variables import open_netcdf
 from lagbench.errors import WorkFailedError
 
 from .card import ScoreCard
-from .score_layout import FILM_RANGE, FORMAT, IDENTITY, LEVELS, SUBMISSION, Preview
+from .score_layout import (
+    FILL_STEP,
+    FILM_RANGE,
+    FORMAT,
+    IDENTITY,
+    LAST_STEP,
+    SUBMISSION,
+    Preview,
+)
 
 INDEX = 4096
 """Size of the index of chunks in HDF5; smaller variables are not compressed [bytes]."""
@@ -154,16 +162,19 @@ def _defined_range(values: NDArray[np.float32]) -> tuple[float, float]:
 def _pack(
     values: NDArray[np.float32], limits: tuple[float, float]
 ) -> tuple[NDArray[np.uint16], dict[str, Any]]:
-    """Return values as uint16 and the CF attributes that unpack them."""
+    """Return values as uint16 and the CF attributes that unpack them.
+
+    Finite values must lie within the limits; the others become the fill value.
+    """
     low, high = limits
     wide = values.astype(np.float64)
-    scale = (high - low) / LEVELS or 1.0
+    scale = (high - low) / LAST_STEP or 1.0
     steps = np.rint((wide - low) / scale)
-    packed = np.where(np.isfinite(wide), steps, LEVELS + 1)
+    packed = np.where(np.isfinite(wide), steps, FILL_STEP)
     attributes = {
         "scale_factor": scale,
         "add_offset": low,
-        "_FillValue": np.uint16(LEVELS + 1),
+        "_FillValue": np.uint16(FILL_STEP),
     }
     return packed.astype(np.uint16), attributes
 

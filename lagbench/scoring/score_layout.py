@@ -20,8 +20,11 @@ IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
 SUBMISSION = "submission"
 """Row of the submission; reference predictors have rows of their names."""
 
-LEVELS = 65534
-"""Greatest packed value of a preview; 65535 marks missing values."""
+LAST_STEP = 65534
+"""Greatest packed value of a preview."""
+
+FILL_STEP = 65535
+"""Packed value that marks a missing one."""
 
 FILM_RANGE = (-0.5, 1.5)
 """Positions in the preview are clipped to this range [length]."""

@@ -222,7 +222,7 @@ def check_finite(scans: list[ScenarioScan], issues: IssueCollector) -> None:
     value_count = sum(scan.value_count for scan in scans)
     frame, particle, axis = bad_scans[0].first_bad or (0, 0, 0)
 
-    what = "values are no numbers"
+    what = "values are not finite"
     fix = (
         "freeze a diverging rollout at its last finite frame and name it in diverged_at"
     )

@@ -75,7 +75,11 @@ class Inner(BaseModel):
         (list[int], 3, "a list in brackets"),
         (tuple[int, ...], "3", "a list in brackets"),
         (Annotated[list[int], Field(min_length=2)], [1], "a list of at least 2 values"),
-        (Annotated[list[int], Field(max_length=1)], [1, 2], "a list of at most 1 value"),
+        (
+            Annotated[list[int], Field(max_length=1)],
+            [1, 2],
+            "a list of at most 1 value",
+        ),
         (
             Annotated[dict[str, int], Field(min_length=1)],
             {},

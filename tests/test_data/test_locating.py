@@ -27,7 +27,7 @@ from lagbench.data.local import (
     resolve_root,
 )
 from lagbench.data.registry import load
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.clean import clean

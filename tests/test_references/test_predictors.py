@@ -48,9 +48,9 @@ from lagbench.references.ballistic_analog import (
     bodies_touch,
     choose,
     cloud_error,
+    fly_then_follow,
     frames_of_flight,
     label_bodies,
-    predict_positions,
 )
 from lagbench.references.coarse_solver import (
     CoarseRollout,
@@ -817,13 +817,13 @@ def test_after_contact_the_particles_follow_their_analogs(
     materials = np.unique(scenario.material)
     library = state_library(size, root, materials.tolist())
     choice = Choice(lag=0, analogs=2)
-    prediction = predict_positions(resting, choice, library=library)
+    prediction = fly_then_follow(resting, choice, library=library)
     positions = list(prediction)
     assert len(positions) == size.task.horizon
     assert scenario.box.contains(np.stack(positions)).all()
     first_step = positions[0] - resting.last
     assert np.abs(first_step).max() < 0.05
-    prediction = predict_positions(resting, choice, library=None)
+    prediction = fly_then_follow(resting, choice, library=None)
     without_train = list(prediction)
     difference = positions[-1] - without_train[-1]
     assert np.abs(difference).max() > 0.01
