@@ -120,7 +120,7 @@ def test_a_template_without_data_names_the_command_that_makes_them(
 ) -> None:
     output = tmp_path / "predictions.nc"
     result = run("template", SPLIT, "-o", output, "--root", tmp_path / "empty")
-    assert result.exit_code == 2
+    assert result.exit_code == 4
     assert f"lagbench generate --split {SPLIT} --size" in result.stderr
 
 
