@@ -225,7 +225,7 @@ class UsageError(LagbenchError):
     exit_code = 2
 
 
-class ErrorCollector:
+class UsageErrorCollector:
     """Collect the usage errors of several ``with`` blocks, to raise them together."""
 
     def __init__(self) -> None:

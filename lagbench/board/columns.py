@@ -111,7 +111,7 @@ class Column:
     # says which
     of_cost: bool = False
     meaning: str
-    # value of a row, where the column shows no metric
+    # value of a row, where metric_value has none
     read: Callable[[TableRow], object] | None = None
 
     @property
@@ -533,7 +533,7 @@ def loss_of(row: TableRow, column: Column) -> float:
 
 
 def metric_value(row: TableRow, key: str) -> Value | None:
-    """Return the value of a metric, or the skill; None where a row has none."""
+    """Return a metric, a skill or a ratio, with interval; None where a row has none."""
     if row.on_shift is not None:
         if key == SKILL_ON_SHIFT.key:
             return row.on_shift.skill

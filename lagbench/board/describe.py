@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lagbench.errors import ErrorCollector, UsageError
+from lagbench.errors import UsageError, UsageErrorCollector
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.submission.format import Header
 
-from .draft import Draft, PredictionsFile, find_entries_to_differ_from, fit
+from .draft import Draft, PredictionsFile, find_entries_to_differ_from, require_valid
 from .entry import About, Entry, EntryBudget, Meta, Prediction, mean_cost
 from .entry_file import examine, read_rivals
 from .fields import LONGEST_TEXT, latest_date
@@ -39,13 +39,17 @@ def draft_entry(
     replace: bool,
     add: bool,
 ) -> Draft:
-    """Return the draft of an entry; refuse together all that does not fit the files."""
+    """Return the draft of an entry.
+
+    Usage errors are raised together. Any other error, and that of predictions that are
+    submitted already, is raised alone.
+    """
     headers = [file.header for file in files]
     rivals: dict[Path, Entry] = {}
     extended = None
     place = (headers[0].split, headers[0].size, "")  # until the method is known
 
-    errors = ErrorCollector()
+    errors = UsageErrorCollector()
     with errors:
         seeds = seeds_of(headers)
     with errors:
@@ -182,7 +186,7 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
         keys["parameters"] = header.parameters
     keys["cost"] = _cost_of(headers, meta, extended)
     keys["budget"] = _budget_of(headers, meta, extended)
-    return fit(About, keys)
+    return require_valid(About, keys)
 
 
 def _fill_from_entry(meta: Meta, entry: Entry) -> Meta:
@@ -277,4 +281,4 @@ def _describe_predictions(
         "provenance": file.header.provenance,
     }
     fix = "name the file otherwise, or move it"
-    return fit(Prediction, keys, where=file.path, fix=fix)
+    return require_valid(Prediction, keys, where=file.path, fix=fix)

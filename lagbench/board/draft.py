@@ -53,7 +53,7 @@ def find_entries_to_differ_from(
     return {**rivals, extended.yaml_path: extended}
 
 
-def fit(
+def require_valid(
     kind: type[Model],
     keys: Mapping[str, object],
     *,
@@ -61,7 +61,7 @@ def fit(
     fix: str = "say it otherwise in --from meta.yaml; docs/submitting.md describes "
     "the keys",
 ) -> Model:
-    """Return a part of an entry.
+    """Return an entry, or a part of one, from its keys.
 
     Raises:
         ChecksFailedError: a key does not fit the schema.

@@ -350,6 +350,7 @@ def conclude(tab: Tab) -> str:
 def _state_verdict(
     verdict: LearningVerdict, data_set: str, model: str, row: BoardRow, ratio: Value
 ) -> str:
+    """Return the first sentence; ``model`` reads "GNS, the most accurate model"."""
     comparison = f"{model}, has {_compare(row, ratio)}"
     if verdict is LearningVerdict.PAYS:
         return f"Learning pays on {data_set}: {comparison}."

@@ -27,7 +27,7 @@ from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.scoring.score_layout import SUBMISSION
 
-from .draft import Draft, PredictionsFile, fit
+from .draft import Draft, PredictionsFile, require_valid
 from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
 from .entry_file import entry_bytes, read_entry_if_valid
 from .folder import (
@@ -320,7 +320,7 @@ def _form_entry(
         "predictions": tuple(predictions),
         "score": score_block,
     }
-    return fit(Entry, keys)
+    return require_valid(Entry, keys)
 
 
 def _moves_of_scores(

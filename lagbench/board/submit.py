@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import ErrorCollector, UsageError, WorkFailedError
+from lagbench.errors import UsageError, UsageErrorCollector, WorkFailedError
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_layout import SUBMISSION
@@ -157,7 +157,7 @@ def _require_fit_arguments(
     new_board: bool,
 ) -> None:
     """Refuse together all that is wrong before any file is read."""
-    errors = ErrorCollector()
+    errors = UsageErrorCollector()
     with errors:
         if add and replace:
             raise UsageError(

@@ -17,9 +17,9 @@ from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import (
-    ErrorCollector,
     UnreadableFileError,
     UsageError,
+    UsageErrorCollector,
     format_count,
 )
 from lagbench.metrics.significance import FEWEST_SCENARIOS
@@ -114,7 +114,7 @@ def adopt(
         paths = [Path(source) for source in sources]
 
     rows_of: Mapping[str, list[Row]] = {}
-    mistakes = ErrorCollector()
+    mistakes = UsageErrorCollector()
     for name, meaning in NEEDED_OPTIONS.items():
         with mistakes:
             _require_option(options, name, meaning)

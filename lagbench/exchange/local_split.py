@@ -481,7 +481,10 @@ class SplitBuilder:
     def _check_positions(
         self, position: NDArray[np.float32], trajectory: Trajectory, *, where: str
     ) -> None:
-        """Refuse positions not finite or outside the box; note their extent."""
+        """Refuse positions not finite, outside the unit box, or far outside the bounds.
+
+        Their extent is noted.
+        """
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):

@@ -33,9 +33,9 @@ from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import (
     DataError,
-    ErrorCollector,
     UnreadableFileError,
     UsageError,
+    UsageErrorCollector,
     suggest_name,
 )
 from lagbench.submission.issues import quote
@@ -219,7 +219,7 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
     except ValidationError as error:
         details = error.errors()
 
-    mistakes = ErrorCollector()
+    mistakes = UsageErrorCollector()
     for detail in details[:MOST_MISTAKES]:
         with mistakes:
             raise _option_error(detail, where=where)
@@ -318,7 +318,7 @@ class Description:
 
     def __post_init__(self) -> None:
         """Check what the user said, and fit the box where that is asked."""
-        mistakes = ErrorCollector()
+        mistakes = UsageErrorCollector()
         with mistakes:
             check_name(self.name)
         self._check_quantities(mistakes)
@@ -339,7 +339,7 @@ class Description:
                 )
             object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
 
-    def _check_quantities(self, mistakes: ErrorCollector) -> None:
+    def _check_quantities(self, mistakes: UsageErrorCollector) -> None:
         for option, value in (
             ("--radius", self.radius),
             ("--frame-interval", self.frame_interval),
@@ -357,7 +357,7 @@ class Description:
                     fix="give it in the length and time of the data",
                 )
 
-    def _check_counts(self, mistakes: ErrorCollector) -> None:
+    def _check_counts(self, mistakes: UsageErrorCollector) -> None:
         for option, count, least in (
             ("--input-frames", self.input_frames, 2),
             ("--horizon", self.horizon, 1),

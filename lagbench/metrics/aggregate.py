@@ -343,7 +343,7 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     methods = [np.atleast_2d(np.asarray(values, np.float64))]
     if minus is not None:
         methods.append(np.atleast_2d(np.asarray(minus, np.float64)))
-    _check_losses(methods)
+    _check_values(methods)
 
     has_value = []
     for method in methods:
@@ -368,7 +368,7 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     return Resampling(mean=float(np.mean(over_seeds)), parts=parts)
 
 
-def _check_losses(methods: Sequence[Floats]) -> None:
+def _check_values(methods: Sequence[Floats]) -> None:
     """Refuse methods of shape [seed, scenario] that cannot be compared."""
     counts = [method.shape[1] for method in methods]
     if len(set(counts)) > 1:
@@ -377,7 +377,7 @@ def _check_losses(methods: Sequence[Floats]) -> None:
         )
     if any(np.isinf(method).any() for method in methods):
         raise UsageError(
-            "losses are infinite",
+            "values are infinite",
             expected="numbers, NaN where undefined",
             got="infinity",
         )

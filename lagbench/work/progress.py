@@ -15,7 +15,7 @@ def watched() -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """Progress of a generation or verification."""
+    """Progress of a piece of work; training counts its steps as scenarios."""
 
     stage: str  # the present stage, in a word or two
     done: int  # units of work done: substeps, summed over scenarios, or files
@@ -46,7 +46,10 @@ class Meter:
         self._started = time.monotonic()
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
-        """Start a stage with counts at zero, or at those of an earlier run."""
+        """Start a stage with counts at zero, or where an earlier run stopped.
+
+        ``done`` counts units and scenarios alike: it suits stages of one unit each.
+        """
         self.stage = stage
         self._progress = Progress(
             stage=stage,

@@ -90,7 +90,9 @@ def write_report(
 
 
 def check_folder(folder: str | Path) -> None:
-    """Refuse a folder where a report cannot be written or would replace another page.
+    """Make the folder of a report; refuse one that holds another page.
+
+    It is made before the work, so that the work is not lost.
 
     Raises:
         UsageError: the folder holds an index.html that is no report.
@@ -124,13 +126,13 @@ def render(subject: Subject) -> str:
     vorticity = _vorticity_section(subject, gallery)
     motion = _motion_section(subject, gallery)
     if subject.is_full_box:
-        fields_and_motion = [vorticity, motion]
+        vorticity_and_motion = [vorticity, motion]
     else:
-        fields_and_motion = [motion, vorticity]
+        vorticity_and_motion = [motion, vorticity]
     sections = [
         Section("scores", "Scores", _score_tables(subject)),
         _rollout_section(subject),
-        *fields_and_motion,
+        *vorticity_and_motion,
         Section(
             "energy",
             "Energy",
