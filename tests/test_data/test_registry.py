@@ -42,6 +42,7 @@ LARGE_RELATIVES = (
     "cavity-3d",
     "cylinder",
     "fluid-3d",
+    "multimaterial-3d",
 )
 
 
@@ -58,6 +59,7 @@ LARGE_RELATIVES = (
         ("cavity-3d", 0.1, (54_872, 24, 36, 6_912, 48, 8, 16)),
         ("cylinder", 1 / 16, (40_512, 128, 60, 7_200, 48, 8, 16)),
         ("fluid-3d", 1 / 60, (20_736, 48, 24, 10_800, 48, 8, 16)),
+        ("multimaterial-3d", 1 / 60, (13_824, 48, 54, 10_800, 48, 8, 16)),
     ],
 )
 def test_full_sizes_are_those_of_the_documentation(
