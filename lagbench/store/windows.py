@@ -211,23 +211,13 @@ class FrameStore:
             )
         # Frames are cached here: HDF5 need not keep chunks too.
         file = h5py.File(path, "r", rdcc_nbytes=0)
-        try:
-            return self._read_small_values(file, scenario)
-        except BaseException:
-            file.close()
-            raise
-
-    def _read_small_values(self, file: h5py.File, scenario: int) -> _OpenScenario:
-        """Check the identity of an open file; read all but the frames.
-
-        Raises:
-            DataError: the file is that of another scenario, version or content, or a
-                parameter is wrong.
-        """
-        where = str(self._paths[scenario])
         variables = list_variables(file)
         position = variables["position"]
-        self._check_identity(file, scenario, frames=len(position))
+        try:
+            self._check_identity(file, scenario, frames=len(position))
+        except DataError:
+            file.close()
+            raise
         material = np.zeros(position.shape[1], np.int8)
         if "material" in variables:
             material = variables["material"][...]
@@ -237,10 +227,10 @@ class FrameStore:
         body_force = None
         if "body_force" in variables:
             body_force = variables["body_force"][...]
-        parameters = select_parameters(file.attrs, where=where)
-        stated = parse_viscosity(parameters.get("viscosity"), where=where)
+        parameters = select_parameters(file.attrs, where=str(path))
+        stated = parse_viscosity(parameters.get("viscosity"), where=str(path))
         viscosity = self._size.viscosity(stated)
-        obstacle = parse_obstacle(parameters, self._size.dimension, where=where)
+        obstacle = parse_obstacle(parameters, self._size.dimension, where=str(path))
         return _OpenScenario(
             file, position, material, wall_velocity, body_force, viscosity, obstacle
         )
