@@ -769,7 +769,8 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="per-material",
-            what="every material has analogs of its own, whatever is beside it there",
+            what="every material has analogs of its own; the other materials there do "
+            "not matter",
             predict=own.per_material,
             choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
         ),

@@ -207,11 +207,12 @@ to find it; more seeds do. A board that ranks by hundredths ranks by chance.
 
 Both sides are seeds of one method, so the test should tell them apart in at most 5 %
 of the draws. The number of draws limits the accuracy of these shares: a share of 5 % is
-known to 1.4 percentage points. With one
-seed a side the test is the sign-flip test over scenarios. Its answer is right for those
-weights. As an answer about the method it is wrong as often as the first column says. So
-the leaderboard then speaks of "these weights". It says so too if one side has one seed
-and the other side several: the scatter of the side with one seed is unknown.
+uncertain by 1.4 percentage points either way (95 %). With one seed a side the test is
+the sign-flip test over scenarios. Its answer is right for the two trained models that
+are compared, that is, for those weights. As an answer about the method it is wrong as
+often as the column "1 seed a side" says. So the leaderboard then speaks of "these
+weights". It says so too if one side has one seed and the other side several: the
+scatter of the side with one seed is unknown.
 
 | case | 1 seed a side | 1 against {seeds} seeds | 2 a side | 3 a side | 5 a side |
 |---|---|---|---|---|---|

@@ -134,6 +134,9 @@ def reproduce(
     are not run again. Costs are compared inside a data set, so they are measured for
     all its entries, unless all of them have costs of one run.
 
+    If no entry is named, an error of one entry is kept in the result, and the other
+    entries are run.
+
     Args:
         board: the leaderboard's folder.
         entries: entries, as in ``cavity/mini/gns``; by default all that have models.
@@ -157,9 +160,6 @@ def reproduce(
         DataError: the data of a named entry are missing or others.
         UnreadableFileError: a model of a named entry cannot be read.
         WorkFailedError: the disk or the memory is full.
-
-    If no entry is named, an error of one entry is kept in the result, and the other
-    entries are run.
     """
     folder = Folder(board)
     folder.require()
