@@ -3,8 +3,10 @@
 What a surrogate must be compared with: accuracy against cost. It learns nothing, but it
 knows the equations, the viscosity, the materials and the motion of the walls to the
 end. Its grid has half as many cells along each axis, or a quarter, and its time step is
-two or four times as long. A seeded subset of the particles, as many to a cell as before
-and as evenly spread, carries the mass. In a full box the others
+two or four times as long. Where the walls do not lie on nodes of the half grid, it has
+two thirds of the cells and a time step that is 1.5 times as long. A seeded subset of
+the particles, as many to a cell as before and as evenly spread, carries the mass. In a
+full box the others
 move as those around them do (see :mod:`.predictor`); on a free surface each keeps its
 offset to the nearest particle of its material that carries mass.
 
@@ -17,7 +19,9 @@ from __future__ import annotations
 
 import math
 import weakref
+from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +53,14 @@ SOLVED = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
 """Splits that are solved; in full boxes the projection solver is cheaper and better."""
 
 
-def coarser(size: Size, times: int) -> Size | None:
+def coarser(size: Size, times: int | Fraction) -> Size | None:
     """Return a size with fewer cells along each axis, by a factor.
 
     Its time step is longer by the same factor, and a cell has as many particles.
 
     Args:
         size: the split and size that is predicted.
-        times: the factor, 2 or 4.
+        times: the factor: 3/2, 2 or 4.
 
     Returns:
         None where the solver does not solve the split, where a wall would lie between
@@ -68,10 +72,10 @@ def coarser(size: Size, times: int) -> Size | None:
     if size.grid % times or wall % times:
         return None
     values = {
-        "grid": size.grid // times,
-        "wall": wall // times,
+        "grid": int(size.grid / times),
+        "wall": int(wall / times),
         "substeps_per_frame": math.ceil(size.substeps_per_frame / times),
-        "particles": size.particles // times**size.dimension,
+        "particles": int(size.particles // times**size.dimension),
     }
     if values["grid"] < MIN_CELLS or values["particles"] < MIN_PARTICLES:
         return None
@@ -81,7 +85,7 @@ def coarser(size: Size, times: int) -> Size | None:
     return size.model_copy(update={"parameters": parameters})
 
 
-def predict(given: Given, times: int) -> Prediction:
+def predict(given: Given, times: int | Fraction) -> Prediction:
     """Yield positions that the solver on a coarser grid finds.
 
     Raises:
@@ -295,12 +299,30 @@ def _leaders(
     return leader
 
 
-def _describe(name: str, times: int, share: str) -> ReferencePredictor:
+TWO_THIRDS = Fraction(3, 2)
+"""How many times fewer cells where the walls do not lie on nodes of half the grid."""
+
+
+def _has_half(size: Size) -> bool:
+    """Tell whether the solver runs on half of the cells."""
+    return coarser(size, 2) is not None
+
+
+def _has_quarter(size: Size) -> bool:
+    """Tell whether the solver runs on a quarter of the cells."""
+    return coarser(size, 4) is not None
+
+
+def _has_two_thirds_only(size: Size) -> bool:
+    """Tell whether the solver runs on two thirds of the cells, but not on half."""
+    return not _has_half(size) and coarser(size, TWO_THIRDS) is not None
+
+
+def _describe(
+    name: str, times: int | Fraction, share: str, applies: Callable[[Size], bool]
+) -> ReferencePredictor:
     def predict_scenario(given: Given) -> Prediction:
         return predict(given, times)
-
-    def has_grid(size: Size) -> bool:
-        return coarser(size, times) is not None
 
     return ReferencePredictor(
         name=name,
@@ -309,12 +331,15 @@ def _describe(name: str, times: int, share: str) -> ReferencePredictor:
         definition=f"The solver itself on a grid with {share} of the cells along each"
         " axis, with the longer time step of that grid: it knows the equations, the"
         " materials and what drives the flow.",
-        applies=has_grid,
+        applies=applies,
         predict=predict_scenario,
     )
 
 
 PREDICTORS = (
-    _describe("coarse-solver", 2, "half"),
-    _describe("coarse-solver-4x", 4, "a quarter"),
+    _describe("coarse-solver", 2, "half", _has_half),
+    _describe("coarse-solver-4x", 4, "a quarter", _has_quarter),
+    _describe(
+        "coarse-solver-two-thirds", TWO_THIRDS, "two thirds", _has_two_thirds_only
+    ),
 )

@@ -7,6 +7,7 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,8 @@ FULL_BOX = (
         ("fluid", "mini", f"{SURFACE} coarse-solver analog-barycentre"),
         ("multimaterial", "full", f"{SURFACE} coarse-solver coarse-solver-4x"),
         ("multimaterial", "mini", f"{SURFACE} coarse-solver analog-barycentre"),
+        ("multimaterial-3d", "full", f"{SURFACE} coarse-solver-two-thirds"),
+        ("multimaterial-3d", "mini", f"{SURFACE} coarse-solver"),
         ("fluid", "tiny", SURFACE),
         ("own", "cell_centres", FULL_BOX),
         ("own", "nodes", "persistence constant-velocity analog"),
@@ -176,10 +179,22 @@ def test_a_size_has_the_predictors_of_its_kind_of_box(
         tier = load().size(split, size)
     tier_names = [predictor.name for predictor in references_of(tier)]
     assert " ".join(tier_names) == names
-    for times in (2, 4):
+    for times in (Fraction(3, 2), 2, 4):
         coarse = coarser(tier, times)
         if coarse is not None:
             assert coarse.grid * times == tier.grid
+            assert coarse.value("wall") * times == tier.value("wall")
+
+
+def test_two_thirds_of_the_cells_keep_the_particles_of_a_cell() -> None:
+    """Walls at node 3 of 48 cells come to lie on node 2 of 32."""
+    full = load().size("multimaterial-3d", "full")
+    coarse = coarser(full, Fraction(3, 2))
+    assert coarse is not None
+    assert coarse.grid == 32
+    assert coarse.value("wall") == 2
+    assert coarse.particles / 32**3 == full.particles / 48**3
+    assert coarse.substeps_per_frame == math.ceil(full.substeps_per_frame * 2 / 3)
 
 
 def test_every_predictor_says_what_it_is() -> None:
