@@ -69,7 +69,8 @@ def score_command(
     all_references: Annotated[
         bool,
         option(
-            "--all-floors", "Show every reference predictor, not only the best one."
+            "--all-references",
+            "Show every reference predictor, not only the best one.",
         ),
     ] = False,
     as_json: JsonFlag = False,

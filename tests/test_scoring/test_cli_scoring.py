@@ -180,7 +180,7 @@ def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
     dataset = f"{SPLIT} --size {SIZE}"
     for command in (
         f"score {predictions}",
-        f"score {predictions} --all --all-floors",
+        f"score {predictions} --all --all-references",
         f"compare {predictions.parent} analog --all",
         "list",
         "info cavity",
