@@ -180,47 +180,57 @@ def count_pairs_of_seeds() -> tuple[int, int]:
 
 
 PAGE = """\
-# Power: what the test can tell apart
+# Power: which differences can the test find?
 
-`python benchmarks/power.py --write` writes this page. The first rows assume how much
-methods and seeds scatter. A row with the name of a split is measured from the score
-files of its size mini in leaderboard/scores. A split has a row if two of its methods
-meet two conditions: their means differ by less than a factor of two, and at least one
-of them has several seeds. If there are only two methods with two seeds each, the
-scatter is known only roughly.
+`lagbench compare` and the leaderboard use a statistical test, `lagbench.metrics.differ`.
+This page answers two questions about it. How often does the test find a difference that
+exists? How often does it find a difference between two seeds of the same method?
+`python benchmarks/power.py --write` writes this page.
 
-The value of seed s in scenario i is modelled as the mean times (1 + scenario +
-method-in-scenario + seed + rest), where the last four terms are random. The scenario
-term is the same for both methods. The standard deviations of the other three are given
-below, relative to a method's mean. The last three columns say how often
-`lagbench.metrics.differ` tells two methods apart at 5 %, with {seeds} seeds each, if
-one is better by 5, 10 and 20 % ({draws} draws).
+## Differences that the test finds
+
+**Model.** The value of seed s in scenario i is the mean of the method times (1 +
+scenario + method-in-scenario + seed + rest). The last four terms are random. The
+scenario term is the same for both methods. The table shows the standard deviations of
+the other three terms, relative to the mean of a method.
+
+**Rows.** The first rows use assumed standard deviations. Each row with the name of a
+split uses standard deviations that we measured, from the score files of size mini in
+leaderboard/scores. They need two methods whose means differ by less than a factor of
+two, and at least one of them must have several seeds. If there are only two methods
+with two seeds each, these standard deviations are inaccurate.
+
+**Result.** The last three columns show the share of {draws} draws in which the test finds
+a difference at the level of 5 %. One of the two methods is better by 5, 10 or 20 %. Each
+method has {seeds} seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
 {rows}
 
-If a difference is small compared with the scatter of seeds, more scenarios do not help
-to find it; more seeds do. A board that ranks by hundredths ranks by chance.
+If a difference is small compared with the scatter between seeds, more seeds help to find
+it, but more scenarios do not. A leaderboard that ranks by such small differences ranks by
+chance.
 
-## Equal methods that are told apart
+## Differences between equal methods
 
-Both sides are seeds of one method, so the test should tell them apart in at most 5 %
-of the draws. The number of draws limits the accuracy of these shares: a share of 5 % is
-uncertain by 1.4 percentage points either way (95 %). With one seed a side the test is
-the sign-flip test over scenarios. Its answer is right for the two trained models that
-are compared, that is, for those weights. As an answer about the method it is wrong as
-often as the column "1 seed a side" says. So the leaderboard then speaks of "these
-weights". It says so too if one side has one seed and the other side several: the
-scatter of the side with one seed is unknown.
+In this table both sides are seeds of the same method. So the test should find a
+difference in at most 5 % of the draws. The shares have a statistical error: 5 % means
+5 % plus or minus 1.4 percentage points (95 % interval).
 
-| case | 1 seed a side | 1 against {seeds} seeds | 2 a side | 3 a side | 5 a side |
+With one seed on each side the test is the sign-flip test over scenarios. Its answer is
+correct for the two trained models, that is, for these weights. But it is often wrong for
+the methods, as the column "1 seed each" shows. Therefore the leaderboard then speaks of
+"these weights". It does so too if only one of the sides has several seeds, because the
+scatter between the seeds of the other side is unknown.
+
+| case | 1 seed each | 1 against {seeds} seeds | 2 seeds each | 3 seeds each | 5 seeds each |
 |---|---|---|---|---|---|
 {false_rows}
 
-The score files of cavity, curl-noise, fluid and multimaterial at size mini hold
-{pair_count} pairs of two seeds of the same method. The test tells {differing_count}
-of these pairs apart, at 5 %, although the method is the same.
+The leaderboard has {pair_count} pairs of two seeds of the same method, on cavity,
+curl-noise, fluid and multimaterial at size mini. The test finds a difference, at 5 %, in
+{differing_count} of these pairs.
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
