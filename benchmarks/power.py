@@ -182,10 +182,10 @@ def count_pairs_of_seeds() -> tuple[int, int]:
 PAGE = """\
 # Power: which differences can the test find?
 
-`lagbench compare` and the leaderboard use a statistical test, `lagbench.metrics.differ`.
-This page answers two questions about it. How often does the test find a difference that
-exists? How often does it find a difference between two seeds of the same method?
-`python benchmarks/power.py --write` writes this page.
+`lagbench compare` and the leaderboard use a statistical test,
+`lagbench.metrics.differ`. This page answers two questions about it. How often does
+the test find a difference that exists? How often does it find a difference between
+two seeds of the same method? `python benchmarks/power.py --write` writes this page.
 
 ## Differences that the test finds
 
@@ -200,17 +200,17 @@ leaderboard/scores. They need two methods whose means differ by less than a fact
 two, and at least one of them must have several seeds. If there are only two methods
 with two seeds each, these standard deviations are inaccurate.
 
-**Result.** The last three columns show the share of {draws} draws in which the test finds
-a difference at the level of 5 %. One of the two methods is better by 5, 10 or 20 %. Each
-method has {seeds} seeds.
+**Result.** The last three columns show the share of {draws} draws in which the test
+finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
+20 %. Each method has {seeds} seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
 {rows}
 
-If a difference is small compared with the scatter between seeds, more seeds help to find
-it, but more scenarios do not. A leaderboard that ranks by such small differences ranks by
-chance.
+If a difference is small compared with the scatter between seeds, more seeds help to
+find it, but more scenarios do not. A leaderboard that ranks by such small differences
+ranks by chance.
 
 ## Differences between equal methods
 
@@ -218,19 +218,19 @@ In this table both sides are seeds of the same method. So the test should find a
 difference in at most 5 % of the draws. The shares have a statistical error: 5 % means
 5 % plus or minus 1.4 percentage points (95 % interval).
 
-With one seed on each side the test is the sign-flip test over scenarios. Its answer is
-correct for the two trained models, that is, for these weights. But it is often wrong for
-the methods, as the column "1 seed each" shows. Therefore the leaderboard then speaks of
-"these weights". It does so too if only one of the sides has several seeds, because the
-scatter between the seeds of the other side is unknown.
+With one seed on each side the test is the sign-flip test over scenarios. Its answer
+is correct for the two trained models, that is, for these weights. But it is often
+wrong for the methods, as the column "1 seed each" shows. Therefore the leaderboard
+then speaks of "these weights". It does so too if only one of the sides has several
+seeds, because the scatter between the seeds of the other side is unknown.
 
-| case | 1 seed each | 1 against {seeds} seeds | 2 seeds each | 3 seeds each | 5 seeds each |
+| case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|
 {false_rows}
 
 The leaderboard has {pair_count} pairs of two seeds of the same method, on cavity,
-curl-noise, fluid and multimaterial at size mini. The test finds a difference, at 5 %, in
-{differing_count} of these pairs.
+curl-noise, fluid and multimaterial at size mini. The test finds a difference, at 5 %,
+in {differing_count} of these pairs.
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
