@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.errors import require
+from lagbench.errors import check_installed
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import Solver, build
 from lagbench.generators.split import InitialState, SolverParameters
@@ -114,7 +114,8 @@ class CoarseRollout:
     """
 
     def __init__(self, given: Given, coarse: Size) -> None:
-        require("taichi", extra="generate")
+        # Not imported here: the solver keeps Taichi quiet.
+        check_installed("taichi", extra="generate")
 
         self.given = given
         self.substeps = coarse.substeps_per_frame

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
@@ -645,6 +648,46 @@ def test_the_coarse_solver_moves_all_particles() -> None:
         expected_fall = fall_unit * k * (k + 1)
         expected = [0.0, expected_fall]
         assert_allclose(mean_fall, expected, atol=1e-3)
+
+
+QUIET_ROLLOUT = """
+from pathlib import Path
+import numpy as np
+from lagbench.data.registry import load
+from lagbench.references.coarse_solver import coarser, predict_with
+from lagbench.references.predictor import Given
+
+size = load().size("fluid", "mini")
+axis = np.linspace(0.4, 0.6, 25)
+block = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+scenario = Given(
+    size=size,
+    root=Path(),
+    position=np.stack([block, block]),
+    material=np.zeros(625, np.int8),
+    walls=np.zeros((2, 4, 2)),
+    area=0.04,
+    parameters={},
+)
+next(predict_with(scenario, coarser(size, 2)))
+"""
+
+
+@pytest.mark.slow
+def test_the_coarse_solver_prints_nothing() -> None:
+    """Taichi greets on stdout as it is imported, which would spoil JSON there."""
+    # This process may have asked Taichi for silence, which a child would inherit.
+    environment = dict(os.environ)
+    environment.pop("ENABLE_TAICHI_HEADER_PRINT", None)
+    result = subprocess.run(
+        [sys.executable, "-c", QUIET_ROLLOUT],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout + result.stderr == ""
 
 
 def test_an_analog_needs_all_of_train(
