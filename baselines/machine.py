@@ -14,6 +14,9 @@ import torch
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.work.machine import available_cores, processor_name, read_processor
 
+MOST_THREADS = 1024
+"""Threads that may be asked for where there are fewer cores."""
+
 
 def choose_device(name: str) -> str:
     """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU if there is one.
@@ -53,7 +56,19 @@ def use_threads(count: int | None, *, processes: int = 1) -> Iterator[None]:
     """Use so many threads for a while.
 
     By default it is OMP_NUM_THREADS, else a process's share of the cores.
+
+    Raises:
+        UsageError: there are so many that OpenMP might end the process.
     """
+    most_threads = max(MOST_THREADS, available_cores())
+    if count is not None and count > most_threads:
+        raise UsageError(
+            "so many threads cannot be used",
+            where="--threads",
+            expected=f"at most {most_threads}",
+            got=count,
+            fix=f"leave --threads out; this machine has {available_cores()} cores",
+        )
     before = torch.get_num_threads()
     if not count:
         environment = os.environ.get("OMP_NUM_THREADS", "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
@@ -71,13 +71,13 @@ def close_command(
         ),
     ] = None,
     source: Annotated[
-        str,
+        str | None,
         option(
             "--source TEXT",
             "Source of a public random value that nobody knows yet. The seeds then "
             "wait for it.",
         ),
-    ] = "",
+    ] = None,
     value: Annotated[
         str | None,
         option("--value TEXT", "The random value that a closed season waits for."),
@@ -93,17 +93,27 @@ def close_command(
     1: a model is not the one that its entry names
     2: the season is closed already, or there is no model to freeze
     """
-    if value is not None and source:
-        raise UsageError(
-            "--source and --value exclude each other",
-            where="--source and --value",
-            expected="one of the two",
-            got="both",
-            fix="give --source before the value is known, and --value afterwards",
-        )
     if value is not None:
+        _refuse_closing_options(
+            {
+                "--source": source,
+                "--split": split,
+                "--size": size,
+                "--scenarios": scenarios,
+                "--budget": budget,
+            }
+        )
         season = reveal(board, name, value)
     else:
+        if source is not None and not source.strip():
+            raise UsageError(
+                "the source of the random value is not named",
+                where="--source",
+                expected="a text that says who publishes the value, and when",
+                got=repr(source),
+                fix="name the source; or leave --source out for seeds of the models "
+                "alone",
+            )
         season = close(
             board,
             name,
@@ -111,13 +121,36 @@ def close_command(
             size=size,
             scenarios=scenarios,
             budget=budget,
-            source=source,
+            source=source or "",
             root=root,
             lagbench=version("lagbench"),
         )
     path = board / season_path(name)
     lines = _describe_season(season, path, board)
     print_result(season.model_dump(mode="json"), lines, as_json=as_json, quiet=quiet)
+
+
+def _refuse_closing_options(options: Mapping[str, object]) -> None:
+    """Refuse options that a season is closed with, where it is closed already.
+
+    Args:
+        options: values by option; None, or the default number of scenarios, where an
+            option was not given.
+
+    Raises:
+        UsageError: one of them was given beside ``--value``.
+    """
+    given = [name for name, value in options.items() if value not in (None, SCENARIOS)]
+    if not given:
+        return
+    raise UsageError(
+        "--value is the random value of a season that is closed already",
+        where="--value",
+        expected="the name of the season and --value alone",
+        got=f"{', '.join(given)} and --value",
+        fix=f"give {given[0]} as the season is closed, and --value when the value is "
+        "known",
+    )
 
 
 def _describe_season(season: Season, path: Path, board: Path) -> Iterator[str]:

@@ -827,3 +827,12 @@ def test_threads_are_those_asked_for(
     with use_threads(count, processes=processes):
         assert torch.get_num_threads() == expected
     assert torch.get_num_threads() == before
+
+
+def test_so_many_threads_that_a_process_may_end_are_refused() -> None:
+    """OpenMP ends a process that asks for a million threads, without a message."""
+    before = torch.get_num_threads()
+    with pytest.raises(UsageError) as caught, use_threads(1_000_000):
+        pass
+    assert caught.value.where == "--threads"
+    assert torch.get_num_threads() == before
