@@ -58,11 +58,13 @@ from .thesis.var_protocol import beside_thesis
 INTRODUCTION = """\
 # Results
 
-On this page you can look up how well the reference models predict each data set, which
-claims of the thesis hold on our data, and what the trainings cost. The first table has
-the best model of each data set. After it come the claims, the trainings, and one
-chapter per data set with all models beside the numbers of the thesis (D. Dharma, PhD
-thesis, University of Leeds, 2025)."""
+On this page you can look up three things: how well the reference models predict each
+data set, which claims of the thesis are true on our data, and the cost of the
+trainings. (The thesis is D. Dharma, PhD thesis, University of Leeds, 2025.)
+
+The first table has the best model of each data set. Then follow the claims, the
+trainings, and one chapter per data set. A chapter has all models, with the numbers of
+the thesis beside ours."""
 
 SUMMARY_NOTE = """\
 A row compares the best learned model, or the best hybrid, of a data set with the best
@@ -70,77 +72,85 @@ predictors that are not trained. A hybrid is a solver with a learned part. A low
 is better.
 
 - The time in brackets after a score is the processor time of one frame on one core, on
-  the machine that timed the reference predictors. Learned models were timed on another
-  machine. Their times are therefore multiplied by the ratio of our solver's times on
-  the two machines.
+  the machine of the reference predictors. Learned models were measured on another
+  machine. Therefore their times are multiplied by a ratio: the time of our solver on
+  the machine of the reference predictors, divided by its time on the other machine.
 - `skill` is 1 - score / score of the best naive baseline.
 - `against_classical` is score / score of the best classical solver that costs no more
-  per frame. Below 1, learning pays. The brackets hold the 95 % interval, and the name
-  of the solver follows. The costs come from one run on one machine, if there is such a
-  run (`leaderboard/verified.yaml`), as on the leaderboard."""
+  per frame. If it is below 1, [learning pays](glossary.md). The brackets contain the
+  95 % interval. The name of the solver follows.
+- The costs for `against_classical` come from one run on one machine, if there is such a
+  run (`leaderboard/verified.yaml`). The leaderboard uses the same costs."""
 
 HOW_TO_READ = """\
 ## How to read this page
 
-- **Reference predictors** are not trained. A naive baseline neither learns nor
-  integrates the equations; a classical solver integrates them
-  ([references](references.md) says on which grid).
-- **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
-  as that baseline, and below 0 is worse.
-- **Cells** hold the mean over the test scenarios, with a 95 % bootstrap interval over
+- **Reference predictors** are not trained. A naive baseline learns nothing and knows no
+  equation. A classical solver integrates the equations
+  ([references](references.md)).
+- **Skill** is 1 - score / score of the best naive baseline. Skill 1 is perfect. Skill 0
+  is as good as this baseline. Below 0 the model is worse.
+- **Cells** have the mean over the test scenarios, with a 95 % bootstrap interval over
   scenarios. If a model has several seeds, the number after ± is the standard deviation
   over the seeds. The leaderboard resamples the seeds too, so its intervals are wider
   for a model with few seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
-  and seeds. One training can be used in two ways, such as with and without mirror
-  averaging; then the two ways are compared seed by seed. The p-values are corrected for
-  the number of rivals (Holm). With fewer than six scenarios nothing is claimed.
+  and seeds. Two models may use the same weights, for example with and without mirror
+  averaging. Then they are compared seed by seed. The p-values are corrected for
+  the number of models in the comparison (Holm). With fewer than six scenarios there is
+  no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
-  GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
-  orientation. Size `mini` has about a quarter of the particles and about half the cells
-  along an axis, so compare only the order of the models there.
-- **Metrics** are defined in [scoring](scoring.md). In the heads ↓ means that less is
-  better, ↑ that more is better, and ◎ that the value after the sign is best.
-- **Comparisons** have two models. `means` and `seeds` have a number for each, that of
-  the first model first. `lead` is the amount by which the first mean is better, in the
-  units of the metric; a negative lead means that the second mean is better.
-  `won` counts the scenarios where the first model is better.
+  GPUs. Each of its tables has one scenario. So compare its numbers with ours only
+  roughly. Size `mini` has about a quarter of the particles and about half the cells
+  along an axis. So at `mini` compare only the order of the models.
+- **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
+  lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
+- **Comparisons** have two models. `means` and `seeds` have two numbers, first that of
+  the first model. `lead` is the difference of the means in the units of the metric. It
+  is positive if the first model is better. `won` is the number of scenarios in which
+  the first model is better.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
 
 CLAIMS_NOTE = """\
-The answers use the ranking metric over the horizon. "Ahead of 3 of 5" means that the
-mean is better than those of three of five models. "Yes" and "better" mean significantly
-better at 5 %. "No" and "worse" mean significantly worse. "Open" means that the test
-finds no difference. Two models are compared over the seeds that both have, or over all
-seeds if they share none. "These weights" means that a model has fewer than three
-trainings, so the answer is about these weights, not about the methods. Models whose fit
-draws nothing need one training only. A dash means that an entry is missing. Models that
-fail a [gate](baselines.md#gates) take no part, and neither do entries that were
-superseded or withdrawn. For an operator the entry with the recipe `pushforward` is
-compared, if there is one."""
+The table has one question per row, and one answer per data set. The answers use the
+ranking metric over the horizon:
+
+- "Yes" and "better" mean significantly better at 5 %. "No" and "worse" mean
+  significantly worse. "Open" means that the test finds no difference.
+- "Ahead of 3 of 5" means that the mean is better than the means of three of five
+  models.
+- "These weights" means that a model has fewer than three trainings. Then the answer is
+  about these weights, not about the methods. (If a fit uses no random numbers, one
+  training is enough.)
+- A dash means that an entry is missing.
+
+Two models are compared over the seeds that both have. If there are no such seeds, they
+are compared over all seeds. Models that fail a [gate](baselines.md#gates) are not
+compared. Superseded and withdrawn entries are not compared either. For an operator the
+entry with the recipe `pushforward` is compared, if there is one."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-No data set has active entries of both models that these questions compare:"""
+No data set has active entries of both models, so these questions have no answer:"""
 
 TRAINING_NOTE = """\
-The three validation columns belong to the first seed. They hold the lowest validation
-error up to a quarter, a half and all of the steps. `validated` names the metric of this
-error. The last column says by how much the second half of the steps lowered it. A model
-that gained more than 2 % has not converged. Hours do not include validations, as in the
-entries. Only the hours of the first trainings of NeuralMPM include them."""
+The three validation columns show the first seed. They have the lowest validation error
+in the first quarter, the first half and all of the steps. `validated` is the metric of
+this error. The last column shows how much the error decreased in the second half of the
+steps. If it decreased by more than 2 %, the training has not converged. Hours do not
+include validations. (The first trainings of NeuralMPM are an exception.)"""
 
 COST_NOTE = """\
-Cost. `changed` lists the options of the training or of the prediction that differ from
-the recipe; `none` means that no option differs. If the seeds have different values, a
-slash separates the values, in the order of the seeds. If there is no record of the
-training, `recipe` and `changed` hold what the entry says. The speed-up is our solver's
-time for a frame, on one core, divided by the time of the model on the same machine.
-Hours do not include validations."""
+**Cost.** `changed` lists the options of the training or of the prediction that differ
+from the recipe. `none` means that no option differs. If the seeds have different
+values, a slash separates the values, in the order of the seeds. If there is no record
+of the training, `recipe` and `changed` come from the entry. The speed-up is the time of
+our solver for a frame, on one core, divided by the time of the model on the same
+machine. Hours do not include validations."""
 
 COMMANDS = """\
 ## How to make these results again
@@ -154,15 +164,16 @@ lagbench submit predictions.nc --from meta.yaml
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
-and figures of a size. It can be interrupted and repeated. `lagbench submit` makes
-entries of its runs.
+and figures of a size. If you interrupt it, the same command continues.
+`lagbench submit` makes entries from its runs.
 
-Results without an entry are read from `docs/studies/<split>/<size>/`. There,
-`mlp_studies.json` is a copy of the file of that name in the folder of runs (`--runs`),
-and `var_protocol.json` is the output of
+Results without an entry come from two files in `docs/studies/<split>/<size>/`.
+`mlp_studies.json` is a copy of the file with this name in the folder of runs
+(`--runs`). `var_protocol.json` is the output of
 `python -m studies.thesis.var_protocol --size mini --json`.
 
-Variants change an option or two, take another recipe, or predict in another way:"""
+A variant is a model with other options, with another recipe, or with another way of
+prediction:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -242,7 +253,7 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
         )
         yield table_markdown(leading)
 
-    yield "### What does a CPU hour buy?"
+    yield "### How much does the error decrease with the training?"
     yield TRAINING_NOTE
     yield training_table(learned)
 
@@ -256,16 +267,19 @@ def _chapter(results: SplitResults) -> Iterator[str]:
     yield f"## {results.where}"
     yield (
         f"{size.particles} particles; {task.input_frames} given frames, "
-        f"{task.horizon} predicted ones; {test_count} test scenarios, {train_count} "
-        f"to train on; data set {size.version}. The best by `{results.ranking}` "
-        "comes first."
+        f"{task.horizon} predicted frames; {test_count} test scenarios, {train_count} "
+        f"train scenarios; version {size.version} of the data. The models are sorted "
+        f"by `{results.ranking}`, the best first."
     )
     yield horizon_table(results)
     if not results.models:
         return
 
     if size.split in TABLE_4_8:
-        yield "Table 4.8: errors of a rollout by scene. A cell is ours / the thesis's."
+        yield (
+            "This table has the errors of a rollout for each scene, as Table 4.8 of "
+            "the thesis. A cell is our value / the value of the thesis."
+        )
         yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
     elif size.split in EXPECTED:
         yield _vorticity_note(results)
@@ -273,8 +287,8 @@ def _chapter(results: SplitResults) -> Iterator[str]:
         tau = order_agreement(results)
         if tau is not None:
             yield (
-                f"Kendall's tau of the two orders by MSE: {tau} "
-                "(1: the same order, -1: reversed)."
+                "Kendall's tau compares the order of the models by MSE with that of "
+                f"the thesis: {tau} (1: the same order, -1: the reversed order)."
             )
     yield COST_NOTE
     yield cost_table(results)
@@ -282,12 +296,13 @@ def _chapter(results: SplitResults) -> Iterator[str]:
 
 def _vorticity_note(results: SplitResults) -> str:
     note = (
-        "Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame "
-        f"{key_frame(results.size)}. A cell is the mean over test scenarios, with the "
-        "first test scenario (T0) in brackets"
+        "This table has the metrics of the vorticity at frame "
+        f"{key_frame(results.size)}, as Tables 5.4, 5.5 and Fig. 5.13 of the thesis. A "
+        "cell is the mean over test scenarios, with the first test scenario (T0) in "
+        "brackets"
     )
     if results.size.split == "cavity":
-        return f"{note}. The thesis prints T0 only: compare it with the brackets."
+        return f"{note}. The thesis has only T0: compare it with the brackets."
     return f"{note}."
 
 
@@ -344,8 +359,8 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
     if unscored:
         names = ", ".join(unscored)
         yield (
-            f"- {results.where}: {names}: trained, but without an active entry "
-            "([baselines](baselines.md#gates) says why)."
+            f"- {results.where}: {names} were trained, but have no active entry "
+            "([reason](baselines.md#gates))."
         )
     if missing:
         names = ", ".join(missing)
@@ -355,7 +370,7 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
         yield f"- {results.where}: {names}: `{command}`, then `lagbench submit`."
     if results.stale:
         count = len(results.stale)
-        yield f"- {results.where}: {count} score files of other data, left out."
+        yield f"- {results.where}: {count} score files belong to other data."
 
 
 SHOWN_LINES = 20  # of the difference from a stale page
