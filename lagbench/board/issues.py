@@ -51,7 +51,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "name another",
     ),
     "place": BoardCheck(
-        "an entry that names another split, size or method than its path does",
+        "an entry whose split, size or method differs from its path",
         "the entry lies in another place than it says",
         "the path that follows from it",
         "let split, size and method be those of the path",
@@ -76,15 +76,15 @@ CHECKS: Mapping[str, BoardCheck] = {
         "choose another name, or say what differs, as in 'GNS, six terms'",
     ),
     "lifecycle": BoardCheck(
-        "a superseded entry whose successor is missing, or leads back to the entry "
-        "itself",
+        "a superseded entry whose successor is missing or is the entry itself (also "
+        "through other entries)",
         "the entry is superseded by an entry that is not there",
         "another entry there, active in the end",
         "name an entry that is there and replaces it, or set status: withdrawn",
     ),
     "predictions": BoardCheck(
-        "predictions that the entry places in the folder, but that are missing there "
-        "or have another length",
+        "predictions that the entry names as a file in the folder, if this file is "
+        "missing or has another length",
         "the predictions do not lie where the entry says",
         "a file of that length",
         "correct path and bytes, or remove path",
@@ -111,13 +111,12 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scores that a prediction can have",
     ),
     "score": BoardCheck(
-        "a score in the entry that differs from the one that follows from its score "
-        "files",
+        "a score in the entry that disagrees with its score files",
         "the score block is not what the score files give",
         "what the score files give",
     ),
     "budget": BoardCheck(
-        "a budget or track in the entry that does not follow from the budgets of its "
+        "a budget or track in the entry that disagrees with the budgets of its "
         "predictions",
         "the budget is not what those of the predictions give",
         "no track, since the predictions have no budgets",
@@ -153,23 +152,23 @@ CHECKS: Mapping[str, BoardCheck] = {
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
-        "a line of verified.yaml about an entry that is not there, or has other score "
-        "files by now; a level that the records of the line do not prove",
+        "a line of verified.yaml about an entry that does not exist, or whose score "
+        "files have changed; a level without the records that prove it",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
     "shift": BoardCheck(
-        "a line of shift.yaml about an entry that is not there, or about other models, "
-        "data or scenarios",
+        "a line of shift.yaml about an entry that does not exist, or about other "
+        "models, data or scenarios",
         "shift.yaml has scores that belong to no entry",
         "scores of the entry's own models on the present data",
         "remove the line, and score anew: lagbench leaderboard shift ENTRY",
     ),
     "season": BoardCheck(
-        "a file of a blind season that cannot be read, whose seeds, scenarios or "
-        "models are not those that were frozen, or whose public scores are not those "
-        "of the score files",
+        "a file of a blind season that cannot be read; seeds, scenarios or models "
+        "that differ from the frozen ones; public scores that disagree with the score"
+        " files",
         "a season is not the one that was closed",
         "what `lagbench season close` and `lagbench season run` wrote",
         "restore the files of the commit that closed the season",
