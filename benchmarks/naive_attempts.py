@@ -723,7 +723,7 @@ def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="offset",
-            what="the same; the offset from the partner fades at other rates",
+            what="the same, with other factors for the offset from the partner",
             predict=own.shared,
             choices=grid(
                 lag=(0, 10),
@@ -733,7 +733,7 @@ def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="velocities",
-            what="the same; velocities count less or more when states are compared",
+            what="the same, with other weights of the velocities in the comparison",
             predict=own.shared,
             choices=grid(
                 lag=(0, 10),
@@ -749,7 +749,7 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
     return (
         Attempt(
             name="weighted",
-            what="mixture of k analogs; nearer ones get more particles",
+            what="mixture of k analogs; a nearer analog gets more particles",
             predict=own.weighted,
             choices=grid(
                 lag=(0, 10),
@@ -759,7 +759,7 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="barycentre",
-            what="Wasserstein mean of k analogs, matched anew at each measured frame",
+            what="Wasserstein mean of k analogs, matched again at each measured frame",
             predict=own.barycentre,
             choices=grid(
                 lag=(0, 10),
@@ -769,20 +769,19 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="per-material",
-            what="every material has analogs of its own; the other materials there do "
-            "not matter",
+            what="separate analogs for each material",
             predict=own.per_material,
             choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
         ),
         Attempt(
             name="windows",
-            what="one analog per window of time, sought anew from the prediction",
+            what="a new analog for each window of frames, found from the prediction",
             predict=own.windows,
             choices=grid(lag=(0, 10), window=(20, 40, 80)),
         ),
         Attempt(
             name="from-the-start",
-            what="mixture of the k scenarios that start most alike",
+            what="mixture of the k scenarios with the most similar start",
             predict=own.from_the_start,
             choices=grid(
                 analogs=(1, 2, 4, 8),
