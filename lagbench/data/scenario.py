@@ -62,6 +62,7 @@ STATED_NAMES = frozenset(
 )
 """Parameters that lagbench or a user reads from the file, if the file states them."""
 
+_VERSION = re.compile(r"[0-9]{1,6}(?:\.[0-9]{1,6}){2}")
 _FACT_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
@@ -404,10 +405,13 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
 def _read_header(
     file: h5py.File, variables: Mapping[str, h5py.Dataset]
 ) -> ScenarioHeader:
+    version = _require_text(file, "version")
+    if not _VERSION.fullmatch(version):
+        raise DataError(f"the attribute 'version' is {version[:40]!a}")
     key = ScenarioKey(
         split=_require_text(file, "split"),
         size=_require_text(file, "size"),
-        version=_require_text(file, "version"),
+        version=version,
         scenario=int(_require_attribute(file, "scenario")),
         subset=_require_text(file, "subset"),
     )

@@ -197,8 +197,10 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             frames_per_chunk = max(1, CHUNK_BYTES // frame_bytes)
             scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
             attributes = {}
-            for name in ("split", "size", "scenario", "version"):
+            for name in ("split", "size", "version"):
                 attributes[name] = scenario.attrs[name]
+            attributes["scenario"] = int(scenario.attrs["scenario"])
+            _check_positions(file["position"])
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
             reason = f"{type(error).__name__}: {error}"
             raise damage_error(path, reason, fix=fix) from error
@@ -214,11 +216,22 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     return scenario
 
 
+def _check_positions(position: xr.DataArray) -> None:
+    """Refuse positions that are no numbers, or have other axes than a file of ours.
+
+    Raises:
+        ValueError: they are something else.
+    """
+    if position.dtype.kind != "f" or position.dims != ("frame", "particle", "space"):
+        message = f"position holds {position.dtype}, with axes {position.dims}"
+        raise ValueError(message)
+
+
 def _is_of(key: ScenarioKey, attributes: Mapping[str, Any]) -> bool:
     """Tell whether attributes name a scenario; MINOR and PATCH may differ."""
     return (
         attributes["split"] == key.split
         and attributes["size"] == key.size
-        and int(attributes["scenario"]) == key.scenario
+        and attributes["scenario"] == key.scenario
         and str(attributes["version"]).split(".")[0] == str(key.major)
     )

@@ -214,6 +214,7 @@ class FrameStore:
         variables = list_variables(file)
         position = variables["position"]
         try:
+            self._check_positions(position, scenario)
             self._check_identity(file, scenario, frames=len(position))
         except DataError:
             file.close()
@@ -233,6 +234,18 @@ class FrameStore:
         obstacle = parse_obstacle(parameters, self._size.dimension, where=str(path))
         return _OpenScenario(
             file, position, material, wall_velocity, body_force, viscosity, obstacle
+        )
+
+    def _check_positions(self, position: h5py.Dataset, scenario: int) -> None:
+        """Refuse positions that are no numbers, or have other axes than the box."""
+        has_axes = position.ndim == 3 and position.shape[2] == self._size.dimension
+        if position.dtype == np.float32 and has_axes and position.size:
+            return
+        raise damage_error(
+            self._paths[scenario],
+            f"{position.dtype}, shape {position.shape}",
+            "position",
+            fix=self._repair_hint(scenario),
         )
 
     def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:

@@ -350,6 +350,14 @@ def test_a_shape_of_terabytes_in_kilobytes_is_refused(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("version", ["x.y", "", "1.0", "9" * 5000 + ".0.0", 3])
+def test_a_version_that_is_none_is_damage(written: Written, version: object) -> None:
+    path, _ = written
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = version
+    assert_refused(path, "damaged", check=read_scenario)
+
+
 def test_a_compound_type_is_damage(written: Written) -> None:
     path, _ = written
     with netCDF4.Dataset(path, "r+") as file:

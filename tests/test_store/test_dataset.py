@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import dask.array
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -163,6 +164,29 @@ def test_a_file_of_another_scenario_is_refused(ragged: Path) -> None:
     path = scenario_path(ragged, TEST_IDS[0])
     set_scenario_id(path, 17)
     with pytest.raises(DataError, match=rf"(?s)another scenario.*{path.name}"):
+        open_tiny(ragged)
+
+
+@pytest.mark.parametrize("scenario", ["three", [3, 3], None])
+def test_an_id_that_is_no_number_is_damage(ragged: Path, scenario: object) -> None:
+    path = scenario_path(ragged, TEST_IDS[0])
+    with h5py.File(path, "r+") as file:
+        del file.attrs["scenario"]
+        if scenario is not None:
+            file.attrs["scenario"] = scenario
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
+        open_tiny(ragged)
+
+
+@pytest.mark.parametrize(
+    "position", [np.zeros((9, 9, 2), np.int32), np.zeros((9, 2)), b"text"]
+)
+def test_positions_that_are_none_are_damage(ragged: Path, position: object) -> None:
+    path = scenario_path(ragged, TEST_IDS[0])
+    with h5py.File(path, "r+") as file:
+        del file["position"]
+        file["position"] = position
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
         open_tiny(ragged)
 
 

@@ -961,6 +961,33 @@ def test_a_scenario_of_another_length_is_refused(tmp_path: Path, train: Open) ->
     assert_data_error(train(tmp_path), 40, "not that of the registry")
 
 
+def write_positions(path: Path, change: Callable[[Any], Any]) -> None:
+    """Replace the positions of a scenario file by others."""
+    with h5py.File(path, "r+") as file:
+        positions = file["position"][...]
+        del file["position"]
+        file["position"] = change(positions)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda positions: positions[:, :0],
+        lambda positions: positions[..., :1],
+        lambda positions: positions[..., [0, 1, 1]],
+        lambda positions: positions[0],
+        lambda positions: positions.astype(np.float64),
+        lambda positions: np.array([b"text"] * len(positions)),
+    ],
+)
+def test_positions_of_another_shape_or_type_are_refused(
+    tmp_path: Path, train: Open, change: Callable[[Any], Any]
+) -> None:
+    folder = write_train(tmp_path)
+    write_positions(folder / "0000.nc", change)
+    assert_data_error(train(tmp_path), 0, "damaged")
+
+
 def test_a_scenario_under_another_id_is_refused(tmp_path: Path, train: Open) -> None:
     """Its own file can be read as soon as it is back."""
     folder = write_train(tmp_path)
