@@ -54,8 +54,9 @@ def list_effective_settings(
     """Return the settings of a prediction that change the model, in one form and order.
 
     A setting that states the value of the weights' own recipe, or of its default,
-    changes nothing and is left out. Settings that the model does not take, and those of
-    a model that is not installed, are returned as they are written.
+    changes nothing and is left out. Nor do settings change anything that the model does
+    not take: nobody can predict with them. Settings of a model that is not installed
+    are returned as they are written.
 
     Args:
         baseline: name of the baseline in the weights.
@@ -65,9 +66,12 @@ def list_effective_settings(
     try:
         entry = find(baseline)
         before = change_options(entry, options, ())
-        after = change_options(entry, options, settings)
     except LagbenchError:
         return tuple(sorted(set(settings)))
+    try:
+        after = change_options(entry, options, settings)
+    except LagbenchError:
+        return ()
     changes = []
     for name, value in after.items():
         if value != before[name]:

@@ -353,7 +353,14 @@ def _gns_metadata(size: Size, shapes: Shapes) -> dict[str, object]:
     for subset_shapes in shapes.values():
         for frame_count, _ in subset_shapes:
             frame_counts.append(frame_count)
-    return {"sequence_length": min(frame_counts), "dt": size.frame_interval}
+    metadata: dict[str, object] = {
+        "sequence_length": min(frame_counts),
+        "dt": size.frame_interval,
+    }
+    if size.box.is_periodic:
+        # The format has no such key; other programs ignore it.
+        metadata["periodic_boundary_conditions"] = list(size.box.periodic)
+    return metadata
 
 
 def _lagrangebench_metadata(

@@ -574,8 +574,10 @@ def test_an_option_with_its_default_is_no_other_option(
     submitted(own, other, weights=(kept_weights(own),), method="glide")
     assert_sound(own)
     glide = own.entry("glide")
-    glide.write_text(glide.read_text().replace("fail_at=1000", "fail_at=0"))
-    assert failing_checks(own) == {"weights"}
+    words = glide.read_text()
+    for setting in ("fail_at=0", "fall_at=1000"):
+        glide.write_text(words.replace("fail_at=1000", setting))
+        assert failing_checks(own) == {"weights"}
 
 
 @pytest.mark.usefixtures("first")
@@ -600,7 +602,9 @@ def test_one_option_in_two_spellings_is_one(
 def test_a_child_process_reads_the_options_of_weights(
     own: BoardBench, first: Path
 ) -> None:
-    """What it cannot read, and options that the model lacks, stay as written."""
+    """Options of a file that it cannot read stay as written; those that the model lacks
+    change nothing.
+    """
     checkpoint = replace(load(first / "weights.pt"), baseline="neuralmpm")
     save(first / "neuralmpm.pt", checkpoint)
     path = str(first / "neuralmpm.pt")
@@ -608,12 +612,16 @@ def test_a_child_process_reads_the_options_of_weights(
         (path, "model.average=false"),
         (path, "model.average=yes", "model.average=true"),
         (path, "model.nothing=1"),
+        (path, "model.average=maybe"),
+        (path, "nothing"),
         (str(first / "predictions.nc"), "model.b=1", "model.a=1"),
     ]
     assert read_in_child(requests) == [
         [],
         ["model.average=true"],
-        ["model.nothing=1"],
+        [],
+        [],
+        [],
         ["model.a=1", "model.b=1"],
     ]
 

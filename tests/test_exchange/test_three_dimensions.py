@@ -149,14 +149,7 @@ def test_another_program_reads_it_and_it_comes_back(
         trajectories = read_h5(out / "train.h5")
     position, _ = trajectories[0]
     assert position.shape == (FRAMES, COUNTS[0], 3)
-    # the first format has no place for periodic axes; none given: those of the file
-    options = {"periodic": list(PERIODIC)} if form == "gns-npz" else {}
-    again = import_split(
-        out,
-        format=form,
-        output=tmp_path / "again",
-        **options,
-    )
+    again = import_split(out, format=form, output=tmp_path / "again")
     box = locate(again.folder).size.box
     assert box.bounds == BOX
     assert box.periodic == (True, False, True)
