@@ -43,6 +43,7 @@ from .folder import Place, entry_path, score_paths, weights_path
 
 OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
+LEAST_SCORE = 1e-38  # to which the difference of two scores is relative, at least
 BUDGET_COUNTS = ("windows", "steps", "start_steps")
 BUDGET_AMOUNTS = ("epochs", "cpu_hours", "validation_hours", "gpu_hours")
 BUDGET_LABELS = ("device", "threads", "metric")
@@ -287,6 +288,13 @@ class Reproduction(Strict):
     def agrees(self) -> bool:
         """Whether the scores are the same within the tolerance."""
         return self.difference <= self.tolerance
+
+    @property
+    def has_stated_difference(self) -> bool:
+        """Whether the difference is that of both scores, up to the digits they have."""
+        scale = max(abs(self.submitted), LEAST_SCORE)
+        difference = abs(self.reproduced - self.submitted) / scale
+        return math.isclose(difference, self.difference, rel_tol=0.1, abs_tol=1e-8)
 
     @property
     def is_complete(self) -> bool:

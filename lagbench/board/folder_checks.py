@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import stat
+import statistics
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,13 +26,22 @@ from lagbench.scoring.score_file_checks import (
 )
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import Entry, EntryBudget, Prediction, Status, Summary, Verification
+from .entry import (
+    Entry,
+    EntryBudget,
+    Prediction,
+    Reproduction,
+    Status,
+    Summary,
+    Verification,
+)
 from .entry_file import examine, load_plain
 from .fields import latest_date
 from .folder import VERIFIED, Folder, Place, entry_path
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
 from .ranking import TOLERANCE, combine, dataset_of, summarise
+from .scores_compared import TOLERANCE as REPRODUCED_TOLERANCE
 from .selection import is_current
 from .shift import check_shift
 from .verified import read_verified, verification_of
@@ -448,13 +458,14 @@ class FolderChecks:
         if not line.is_reproduced:
             return
         where = f"{VERIFIED}, {entry.yaml_path}"
-        seeds = {reproduction.seed for reproduction in line.reproduced}
-        agreeing = [reproduction.agrees for reproduction in line.reproduced]
-        if seeds != {*entry.seeds} or not all(agreeing):
+        seeds = sorted(reproduction.seed or 0 for reproduction in line.reproduced)
+        proofs = [_proves_score(each, entry) for each in line.reproduced]
+        has_all_seeds = seeds == sorted(seed or 0 for seed in entry.seeds)
+        if not has_all_seeds or not all(proofs) or not _states_score(line, entry):
             self._add(
                 "verified",
                 where,
-                f"{sum(agreeing)} seeds with the same scores",
+                f"{sum(proofs)} records with the same scores",
                 what=f"the level is {line.level}, and the records do not show it",
                 expected=f"a record of each of {len(entry.seeds)} seeds that agrees",
             )
@@ -472,6 +483,30 @@ class FolderChecks:
                 what="other numbers of scenarios than the test subset has",
                 expected=f"at most {test_count} of {test_count}",
             )
+
+
+def _proves_score(reproduction: Reproduction, entry: Entry) -> bool:
+    """Tell whether a record shows that a model gave the score of its entry again."""
+    return (
+        reproduction.metric == entry.score.ranking_metric
+        and reproduction.tolerance <= REPRODUCED_TOLERANCE
+        and reproduction.has_stated_difference
+        and reproduction.agrees
+    )
+
+
+def _states_score(line: Verification, entry: Entry) -> bool:
+    """Tell whether the submitted scores of a line are those of its entry.
+
+    A record of a part of the scenarios has another mean than the entry.
+    """
+    if not all(reproduction.is_complete for reproduction in line.reproduced):
+        return True
+    summary = entry.score.metrics.get(entry.score.ranking_metric)
+    if summary is None or summary.mean is None:
+        return False
+    scores = [reproduction.submitted for reproduction in line.reproduced]
+    return math.isclose(statistics.fmean(scores), summary.mean, rel_tol=TOLERANCE)
 
 
 def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:

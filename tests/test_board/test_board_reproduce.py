@@ -186,6 +186,18 @@ def test_check_counts_whole_and_partial_reproductions(own: ModelBoard) -> None:
     assert change_record(scenarios=1, of=1) == ["verified"]
     assert change_record(scenarios=3, of=2) == ["verified"]
     assert change_record(difference=0.5) == ["verified"]
+    assert change_record(reproduced=0.123) == ["verified"]
+    assert change_record(reproduced=0.123, submitted=0.123) == ["verified"]
+    assert change_record(difference=0.5, tolerance=1.0) == ["verified"]
+    assert change_record(tolerance=1.0) == ["verified"]
+    assert change_record(metric="position_rmse") == ["verified"]
+
+    def repeat_record(lines: Content) -> None:
+        lines[PATH]["reproduced"] *= 2
+
+    verified.write_bytes(content)
+    own.edit(verified, repeat_record)
+    assert checks_of(own.find()) == ["verified"]
 
 
 def test_what_cannot_be_run_is_refused(own: ModelBoard) -> None:
