@@ -33,12 +33,16 @@ MOST_SHIFT_BYTES = 4_000_000
 """Longest file [bytes]; a model takes about 500."""
 
 
+MetricValue = Annotated[Number, Field(ge=-1e100, le=1e100)]
+"""Value of a metric of positions in float32; its square is a number too."""
+
+
 class ShiftModel(Strict):
     """The ranking metric of one model in each scenario of ``shift``."""
 
     seed: Seed | None = None
     model: Hash
-    values: Annotated[dict[int, Number], Field(min_length=1, max_length=1000)]
+    values: Annotated[dict[int, MetricValue], Field(min_length=1, max_length=1000)]
 
 
 class ShiftScores(Strict):
@@ -47,7 +51,9 @@ class ShiftScores(Strict):
     metric: Label
     dataset_sha256: Hash
     subset_sha256: Hash
-    models: Annotated[tuple[ShiftModel, ...], Field(max_length=100, strict=False)]
+    models: Annotated[
+        tuple[ShiftModel, ...], Field(min_length=1, max_length=100, strict=False)
+    ]
 
 
 class ShiftFile(RootModel[dict[str, ShiftScores]]):
