@@ -1,4 +1,4 @@
-"""Seeded draws whose bits are the same on every machine.
+"""Seeded draws whose bits are the same on every x86-64 Linux CPU.
 
 Two rules keep them so. Random bits come only from ``Generator.random``, the one
 distribution of NumPy that never changes for PCG64. What is done with them is + - * /

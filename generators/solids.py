@@ -146,7 +146,8 @@ class Rod:
 def cube_root(value: float) -> float:
     """Return the cube root of a positive number by Newton's method.
 
-    Only + - * / are used, so that the result has the same bits on every machine.
+    Only + - * / are used, so that the result has the same bits on every x86-64 Linux
+    CPU.
 
     >>> cube_root(27.0)
     3.0

@@ -290,8 +290,8 @@ def draw_intro(board: Board) -> Markup:
     sentences = escaped(
         "Which neural surrogate predicts how fluids and soft bodies move, and is it "
         f"better than a classical solver of the same cost? {entries} on {data_sets} "
-        "that anyone regenerates bit for bit. Every score follows from committed "
-        f"score files. {_describe_levels(rows)} {_describe_costs(rows)} "
+        "that every x86-64 Linux CPU regenerates bit for bit. Every score follows from "
+        f"committed score files. {_describe_levels(rows)} {_describe_costs(rows)} "
     )
     return join([sentences, tag("a", "Take part", href="#take-part")])
 

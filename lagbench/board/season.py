@@ -1,15 +1,16 @@
 """Seasons: blind tests of the models on a board, without a server and a custodian.
 
 Closing a season freezes the entries that have models. A seed follows from the hashes of
-all frozen models, so nobody knows the blind scenarios before the season is closed, and
-afterwards everybody can draw them::
+all frozen models and from the value, if the season has one. Afterwards everybody can
+draw the blind scenarios::
 
     seed = SHA-256(season, split, size, version, all frozen models, value)
 
 A frozen model is the hash of its file, and the options of the prediction.
 
 The value is a public random number, from a source that was named when the season was
-closed; a season may do without one. docs/seasons.md says what that proves.
+closed. With it nobody knows the blind scenarios before the season is closed. Without it
+the last person to submit can compute them. docs/seasons.md says what each proves.
 
     seasons/<name>/season.yaml    the frozen entries and the seeds
     seasons/<name>/scores.yaml    the scores of their models (`season_run`)

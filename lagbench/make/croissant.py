@@ -77,7 +77,7 @@ _FIELDS: Mapping[str, tuple[str, str]] = {
     "path": ("sc:Text", "file, relative to this document"),
     "frames": ("sc:Integer", "recorded frames"),
     "particles": ("sc:Integer", "particles in every frame"),
-    "content_sha256": ("sc:Text", "content hash, the same on every machine"),
+    "content_sha256": ("sc:Text", "content hash, the same on every x86-64 Linux CPU"),
 }
 
 

@@ -407,7 +407,7 @@ def compare_hashes(
     if measured is None:
         return (
             f"nothing to compare with: {record} holds no hash of this size yet, which "
-            "would tell whether these are the bits that every machine has"
+            "would tell whether these are the bits of every x86-64 Linux CPU"
         )
 
     differing = []
