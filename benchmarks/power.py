@@ -189,16 +189,21 @@ two seeds of the same method? `python benchmarks/power.py --write` writes this p
 
 ## Differences that the test finds
 
-**Model.** The value of seed s in scenario i is the mean of the method times (1 +
-scenario + method-in-scenario + seed + rest). The last four terms are random. The
-scenario term is the same for both methods. The table shows the standard deviations of
-the other three terms, relative to the mean of a method.
+**Model.** The value of seed s in scenario i is m (1 + a_i + b_i + c_s + e_si). Here m
+is the mean of the method. The other four terms are random:
+
+- a_i belongs to the scenario. It is the same for both methods.
+- b_i belongs to the method in this scenario (column "method in scenario").
+- c_s belongs to the seed (column "seed").
+- e_si is the rest (column "rest").
+
+The table shows the standard deviations of b_i, c_s and e_si.
 
 **Rows.** The first rows use assumed standard deviations. Each row with the name of a
 split uses standard deviations that we measured, from the score files of size mini in
-leaderboard/scores. They need two methods whose means differ by less than a factor of
-two, and at least one of them must have several seeds. If there are only two methods
-with two seeds each, these standard deviations are inaccurate.
+leaderboard/scores. The measurement needs two methods whose means differ by less than a
+factor of two. At least one of these methods must have several seeds. If there are only
+two methods with two seeds each, the measured standard deviations are inaccurate.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
@@ -221,8 +226,9 @@ difference in at most 5 % of the draws. The shares have a statistical error: 5 %
 With one seed on each side the test is the sign-flip test over scenarios. Its answer
 is correct for the two trained models, that is, for these weights. But it is often
 wrong for the methods, as the column "1 seed each" shows. Therefore the leaderboard
-then speaks of "these weights". It does so too if only one of the sides has several
-seeds, because the scatter between the seeds of the other side is unknown.
+speaks of "these weights" if a side has only one seed. This is also true if the other
+side has several seeds, because the scatter between seeds is then known for one side
+only.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|

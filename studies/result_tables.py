@@ -97,7 +97,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     if pays:
         sentences.append(
             f"Learning pays on {_join(pays)}: the best learned or hybrid model is more"
-            " accurate than every classical solver here that costs no more per frame."
+            " accurate than every classical solver of lagbench that costs no more per"
+            " frame."
         )
     if open_sets:
         sentences.append(
