@@ -36,6 +36,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     UsageErrorCollector,
+    format_count,
     suggest_name,
 )
 from lagbench.submission.issues import quote
@@ -484,7 +485,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
     frame_count, particle_count, component_count = shape
     if component_count not in DIMENSIONS:
         raise DataError(
-            f"positions have {component_count} components",
+            f"positions have {format_count(component_count, 'component')}",
             where=name,
             expected="shape (frame, particle, 2) or (frame, particle, 3)",
             got=f"shape {shape}",
