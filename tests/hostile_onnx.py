@@ -157,16 +157,59 @@ def long_work(path: Path) -> Path:
     nodes = [
         node("ReduceSum", ["position"], "seed", keepdims=0),
         node("Expand", ["seed", "shape"], "m0"),
-    ]
-    for number in range(200):
-        matrix = f"m{number}"
-        nodes.append(node("MatMul", [matrix, matrix], f"m{number + 1}"))
-    nodes += [
+        *products("m", 200),
         node("ReduceSum", ["m200"], "sum", keepdims=0),
         node("Add", ["position", "sum"], "next_position"),
     ]
     shape = integers("shape", 3000, 3000)
     return save_model(path, nodes, initialisers=[shape])
+
+
+def products(name: str, count: int) -> list[Any]:
+    """Return nodes that square a matrix so many times, from ``name0`` on."""
+    nodes = []
+    for number in range(count):
+        matrix = f"{name}{number}"
+        nodes.append(node("MatMul", [matrix, matrix], f"{name}{number + 1}"))
+    return nodes
+
+
+def constant_work(path: Path) -> Path:
+    """Multiply large matrices that are constants: they are computed while it loads."""
+    nodes = [
+        node("ConstantOfShape", ["shape"], "m0"),
+        *products("m", 200),
+        node("ReduceSum", ["m200"], "sum", keepdims=0),
+        node("Add", ["position", "sum"], "next_position"),
+    ]
+    shape = integers("shape", 3000, 3000)
+    return save_model(path, nodes, initialisers=[shape])
+
+
+def works_later(path: Path) -> Path:
+    """Let nothing move; multiply large matrices once the last frames are equal."""
+    zero = numpy_helper.from_array(np.array(0, np.float32), "zero")
+    nodes = [
+        node("Gather", ["position", "last"], "now", axis=0),
+        node("Gather", ["position", "before"], "past", axis=0),
+        node("Sub", ["now", "past"], "step"),
+        node("Abs", ["step"], "distance"),
+        node("ReduceMax", ["distance"], "largest", keepdims=0),
+        node("Equal", ["largest", "zero"], "at_rest"),
+        node("Where", ["at_rest", "large", "small"], "shape"),
+        node("Expand", ["zero", "shape"], "m0"),
+        *products("m", 200),
+        node("ReduceSum", ["m200"], "sum", keepdims=0),
+        node("Add", ["now", "sum"], "next_position"),
+    ]
+    constants = [
+        zero,
+        integers("last", -1),
+        integers("before", -2),
+        integers("large", 3000, 3000),
+        integers("small", 1, 1),
+    ]
+    return save_model(path, nodes, initialisers=constants)
 
 
 def large_constant(path: Path) -> Path:
@@ -261,7 +304,7 @@ REFUSED: tuple[Make, ...] = (
 )
 """Files that the checks refuse."""
 
-STOPPED: tuple[Make, ...] = (huge_shape, long_work)
+STOPPED: tuple[Make, ...] = (huge_shape, long_work, constant_work)
 """Files that the checks let pass, and that the limits of a rollout stop."""
 
 

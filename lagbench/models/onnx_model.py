@@ -28,10 +28,10 @@ from .onnx_checks import MOST_BYTES
 from .onnx_rollout import pack, unpack
 
 CHECK_SECONDS = 5.0  # processor time of the checks [s]
-LOAD_SECONDS = 10.0  # processor time until a model is ready to run [s]
+LOAD_SECONDS = 10.0  # processor time of imports and of loading a model [s]
 CHECK_MEMORY = 1 << 30  # address space of the checks [bytes]
 MEMORY = 4 << 30  # address space of a rollout [bytes]
-SECONDS_PER_FRAME = 4.0  # processor time of a rollout, per frame [s]
+SECONDS_PER_CALL = 3.0  # processor time of loading, and of each call of a model [s]
 LEAST_SECONDS = 1e-6  # processor time of a rollout, which is never nothing [s]
 WALL_FACTOR = 4.0  # time of the clock over processor time, on a busy machine
 START_SECONDS = 30.0  # time of the clock for the start of a child [s]
@@ -57,8 +57,7 @@ class OnnxModel:
     inputs: tuple[str, ...]  # names of its inputs
     parameters: int  # numbers in its initialisers
     memory: int = MEMORY
-    seconds_per_frame: float = SECONDS_PER_FRAME
-    load_seconds: float = LOAD_SECONDS
+    seconds_per_call: float = SECONDS_PER_CALL
 
     def predict(
         self, scenario_file: Path, frames: int | None = None
@@ -104,7 +103,8 @@ class OnnxModel:
         """Return the answer of a child about one scenario."""
         count = frames or self.size.task.horizon
         request = self._make_request(scenario_file, count)
-        seconds = self.load_seconds + self.seconds_per_frame * (count + 1)
+        most_calls = count + 1  # the first one is made twice
+        seconds = LOAD_SECONDS + self.seconds_per_call * most_calls
         answers = run_in_child(
             "lagbench.models.onnx_rollout.predict_scenario",
             [request],
@@ -116,8 +116,8 @@ class OnnxModel:
             raise WorkFailedError(
                 "the model was stopped",
                 where=str(self.path),
-                expected=f"at most {self.seconds_per_frame:g} s per frame and "
-                f"{self.memory >> 20} MiB",
+                expected=f"at most {self.seconds_per_call:g} s of processor time per "
+                f"call and {self.memory >> 20} MiB of memory",
                 got=answers.stopped,
                 fix="make the model smaller or faster; see docs/submitting.md",
             )
@@ -160,6 +160,7 @@ class OnnxModel:
         return {
             "path": str(self.path.absolute()),
             "frames": frames,
+            "seconds_per_call": self.seconds_per_call,
             "radius": self.size.task.radius,
             "arrays": packed_arrays,
         }
@@ -171,8 +172,7 @@ def open_onnx(
     size: Size,
     root: Path,
     memory: int = MEMORY,
-    seconds_per_frame: float = SECONDS_PER_FRAME,
-    load_seconds: float = LOAD_SECONDS,
+    seconds_per_call: float = SECONDS_PER_CALL,
 ) -> OnnxModel:
     """Check an ONNX file and return its model; nothing in it is run yet.
 
@@ -181,8 +181,7 @@ def open_onnx(
         size: the split and size to predict.
         root: folder of all data sets.
         memory: address space of a rollout [bytes].
-        seconds_per_frame: processor time of a rollout, per frame [s].
-        load_seconds: processor time until the model is ready to run [s].
+        seconds_per_call: processor time of loading the model, and of each call [s].
 
     Raises:
         UsageError: onnx or onnxruntime is not installed.
@@ -196,8 +195,7 @@ def open_onnx(
         inputs=declared.inputs,
         parameters=declared.parameters,
         memory=memory,
-        seconds_per_frame=seconds_per_frame,
-        load_seconds=load_seconds,
+        seconds_per_call=seconds_per_call,
     )
 
 

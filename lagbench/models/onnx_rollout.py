@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import base64
 import functools
+import signal
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -55,10 +58,28 @@ def forbid_files() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
 
-def open_session(path: str) -> tuple[Any, dict[str, str]]:
+@contextmanager
+def end_after(seconds: float) -> Iterator[None]:
+    """End this process if the block needs more processor time than allowed [s].
+
+    A call into a library cannot be interrupted from Python, so a signal ends the whole
+    process. The parent reads the reason from the exit code.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+
+
+def open_session(path: str, seconds: float) -> tuple[Any, dict[str, str]]:
     """Return a checked model that is ready to run on one thread, and its inputs.
 
-    The inputs are types by name.
+    The inputs are types by name. Loading may take so much processor time [s], because
+    constants are computed then.
     """
     import onnxruntime
 
@@ -72,9 +93,10 @@ def open_session(path: str) -> tuple[Any, dict[str, str]]:
     # the arena keeps all memory that was ever used
     options.enable_cpu_mem_arena = False
     options.add_session_config_entry("session.use_env_allocators", "0")
-    session = onnxruntime.InferenceSession(
-        path, options, providers=["CPUExecutionProvider"]
-    )
+    with end_after(seconds):
+        session = onnxruntime.InferenceSession(
+            path, options, providers=["CPUExecutionProvider"]
+        )
     return session, declared["inputs"]
 
 
@@ -87,8 +109,9 @@ def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
     Args:
         request: ``path`` of the model, ``frames`` to predict, arrays of the scenario
             (position, material, bounds, periodic, viscosity, wall_velocity for all
-            frames, and body_force for all frames and obstacle where there are such) and
-            the connectivity ``radius``.
+            frames, and body_force for all frames and obstacle where there are such),
+            the connectivity ``radius``, and ``seconds_per_call``, the processor time
+            of loading and of each call.
 
     Returns:
         ``position``, shape [frame, particle, axis] [length]; ``seconds``, the processor
@@ -97,10 +120,11 @@ def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
     """
     forbid_files()
     try:
-        session, inputs = _cached_session(request["path"])
+        seconds_per_call = float(request["seconds_per_call"])
+        session, inputs = _cached_session(request["path"], seconds_per_call)
         given = {name: unpack(value) for name, value in request["arrays"].items()}
         # the first call compiles and allocates
-        _advance(session, inputs, given, given["position"], 0, request["radius"])
+        _advance(session, inputs, given, given["position"], 0, request)
         # The clock of the process is coarse where its time is limited, as here: 4 ms.
         started = time.thread_time()
         position, diverged_at = _roll_out(session, inputs, given, request)
@@ -133,7 +157,7 @@ def _roll_out(
     middle = given["bounds"].mean(axis=1)
     done = 0
     while done < frames:
-        output = _advance(session, inputs, given, window, done, request["radius"])
+        output = _advance(session, inputs, given, window, done, request)
         for frame in output:
             if done == frames:
                 break
@@ -163,9 +187,10 @@ def _advance(
     given: dict[str, NDArray[Any]],
     window: NDArray[np.float64],
     done: int,
-    radius: float,
+    request: dict[str, Any],
 ) -> NDArray[np.float64]:
     """Return the next frames, at least one, shape [frame, particle, axis]."""
+    radius = request["radius"]
     values: dict[str, NDArray[Any]] = {}
     for name, type_name in inputs.items():
         value: NDArray[Any]
@@ -181,7 +206,8 @@ def _advance(
         else:
             raise ValueError(f"the input {name}, which this data set does not have")
         values[name] = np.asarray(value, np.dtype(type_name), order="C")
-    (output,) = session.run([OUTPUT], values)
+    with end_after(request["seconds_per_call"]):
+        (output,) = session.run([OUTPUT], values)
     if output.ndim != 3 or output.shape[1:] != window.shape[1:] or len(output) == 0:
         raise ValueError(
             f"{OUTPUT} of shape {list(output.shape)}, expected [frame, "

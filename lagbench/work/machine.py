@@ -45,8 +45,10 @@ _MACHINES = {"x86_64", "amd64"}
 _DEVICES = {"cpu", "parallel"}
 _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
 
-TOO_LONG = -int(getattr(signal, "SIGXCPU", 0)) or None
-"""Return code of a process beyond its computing time; None without such a limit."""
+TOO_LONG = frozenset()
+"""Return codes of a process beyond its computing time; none without such a limit."""
+if LIMITS:
+    TOO_LONG = frozenset({-signal.SIGXCPU, -signal.SIGPROF})
 
 OUT_OF_MEMORY = 77  # exit code of a child that needed more than it may
 MEMORY = 768 << 20  # address space of a child [bytes]
@@ -366,7 +368,7 @@ def describe_exit(code: int, memory: int) -> str:
     """
     if code == OUT_OF_MEMORY:
         return f"more than {memory >> 20} MiB of memory"
-    if code == TOO_LONG:
+    if code in TOO_LONG:
         return "no end within the computing time allowed"
     if code < 0:
         return f"it crashed: {signal.strsignal(-code) or -code}"

@@ -26,7 +26,7 @@ from lagbench.board.folder import (
     WEIGHTS,
 )
 from lagbench.data.registry import load
-from lagbench.models.onnx_model import LOAD_SECONDS, SECONDS_PER_FRAME
+from lagbench.models.onnx_model import LOAD_SECONDS, SECONDS_PER_CALL
 from lagbench.scoring.boards import SUBMISSIONS
 
 from .arrays import (
@@ -406,7 +406,7 @@ def list_targets(folder: Path) -> list[Target]:
 def _seconds_of_rollout() -> float:
     """Return the processor time that an ONNX model is granted for one rollout [s]."""
     horizon = load().size("decaying-vortices", "tiny").task.horizon
-    return LOAD_SECONDS + SECONDS_PER_FRAME * (horizon + 1)
+    return LOAD_SECONDS + SECONDS_PER_CALL * (horizon + 1)
 
 
 def _board_targets(folder: Path) -> list[Target]:
