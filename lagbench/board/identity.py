@@ -70,8 +70,10 @@ def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
 
     Errors and distances are never negative, correlations never above one. Where one
     error of a scenario is zero at all frames, the others are, too: the prediction is
-    the truth.
+    the truth. The ranking metric has a value at some frame.
     """
+    if _lacks_ranking_values(stored):
+        yield f"no value of {stored.scores.ranking} in any scenario"
     for scenario, tally in sorted(stored.scores.tallies.items()):
         rows = []
         names = []
@@ -89,6 +91,23 @@ def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
                 f"{name} 0 at all frames of scenario {scenario}, though the "
                 "prediction is not the truth"
             )
+
+
+def _lacks_ranking_values(stored: ScoreFile) -> bool:
+    """Tell whether the ranking metric is undefined at all frames of all scenarios."""
+    ranking = stored.scores.ranking
+    if ranking not in METRICS:
+        return False
+
+    statistics = METRICS[ranking].of
+    for tally in stored.scores.tallies.values():
+        if not set(statistics).issubset(tally.names):
+            return False
+        rows = [tally.names.index(name) for name in statistics]
+        is_defined = ~np.isnan(tally.values[rows]).any(axis=0)  # [frame]
+        if is_defined.any():
+            return False
+    return True
 
 
 def _values_out_of_range(

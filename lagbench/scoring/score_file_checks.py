@@ -237,6 +237,7 @@ def _check_shapes(preview: Preview) -> None:
         if got != expected:
             raise ValueError(f"{name} has shape {got}, not {expected}")
     _check_obstacle(preview.obstacle)
+    _check_histograms(preview)
 
     film = preview.film
     is_long = film_count > FRAMES or particle_count > PARTICLES
@@ -247,6 +248,21 @@ def _check_shapes(preview: Preview) -> None:
     low, high = FILM_RANGE
     if film.min() < low - FILM_TOLERANCE or film.max() > high + FILM_TOLERANCE:
         raise ValueError("the film leaves its range")
+
+
+def _check_histograms(preview: Preview) -> None:
+    """Refuse shares without a range.
+
+    A map frame without rotation has neither: its shares and its range are NaN.
+    """
+    low, high = preview.histogram_range.T
+    has_range = np.isfinite(low) & np.isfinite(high) & (low <= high)
+    has_no_range = np.isnan(low) & np.isnan(high)
+    if not (has_range | has_no_range).all():
+        raise ValueError("a histogram has an impossible range")
+    has_shares = np.isfinite(preview.histogram).any(axis=(0, 2))
+    if (has_shares & has_no_range).any():
+        raise ValueError("a histogram has shares without a range")
 
 
 def _check_obstacle(obstacle: NDArray[np.float32] | None) -> None:

@@ -519,23 +519,28 @@ def test_boards_without_an_entry_are_named(
 
 @pytest.mark.parametrize("value", [-1.0, math.nan])
 def test_impossible_scores_name_their_file(own: BoardBench, value: float) -> None:
-    """Negative errors stop the page, which names the file; a method without any value
-    comes last and has no skill.
-    """
+    """Negative errors, or none at all, stop the page, which names the file."""
     path = own.folder / "scores/cavity/tiny/noisy.nc"
     with netCDF4.Dataset(path, "a") as file:
         file.set_auto_maskandscale(False)
         file["value"][:] = value
-    if math.isnan(value):
-        tab = collect(own.folder, registry=own.registry).tabs[0]
-        ranked = [row for row in tab.rows if row.rank is not None]
-        assert ranked[-1].id == "noisy"
-        assert ranked[-1].skill is None
-        return
     with pytest.raises(UnreadableFileError) as caught:
         collect(own.folder, registry=own.registry)
     assert caught.value.where == str(path)
     assert "leaderboard check" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_an_impossible_range_of_a_histogram_names_its_file(
+    own: BoardBench, value: float
+) -> None:
+    """Neither an endless axis nor shares without an axis reach the page."""
+    path = own.folder / "scores/cavity/tiny/noisy.nc"
+    with netCDF4.Dataset(path, "a") as file:
+        file["preview/histogram_range"][0, 1] = value
+    with pytest.raises(UnreadableFileError) as caught:
+        collect(own.folder, registry=own.registry)
+    assert caught.value.where == str(path)
 
 
 def test_weights_that_fail_a_gate_are_marked(tmp_path: Path) -> None:

@@ -529,3 +529,45 @@ PREDICTIONS: tuple[Mutation, ...] = (
     wrong_attribute,
     repeated_ids,
 )
+
+
+# --- score files ----------------------------------------------------------------------
+
+
+def wrong_numbers(path: Path, rng: np.random.Generator) -> None:
+    """Write an impossible number into one place, or everywhere, of a variable."""
+    numbers = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e30)
+    number = numbers[rng.integers(len(numbers))]
+    with h5py.File(path, "r+") as file:
+        names = _numeric_variables(file)
+        variable = file[names[rng.integers(len(names))]]
+        values = variable[...]
+        if not np.issubdtype(values.dtype, np.floating):
+            limits = np.iinfo(values.dtype)
+            number = (limits.min, 0, limits.max)[rng.integers(3)]
+        if rng.random() < 0.5:
+            values[...] = number
+        elif values.size:
+            values.flat[rng.integers(values.size)] = number
+        variable[...] = values
+
+
+def _numeric_variables(file: h5py.File) -> list[str]:
+    """Return the names of all variables of numbers, those of groups included."""
+    names: list[str] = []
+
+    def add(name: str, member: object) -> None:
+        if isinstance(member, h5py.Dataset) and member.dtype.kind in "fiu":
+            names.append(name)
+
+    file.visititems(add)
+    return sorted(names)
+
+
+SCORE_FILE: tuple[Mutation, ...] = (
+    *[wrong_numbers] * 8,
+    remove_a_variable,
+    remove_an_attribute,
+    wrong_attribute,
+)
+"""Changes of what a score file contains."""

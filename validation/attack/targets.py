@@ -39,7 +39,15 @@ from .arrays import (
 from .models import ONNX, extreme_tensor, write_straight_on
 from .models import WEIGHTS as WEIGHT_MUTATIONS
 from .modules import GRAPH_SETTINGS, MODULES, SETTINGS
-from .mutations import BYTES, PLACES, PREDICTIONS, YAML, Mutation, copy_tree
+from .mutations import (
+    BYTES,
+    PLACES,
+    PREDICTIONS,
+    SCORE_FILE,
+    YAML,
+    Mutation,
+    copy_tree,
+)
 from .obstacles import OBSTACLES, write_scenario
 from .running import run_command
 from .safetensors_files import SAFETENSORS, write_small_network
@@ -516,7 +524,16 @@ def _record_targets(folder: Path) -> list[Target]:
         weight=2,
         is_hashed=True,
     )
-    return [*targets, target]
+    # the page and the table read score files without a look at their hashes
+    drawn_target = Target(
+        name="score file: page",
+        source="records",
+        victim=score_file.as_posix(),
+        mutations=SCORE_FILE,
+        commands=[SHOW, BUILD],
+        weight=8,
+    )
+    return [*targets, target, drawn_target]
 
 
 def empty_and_locked(path: Path, rng: np.random.Generator) -> None:
