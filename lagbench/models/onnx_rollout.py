@@ -59,13 +59,13 @@ def forbid_files() -> None:
 
 
 @contextmanager
-def end_after(seconds: float) -> Iterator[None]:
+def end_after(seconds: float | None) -> Iterator[None]:
     """End this process if the block needs more processor time than allowed [s].
 
     A call into a library cannot be interrupted from Python, so a signal ends the whole
     process. The parent reads the reason from the exit code.
     """
-    if sys.platform == "win32":
+    if seconds is None or sys.platform == "win32":
         yield
         return
     signal.setitimer(signal.ITIMER_PROF, seconds)
@@ -75,11 +75,16 @@ def end_after(seconds: float) -> Iterator[None]:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
-def open_session(path: str, seconds: float) -> tuple[Any, dict[str, str]]:
+def open_session(path: str, seconds: float | None = None) -> tuple[Any, dict[str, str]]:
     """Return a checked model that is ready to run on one thread, and its inputs.
 
-    The inputs are types by name. Loading may take so much processor time [s], because
-    constants are computed then.
+    Args:
+        path: the ONNX file.
+        seconds: processor time after which loading ends this process, because
+            constants are computed then [s]; without it there is no limit.
+
+    Returns:
+        The session, and the types of the inputs by name.
     """
     import onnxruntime
 

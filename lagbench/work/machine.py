@@ -45,7 +45,7 @@ _MACHINES = {"x86_64", "amd64"}
 _DEVICES = {"cpu", "parallel"}
 _LIBRARIES = ("lagbench", "numpy", "netCDF4", "taichi")
 
-TOO_LONG = frozenset()
+TOO_LONG: frozenset[int] = frozenset()
 """Return codes of a process beyond its computing time; none without such a limit."""
 if LIMITS:
     TOO_LONG = frozenset({-signal.SIGXCPU, -signal.SIGPROF})
