@@ -90,11 +90,54 @@ _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
 
 _DECIMAL_COMMA = re.compile(r"[0-9]+,[0-9]+")
 
+_LONG_OPTION = re.compile(r"--[a-z][a-z-]*(=.*)?", re.DOTALL)
+"""A word that begins as a long option does, its own value included."""
+
 SIZE_NAMES = frozenset({"tiny", "mini", "full"})
 """Names of sizes that a user may write behind the split."""
 
 NEAR_NAME = 0.8
 """Likeness of two options, of 1, from which one is a misspelt other."""
+
+
+class _CheckedCommand(TyperCommand):
+    """A command that takes none of its own options for the value of another one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401
+        rest = super().parse_args(ctx, args)
+        _refuse_options_as_values(ctx)
+        return rest
+
+
+def _refuse_options_as_values(context: Any) -> None:  # noqa: ANN401 (two copies of click)
+    """Refuse an option that was read as the text or the path of another one.
+
+    Raises:
+        UsageError: there is one, as in ``--output --overwrite``.
+    """
+    options = []
+    names: set[str] = set()
+    for parameter in context.command.get_params(context):
+        if parameter.param_type_name == "option":
+            options.append(parameter)
+            names.update(parameter.opts)
+            names.update(parameter.secondary_opts)
+    for parameter in options:
+        value = context.params.get(parameter.name)
+        values = value if isinstance(value, list | tuple) else [value]
+        for item in values:
+            word = str(item)
+            if word not in names and not _LONG_OPTION.fullmatch(word):
+                continue
+            name = max(parameter.opts, key=len)
+            raise UsageError(
+                f"{name} has no value",
+                where=f"{PROGRAM} {_command_words(context)}",
+                expected=f"{name} {parameter.metavar or 'VALUE'}",
+                got=f"{name} {shorten_word(word)}, which is written as an option is",
+                fix=f"add a value behind {name}; a file of that name is "
+                f"./{shorten_word(word)}",
+            )
 
 
 class _LazyCommand(TyperCommand):
@@ -112,7 +155,9 @@ class _LazyCommand(TyperCommand):
         function = getattr(module, function_name)
         app = typer.Typer(add_completion=False)
         register = app.command(
-            self._entry.name, epilog=f"Example: lagbench {self._entry.example}"
+            self._entry.name,
+            cls=_CheckedCommand,
+            epilog=f"Example: lagbench {self._entry.example}",
         )
         register(function)
         return get_command(app)

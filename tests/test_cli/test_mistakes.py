@@ -360,6 +360,31 @@ def test_a_mistake_is_told_with_all_that_is_needed(
     assert has_all_parts(result.stderr), result.stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("score good.nc -o --overwrite", "--output"),
+        ("template curl-noise --size tiny -qo --overwrite", "--output"),
+        ("score good.nc -o -q", "--output"),
+        ("score good.nc --report --help", "--report"),
+        ("score good.nc --report --root=x", "--report"),
+        ("list --root --json", "--root"),
+        ("leaderboard show --metric --wide", "--metric"),
+        ("leaderboard reproduce --all --board --no-record", "--board"),
+    ],
+)
+def test_an_option_is_no_value_of_another_one(
+    command: str, option: str, type_command: Callable[[str], Result]
+) -> None:
+    """A file or folder of the option's name would surprise whoever forgot a value."""
+    files_before = set(os.listdir())
+    result = type_command(command)
+    assert result.exit_code == 2
+    assert has_all_parts(result.stderr), result.stderr
+    assert f"{option} has no value" in result.stderr
+    assert set(os.listdir()) == files_before
+
+
 @pytest.mark.parametrize("command", ["score", "validate", "compare", "submit"])
 def test_a_size_that_the_file_states_is_not_asked_for(
     command: str, run: Callable[..., Result]
