@@ -205,6 +205,10 @@ def _count_seeds(row: TableRow) -> int | None:
     return len(row.entry.predictions)
 
 
+SHORT_LEVELS = {Level.REPRODUCED: "repr."}
+"""Levels that have other names in narrow tables."""
+
+
 def level_of(row: BoardRow) -> Level:
     """Return how far the maintainers followed the scores of an entry."""
     if row.verified is None:
@@ -212,20 +216,30 @@ def level_of(row: BoardRow) -> Level:
     return row.verified.level
 
 
-def describe_check(row: BoardRow) -> str:
-    """Return in words how far the scores of an entry were followed."""
+def describe_check(row: BoardRow, *, is_short: bool = False) -> str:
+    """Return in words how far the scores of an entry were followed.
+
+    Short texts are those of narrow tables, as in ``repr. 2/16``.
+    """
     if row.verified is None:
         return str(Level.AS_SUBMITTED)
+    level = row.verified.level
     reproductions = row.verified.reproduced
+    reproduced = SHORT_LEVELS[Level.REPRODUCED] if is_short else str(Level.REPRODUCED)
     if any(not reproduction.agrees for reproduction in reproductions):
-        return "not reproduced"
-    if row.verified.level.rank < Level.REPRODUCED.rank and reproductions:
+        return f"not {reproduced}"
+    if level.rank < Level.REPRODUCED.rank and reproductions:
         seeds = len(row.entry.predictions)
+        if is_short:
+            return f"{reproduced} {len(reproductions)}/{seeds} seeds"
         return f"{len(reproductions)} of {seeds} seeds reproduced"
+    name = SHORT_LEVELS.get(level, str(level)) if is_short else str(level)
     if reproductions and not row.verified.is_reproduced_wholly:
         least = min(reproductions, key=lambda reproduction: reproduction.scenarios)
-        return f"{row.verified.level}, {least.scenarios} of {least.of} scenarios"
-    return str(row.verified.level)
+        if is_short:
+            return f"{name} {least.scenarios}/{least.of}"
+        return f"{name}, {least.scenarios} of {least.of} scenarios"
+    return name
 
 
 def _describe_check(row: TableRow) -> str:
@@ -234,13 +248,17 @@ def _describe_check(row: TableRow) -> str:
     return describe_check(row)
 
 
+SELF_REPORTED = "self-reported"
+"""Source of a cost that the submitter states and nobody measured."""
+
+
 def source_of_cost(row: TableRow) -> str:
     """Return who took the time of a frame; empty where nobody did."""
     if isinstance(row, ReferenceRow):
         return "measured" if row.cost else ""
     if row.verified is not None and row.verified.cost is not None:
         return "measured"
-    return "self-reported" if row.entry.cost else ""
+    return SELF_REPORTED if row.entry.cost else ""
 
 
 def format_ranks(rank: int, ranks: tuple[int, int] | None) -> str:

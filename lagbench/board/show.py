@@ -14,6 +14,9 @@ from lagbench.scoring.card import digits
 
 from .build import COLUMNS, Scope
 from .columns import (
+    SELF_REPORTED,
+    SKILL,
+    SKILL_ON_SHIFT,
     TableRow,
     cost_of,
     describe_check,
@@ -22,10 +25,25 @@ from .columns import (
     metric_value,
     source_of_cost,
 )
-from .entry import EntryCost, Level
+from .entry import Level
 from .model import Board, BoardRow, OnShift, ReferenceRow, Tab, Value
 
 NOTHING = "-"
+
+WIDTH = 80
+"""Width that a table without `--wide` keeps to [characters]."""
+
+GAP = 2
+"""Spaces between two columns."""
+
+LEAST_REMARKS = 10
+"""Width of the remarks below which another column makes room [characters]."""
+
+LEFT_OUT = "…"
+"""Stands for remarks that a table has no room for."""
+
+REPORTED = "*"
+"""Behind a time of a frame that the submitter states."""
 
 
 def scope_of_tables(metrics: Collection[str], *, wide: bool) -> Scope:
@@ -64,27 +82,70 @@ def tables(
                 fix=suggest_name(name, METRICS),
             )
     for tab in board.tabs:
-        names = _columns_of(tab, metrics, wide=wide)
-        methods = []
-        other_rows = []
-        for row in tab.rows:
-            if row.rank is not None:
-                methods.append(row)
-            elif wide or row.variant_of is None:
-                other_rows.append(row)
-        rows: list[TableRow] = [*methods, *tab.references, *other_rows]
-        cells = []
-        for table_row in rows:
-            cells.append(_format_row(tab, table_row, names, wide=wide))
-        headings = [HEADINGS.get(name, name) for name in names]
-        headings[names.index(tab.ranking)] = "score"
-        yield Table(
-            _title_of(tab),
-            ("rank", "method", *headings, "s/frame", "remarks"),
-            tuple(cells),
-            keys=2,
-        )
+        yield _table_of(tab, metrics, wide=wide)
 
+
+def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
+    """Return the table of a tab; without ``wide`` it leaves out what does not fit."""
+    methods = []
+    other_rows = []
+    for row in tab.rows:
+        if row.rank is not None:
+            methods.append(row)
+        elif wide or row.variant_of is None:
+            other_rows.append(row)
+    rows: list[TableRow] = [*methods, *tab.references, *other_rows]
+
+    names = _columns_of(tab, metrics, wide=wide)
+    lines = _format_lines(tab, rows, names, wide=wide)
+    if not wide and SHIFT in names and _room_for_remarks(lines) < LEAST_REMARKS:
+        names.remove(SHIFT)
+        lines = _format_lines(tab, rows, names, wide=wide)
+    room = _room_for_remarks(lines)
+    if room < LEAST_REMARKS:
+        # they stand in a block of their own, behind rank and method
+        room = _room_for_remarks([line[:KEYS] for line in lines])
+
+    table_rows = []
+    for row, line in zip(rows, lines[1:], strict=True):
+        remarks = _join_remarks(row, wide=wide)
+        if not wide and len(remarks) > room:
+            remarks = _shorten_remarks(row, room)
+        table_rows.append((*line, remarks))
+    legend = _legend_of(tab, table_rows, wide=wide)
+    return Table(
+        "\n".join([_title_of(tab), *legend]),
+        (*lines[0], "remarks"),
+        tuple(table_rows),
+        keys=KEYS,
+    )
+
+
+def _format_lines(
+    tab: Tab, rows: Sequence[TableRow], names: Sequence[str], *, wide: bool
+) -> list[tuple[str, ...]]:
+    """Return the headings and the cells of a table, all but the remarks."""
+    headings = [HEADINGS.get(name, name) for name in names]
+    headings[names.index(tab.ranking)] = "score"
+    lines: list[tuple[str, ...]] = [("rank", "method", *headings, "s/frame")]
+    for row in rows:
+        lines.append(_format_row(tab, row, names, wide=wide))
+    return lines
+
+
+def _room_for_remarks(lines: Sequence[Sequence[str]]) -> int:
+    """Return the width that other columns leave for the remarks [characters]."""
+    room = WIDTH
+    for column in zip(*lines, strict=True):
+        room -= max(map(len, column)) + GAP
+    return room
+
+
+KEYS = 2
+"""Columns that say what a row is: rank and method."""
+
+SHIFT = SKILL_ON_SHIFT.key
+"""Key of the column that makes room for remarks."""
 
 HEADINGS = {"against_classical": "÷class.", "skill_on_shift": "shift"}
 """Headings of columns that have other names than their keys."""
@@ -95,7 +156,7 @@ def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
     if any(row.against_classical for row in tab.rows):
         names.append("against_classical")
     if any(row.on_shift for row in tab.rows):
-        names.append("skill_on_shift")
+        names.append(SHIFT)
     names += metrics
     if any(row.skill for row in tab.rows):
         names.insert(0, "skill")
@@ -106,12 +167,22 @@ def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
 
 def _title_of(tab: Tab) -> str:
     size = tab.size
-    title = f"{size.split} {size.name} {size.version}, score: {tab.ranking}"
-    if any(row.variant_of for row in tab.rows):
-        title += "; +n: variants (--wide)"
+    return f"{size.split} {size.name} {size.version}, score: {tab.ranking}"
+
+
+def _legend_of(tab: Tab, rows: Sequence[Sequence[str]], *, wide: bool) -> Iterator[str]:
+    """Yield lines that explain the marks of a table, where it has them."""
+    marks = []
+    if not wide and any(row.variant_of for row in tab.rows):
+        marks.append("+n: variants (--wide)")
+    if any(seconds.endswith(REPORTED) for *_, seconds, _ in rows):
+        marks.append(f"{REPORTED}: self-reported")
+    if any(remarks.endswith(LEFT_OUT) for *_, remarks in rows):
+        marks.append(f"{LEFT_OUT}: more remarks (--wide)")
+    if marks:
+        yield "; ".join(marks)
     if not tab.decided:
-        title += ", too few scenarios to tell entries apart"
-    return title
+        yield "too few scenarios to tell entries apart"
 
 
 def to_plain(board: Board) -> dict[str, Any]:
@@ -214,17 +285,14 @@ def _format_row(
 ) -> tuple[str, ...]:
     values = []
     for name in names:
-        values.append(_format_value(metric_value(row, name), wide=wide))
-    seconds = _format_seconds(cost_of(row))
+        value = metric_value(row, name)
+        is_skill = name in (SKILL.key, SHIFT)
+        values.append(_format_value(value, wide=wide, is_skill=is_skill))
+    seconds = _format_seconds(row)
     if isinstance(row, ReferenceRow):
-        return (NOTHING, row.name, *values, seconds, str(row.kind))
-    return (
-        _format_rank(row),
-        row.id if wide else _format_name(tab, row),
-        *values,
-        seconds,
-        ", ".join(_remarks_on(row, wide=wide)),
-    )
+        return (NOTHING, row.name, *values, seconds)
+    name = row.id if wide else _format_name(tab, row)
+    return (_format_rank(row), name, *values, seconds)
 
 
 def _format_name(tab: Tab, row: BoardRow) -> str:
@@ -235,19 +303,24 @@ def _format_name(tab: Tab, row: BoardRow) -> str:
     return row.id
 
 
-def _format_value(value: Value | None, *, wide: bool) -> str:
+def _format_value(value: Value | None, *, wide: bool, is_skill: bool) -> str:
     if value is None or math.isnan(value.mean):
         return NOTHING
+    if is_skill and not wide:
+        # less than a thousandth of the naive baseline's score says nothing
+        return f"{round(value.mean, 3):.3g}"
     if math.isnan(value.std) or not wide:
         return f"{value.mean:.3g}"
     return f"{value.mean:.4g} ± {value.std:.2g}"
 
 
-def _format_seconds(cost: EntryCost | None) -> str:
-    """Return the time of a frame."""
+def _format_seconds(row: TableRow) -> str:
+    """Return the time of a frame, with a mark where only the submitter took it."""
+    cost = cost_of(row)
     if cost is None:
         return NOTHING
-    return f"{cost.seconds_per_frame:.2g}"
+    mark = REPORTED if source_of_cost(row) == SELF_REPORTED else ""
+    return f"{cost.seconds_per_frame:.2g}{mark}"
 
 
 def _format_rank(row: BoardRow) -> str:
@@ -256,14 +329,36 @@ def _format_rank(row: BoardRow) -> str:
     return format_ranks(row.rank, row.rank_range)
 
 
-def _remarks_on(row: BoardRow, *, wide: bool) -> Iterator[str]:
+def _join_remarks(row: TableRow, *, wide: bool) -> str:
+    """Return the remarks on a row in full."""
+    if isinstance(row, ReferenceRow):
+        return str(row.kind)
+    return ", ".join(_remarks_on(row, wide=wide))
+
+
+def _shorten_remarks(row: TableRow, room: int) -> str:
+    """Return the first remarks on a row that fit, with a mark where others do not."""
+    if isinstance(row, ReferenceRow):
+        return str(row.kind)
+    remarks = list(_remarks_on(row, is_short=True))
+    text = ", ".join(remarks)
+    while len(text) > room and remarks:
+        remarks.pop()
+        text = f"{', '.join(remarks)} {LEFT_OUT}".lstrip()
+    return text
+
+
+def _remarks_on(
+    row: BoardRow, *, wide: bool = False, is_short: bool = False
+) -> Iterator[str]:
+    """Yield remarks; what an entry without a rank misses comes first."""
     entry = row.entry
-    if row.verified is not None:
-        yield describe_check(row)
     if str(entry.status) != "active":
         yield str(entry.status)
     if not row.current:
         yield f"data set {entry.dataset.version}"
+    if row.verified is not None:
+        yield describe_check(row, is_short=is_short)
     if row.variant_of is not None:
         yield "variant"
     if entry.kind is not Kind.LEARNED:

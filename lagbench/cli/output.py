@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -212,9 +213,12 @@ def print_table(
 
 
 def _output_width() -> int:
-    """Return the width of the terminal; a fixed one gives equal files everywhere."""
+    """Return the width of the terminal, or that of the variable COLUMNS.
+
+    Where there is neither, a fixed one gives equal files everywhere.
+    """
     console = Console()
-    if console.is_terminal:
+    if console.is_terminal or os.environ.get("COLUMNS", "").isdecimal():
         return console.width
     return PIPE_WIDTH
 

@@ -15,6 +15,8 @@ from typer.testing import CliRunner, Result
 
 import lagbench
 from lagbench.__main__ import app
+from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import Folder
 from lagbench.cli.output import print_table
 from lagbench.data.registry import default_path
 
@@ -299,6 +301,30 @@ def test_letters_that_a_stream_lacks_are_escaped() -> None:
     done = CliRunner(charset="ascii").invoke(app, line.split())
     assert done.exit_code == 0
     assert "\\xf7" in done.stdout
+
+
+def test_the_leaderboard_is_shown_in_one_table_for_each_data_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No line is wider than a narrow terminal, and stated costs have a mark."""
+    monkeypatch.setenv("COLUMNS", "80")
+    board = Path(lagbench.__file__).parents[1] / "leaderboard"
+    data_sets = Folder(board).data_sets()
+    done = CliRunner().invoke(app, ["leaderboard", "show", "--board", str(board)])
+    assert done.exit_code == 0
+    lines = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    headings = [line for line in lines if line.split()[:2] == ["rank", "method"]]
+    assert len(headings) == len(data_sets) > 1
+    assert all(line.split()[-1] == "remarks" for line in headings)
+
+    stated = read_entry(board / "submissions/cavity/mini/var-stable.yaml")
+    assert stated.cost is not None
+    titles = [line for line in lines if line.startswith("cavity mini ")]
+    start = lines.index(titles[0])
+    (line,) = [line for line in lines[start : start + 30] if " var-stable " in line]
+    assert f"{stated.cost.seconds_per_frame:.2g}*" in line.split()
+    assert "*: self-reported" in lines[start + 1]
 
 
 def test_a_title_is_not_wrapped_to_the_width_of_its_table(
