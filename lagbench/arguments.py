@@ -27,7 +27,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, S
 from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
-from .errors import UsageError
+from .errors import UsageError, WrongCallError, suggest_name
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -141,10 +141,12 @@ def check_arguments(
 
     What an argument may be follows from its annotation. Whether a value of the right
     kind fits, the function checks itself, and so it does with ``*args`` and
-    ``**options``. Missing and unknown arguments raise the TypeError of Python.
+    ``**options``.
 
     Raises:
         UsageError: by the decorated function, for an argument of a wrong kind.
+        WrongCallError: by the decorated function, for an argument that is missing, has
+            an unknown name, or has none where it needs one.
     """
     signature = inspect.signature(function)
     kinds: dict[str, tuple[ArgumentKind, ...]] = {}
@@ -160,22 +162,101 @@ def check_arguments(
 
     @functools.wraps(function)
     def checked(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        place = function.__name__
+        parameters = list(signature.parameters.values())
+        values = args
+        if is_constructor:
+            # of the class that the user called, which may have inherited it
+            place = type(args[0]).__name__
+            parameters = parameters[1:]
+            values = args[1:]
         bound = None
         with contextlib.suppress(TypeError):
             bound = signature.bind(*args, **kwargs)
         if bound is None:
+            check_call(parameters, values, kwargs, where=place)
             # Python's own message names the function.
             return function(*args, **kwargs)
-        place = function.__name__
-        if is_constructor:
-            # of the class that the user called, which may have inherited it
-            place = type(args[0]).__name__
         for name, value in bound.arguments.items():
             if name in kinds:
                 check_argument(name, value, kinds[name], where=place)
         return function(*args, **kwargs)
 
     return checked
+
+
+def check_call(
+    parameters: Sequence[inspect.Parameter],
+    values: Sequence[object],
+    named_values: Mapping[str, object],
+    *,
+    where: str,
+) -> None:
+    """Refuse arguments that do not fit the parameters of a function.
+
+    Args:
+        parameters: those of the function, without ``self``.
+        values: arguments without a name.
+        named_values: arguments by name.
+        where: name of the function or class.
+
+    Raises:
+        WrongCallError: an argument is unknown, given twice, missing, or has no name.
+    """
+    known_names = []
+    names_in_order = []
+    for parameter in parameters:
+        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
+            continue
+        known_names.append(parameter.name)
+        if parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD:
+            names_in_order.append(parameter.name)
+    takes_any_name = len(known_names) < len(parameters)
+
+    for name, value in named_values.items():
+        if name not in known_names and not takes_any_name:
+            raise WrongCallError(
+                f"{where}() has no argument {name}",
+                where=f"{where}, {name}",
+                expected="the name of an argument",
+                got=f"{name}={_shorten(value)}",
+                fix=suggest_name(name, known_names),
+            )
+    if len(values) > len(names_in_order):
+        others = [name for name in known_names if name not in names_in_order]
+        first_value = _shorten(values[len(names_in_order)])
+        fix = "leave it out"
+        if others:
+            listing = ", ".join(f"{name}=" for name in others)
+            fix = f"write its name before it, one of: {listing}"
+        raise WrongCallError(
+            "an argument needs its name",
+            where=where,
+            expected=f"without a name only {', '.join(names_in_order) or 'nothing'}",
+            got=first_value,
+            fix=fix,
+        )
+    for name, value in zip(names_in_order, values, strict=False):
+        if name in named_values:
+            raise WrongCallError(
+                f"{name} is given twice",
+                where=f"{where}, {name}",
+                expected=f"one value of {name}",
+                got=f"{_shorten(value)} and {name}={_shorten(named_values[name])}",
+                fix="leave one of the two out",
+            )
+    given_names = {*names_in_order[: len(values)], *named_values}
+    for parameter in parameters:
+        has_default = parameter.default is not inspect.Parameter.empty
+        is_needed = parameter.name in known_names and not has_default
+        if is_needed and parameter.name not in given_names:
+            raise WrongCallError(
+                f"{parameter.name} is missing",
+                where=f"{where}, {parameter.name}",
+                expected=f"a value of {parameter.name}",
+                got="nothing",
+                fix=f"add {parameter.name}=...",
+            )
 
 
 def check_argument(

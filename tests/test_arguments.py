@@ -20,7 +20,6 @@ from lagbench.arguments import (
     ALIASES,
     UNCHECKED,
     check_argument,
-    check_arguments,
     find_kinds,
     list_members,
 )
@@ -353,20 +352,77 @@ def test_folders_of_local_splits_may_be_paths() -> None:
             assert "Path" in members, name
 
 
-def test_calls_that_do_not_fit_raise_the_error_of_python() -> None:
-    """An unknown or missing argument is told with the name of the function."""
+ANY: Any = lagbench
+"""The package, for calls that a type checker refuses."""
 
-    @check_arguments
-    def draw(split: str) -> str:
-        return split
 
-    call: Any = draw
-    with pytest.raises(TypeError, match=r"draw\(\) got an unexpected keyword"):
-        call("cavity", colour="red")
-    with pytest.raises(TypeError, match=r"draw\(\) missing 1 required") as caught:
+@pytest.mark.parametrize(
+    ("call", "where", "fix"),
+    [
+        (
+            lambda: ANY.windows("cavity", "tiny", subsets="test"),
+            "windows, subsets",
+            "did you mean 'subset'?",
+        ),
+        (
+            lambda: ANY.open_split("cavity", "tiny", "test"),
+            "open_split",
+            "one of: subset=, root=",
+        ),
+        (lambda: ANY.score("p.nc", "out"), "score", "output_dir="),
+        (lambda: ANY.generate(), "generate, split", "add split=..."),
+        (
+            lambda: ANY.generate("cavity", "tiny", size="mini"),
+            "generate, size",
+            "leave one of the two out",
+        ),
+        (
+            lambda: lagbench_torch.WindowDataset("cavity", "tiny", futur=2),  # type: ignore[call-arg]
+            "WindowDataset, futur",
+            "did you mean 'future'?",
+        ),
+        (
+            lambda: lagbench.submission.write("p.nc", split="cavity"),  # type: ignore[call-arg]
+            "write, positions",
+            "add positions=...",
+        ),
+    ],
+)
+def test_calls_that_do_not_fit_are_errors_of_usage_and_of_type(
+    call: Callable[[], Any], where: str, fix: str
+) -> None:
+    """The message names the function, the argument and what to write."""
+    with pytest.raises(TypeError) as caught:
         call()
-    assert caught.value.__context__ is None
-    assert call("cavity") == "cavity"
+    error = caught.value
+    assert isinstance(error, UsageError)
+    assert error.where == where
+    assert fix in str(error.fix)
+    assert error.expected
+    assert error.got
+    assert error.__context__ is None
+
+
+def test_size_is_the_second_argument_behind_split() -> None:
+    """A call that works with generate works with what reads the data as well."""
+    names = []
+    for name, function in FUNCTIONS.items():
+        parameters = list(inspect.signature(function).parameters.values())
+        if parameters and parameters[0].name == "split":
+            assert parameters[1].name == "size", name
+            assert parameters[1].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD, name
+            names.append(name)
+    assert {"generate", "open_split", "windows", "WindowDataset"} <= set(names)
+
+
+def test_the_result_of_a_validation_is_short_in_a_notebook(tmp_path: Path) -> None:
+    """Its repr has the verdict and counts, not all issues."""
+    path = tmp_path / "p.nc"
+    path.write_text("no predictions")
+    result = lagbench.validate(path, isolated=False)
+    assert (
+        repr(result) == f"<ValidationResult of {path}: not valid, 1 error, 0 warnings>"
+    )
 
 
 def test_aliases_are_those_of_the_modules() -> None:

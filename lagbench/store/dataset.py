@@ -41,7 +41,7 @@ def list_splits() -> tuple[str, ...]:
 
 @check_arguments
 def load_manifest(
-    split: str | Path, *, size: str | None = None, root: str | Path | None = None
+    split: str | Path, size: str | None = None, *, root: str | Path | None = None
 ) -> Manifest:
     """Return the manifest of a generated data set.
 
@@ -72,18 +72,18 @@ def load_manifest(
 @check_arguments
 def open_split(
     split: str | Path,
+    size: str | None = None,
     *,
     subset: str = "test",
-    size: str | None = None,
     root: str | Path | None = None,
 ) -> xr.Dataset:
     """Open one subset of a generated data set; arrays are read when computed.
 
     Args:
         split: name of the split, or path of a local split's folder.
-        subset: train, valid or test; also shift or extra where the split has it.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
+        subset: train, valid or test; also shift or extra where the split has it.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:

@@ -386,9 +386,9 @@ class WindowReader:
     def __init__(
         self,
         split: str | Path,
+        size: str | None = None,
         *,
         subset: str | Sequence[str] = "train",
-        size: str | None = None,
         root: str | Path | None = None,
         history: int | None = None,
         future: int = 1,
@@ -538,9 +538,9 @@ class Windows(WindowReader):
 @check_arguments
 def windows(
     split: str | Path,
+    size: str | None = None,
     *,
     subset: str | Sequence[str] = "train",
-    size: str | None = None,
     root: str | Path | None = None,
     history: int | None = None,
     future: int = 1,
@@ -561,10 +561,10 @@ def windows(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        subset: train, valid or test, also shift or extra where the split has it; or
-            several of them.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
+        subset: train, valid or test, also shift or extra where the split has it; or
+            several of them.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.

@@ -12,6 +12,7 @@ from lagbench.errors import (
     DataError,
     LagbenchError,
     UnreadableFileError,
+    format_count,
 )
 
 CHECKS = (
@@ -106,6 +107,14 @@ class ValidationResult:
     skipped: Mapping[str, str]  # check to the reason why it could not be made
     # content hash of the positions; None where they were not all read
     sha256: str | None = None
+
+    def __repr__(self) -> str:
+        """Return the verdict on the file, and how much is wrong with it."""
+        counts = [
+            format_count(len(self.errors), "error"),
+            format_count(len(self.warnings), "warning"),
+        ]
+        return f"<ValidationResult of {self.path}: {self.verdict}, {', '.join(counts)}>"
 
     @property
     def errors(self) -> tuple[ValidationIssue, ...]:
