@@ -276,10 +276,11 @@ def renamed(path: Path, ending: str) -> str:
     return f"{stem}{ending}"
 
 
-def save(drawn: Figure, output: str | Path) -> Path:
+def save(drawn: Figure, output: str | Path, *, option: str = "--output") -> Path:
     """Write the figure to a file, with equal bytes every time; return its path.
 
-    The file appears whole or not at all.
+    The file appears whole or not at all. ``option`` is what names another place, for
+    messages.
 
     Raises:
         UsageError: the name ends in none of :data:`ENDINGS`.
@@ -290,7 +291,7 @@ def save(drawn: Figure, output: str | Path) -> Path:
     if ending not in ENDINGS:
         raise UsageError(
             "pictures are PNG, PDF or SVG files",
-            where="--output",
+            where=option,
             expected=f"a name ending in {', '.join(ENDINGS)}",
             got=path,
             fix=f"name it {renamed(path, ENDINGS[0])}",
@@ -299,7 +300,7 @@ def save(drawn: Figure, output: str | Path) -> Path:
         data = png_bytes(drawn)
     else:
         data = _vector_bytes(drawn, ending)
-    write_atomically(path, data, option="--output")
+    write_atomically(path, data, option=option)
     return path
 
 

@@ -116,6 +116,7 @@ def plot_frame(
     kind: str = ALL,
     dpi: float = DPI,
     registry: Registry | None = None,
+    option: str = "--output",
 ) -> Path:
     """Draw one frame of a scenario; return the path of the file.
 
@@ -126,6 +127,7 @@ def plot_frame(
         kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
         dpi: pixels per inch.
         registry: where splits are described; ours when None.
+        option: the option that names another place, for messages.
 
     Raises:
         UsageError: unknown kind, no such frame, a name with another ending, no
@@ -163,7 +165,7 @@ def plot_frame(
                 material_key(below, recording.material)
             else:
                 colour_bar(below, panel, limit, is_solid=recording.is_solid)
-        return save(drawn, output)
+        return save(drawn, output, option=option)
 
 
 def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
@@ -310,6 +312,7 @@ def draw_contact_sheet(
     panel: Panel | None = None,
     frame: int | None = None,
     dpi: float = DPI,
+    option: str = "--output",
 ) -> Path:
     """Draw the scenarios of a data set that lies in a root folder on one page.
 
@@ -321,6 +324,7 @@ def draw_contact_sheet(
         panel: what each panel shows; the default suits the split.
         frame: see ``contact_sheet``.
         dpi: pixels per inch.
+        option: the option that names another place, for messages.
 
     Raises:
         DataError: no scenario is there, or a file is damaged.
@@ -341,7 +345,7 @@ def draw_contact_sheet(
     else:
         sheet = _arrange_table(files, panel, frame=frame, splits=registry)
     title = f"{registry.split(tier.split).title} · {tier.split} {tier.name}"
-    return _draw_sheet(sheet, title, output, dpi=dpi)
+    return _draw_sheet(sheet, title, output, dpi=dpi, option=option)
 
 
 def _list_existing_files(size: Size, root: Path) -> list[Path]:
@@ -499,7 +503,7 @@ def _choose_frames(recording: Recording) -> list[int]:
 
 
 def _draw_sheet(
-    sheet: ContactSheet, title: str, output: str | Path, *, dpi: float
+    sheet: ContactSheet, title: str, output: str | Path, *, dpi: float, option: str
 ) -> Path:
     """Draw a contact sheet; return the path of its file."""
     columns = max(map(len, sheet.rows))
@@ -518,7 +522,7 @@ def _draw_sheet(
                 axes = drawn.add_axes(place)
                 _draw_cell(axes, sheet.panel, cell)
         _draw_key(drawn, sheet, width=width, height=height)
-        return save(drawn, output)
+        return save(drawn, output, option=option)
 
 
 def _draw_cell(axes: Axes, panel: Panel, cell: SheetCell) -> None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from lagbench.atomic import write_atomically
+from lagbench.atomic import ROOT_OPTION, write_atomically
 from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
 from lagbench.data.manifest import FileEntry, Manifest
@@ -101,11 +101,19 @@ def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> 
     registry = Registry({size.split: split}, {})
     folder = size.folder(root)
     sheet_name, frame_name = PICTURES
-    draw_contact_sheet(size, root, folder / sheet_name, registry=registry)
+    draw_contact_sheet(
+        size, root, folder / sheet_name, registry=registry, option=ROOT_OPTION
+    )
 
     entry = _first_test_entry(manifest)
     frame = min(size.task.frames_of_interest[-1], entry.frames - 1)
-    plot_frame(folder / entry.path, frame, folder / frame_name, registry=registry)
+    plot_frame(
+        folder / entry.path,
+        frame,
+        folder / frame_name,
+        registry=registry,
+        option=ROOT_OPTION,
+    )
 
 
 def _first_test_entry(manifest: Manifest) -> FileEntry:

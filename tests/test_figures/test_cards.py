@@ -21,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rotating_disc import write_swirl
 
+from lagbench.atomic import ROOT_OPTION
 from lagbench.data import registry
 from lagbench.data.layout import PICTURES, dataset_folder
 from lagbench.data.manifest import (
@@ -30,6 +31,7 @@ from lagbench.data.manifest import (
     read_or_empty,
 )
 from lagbench.data.registry import Size
+from lagbench.errors import WorkFailedError
 from lagbench.figures.tables import escape, markdown
 from lagbench.make import cards
 from lagbench.make.croissant import croissant_json
@@ -89,6 +91,21 @@ def card(size: Size, manifest: Manifest, **update: object) -> str:
     split = registry.load().split(size.split)
     changed = manifest.model_copy(update=update)
     return cards.dataset_card(size, split, changed, pictures=[])
+
+
+def test_pictures_that_cannot_be_written_name_the_root(tmp_path: Path) -> None:
+    """`lagbench generate` has no --output."""
+    size, manifest = make(tmp_path)
+    split = registry.load().split(size.split)
+    for name in PICTURES:
+        picture = size.folder(tmp_path) / name
+        picture.mkdir(parents=True)
+        with pytest.raises(WorkFailedError) as caught:
+            PAINT_PICTURES(tmp_path, size, split, manifest)
+        assert str(picture) in str(caught.value.where)
+        assert ROOT_OPTION in str(caught.value.fix)
+        assert "--output" not in str(caught.value)
+        picture.rmdir()
 
 
 def run_program(*command: str) -> subprocess.CompletedProcess[str]:
