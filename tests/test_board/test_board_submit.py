@@ -560,7 +560,7 @@ def finish(processes: Sequence[Any]) -> list[int]:
 def test_two_that_add_a_seed_at_once_lose_none(
     own: BoardBench, numbers: Sequence[int]
 ) -> None:
-    """Both seeds are there, or one was refused and says so."""
+    """Both seeds are there, or one of the two was refused and says so."""
     for number in numbers:
         name = f"twice-{number}"
         paths = []
@@ -573,6 +573,7 @@ def test_two_that_add_a_seed_at_once_lose_none(
         codes = finish(processes)
         entry = read_entry(own.entry(name))
         assert set(codes) <= {0, REFUSED}
+        assert 0 in codes
         assert len(entry.seeds) == 3 - codes.count(REFUSED)
     assert well(own)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -415,6 +417,61 @@ def test_a_file_without_permission_is_unreadable(
     result = run(command, "nan.nc")
     assert result.exit_code == 3
     assert has_all_parts(result.output), result.output
+
+
+def lose_permissions() -> None:
+    """Let the program that this process becomes open no file that its mode forbids.
+
+    The superuser may open all files by two capabilities; others do not have them.
+    """
+    drop_capability = 24  # PR_CAPBSET_DROP of <linux/prctl.h>
+    libc = ctypes.CDLL(None)
+    for capability in (1, 2):  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
+        libc.prctl(drop_capability, capability, 0, 0, 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
+def test_a_true_scenario_without_permission_is_told(
+    files: Path, bench: ScoreBench, tmp_path: Path
+) -> None:
+    """It is data that cannot be read, and nothing says that it is to be made again."""
+    root = shutil.copytree(bench.root, tmp_path / "root")
+    truth = bench.size.path(root, 3)
+    truth.chmod(0)
+    words = ["score", str(files / "good.nc"), "--root", str(root), "--workers", "1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "lagbench", *words, "-o", str(tmp_path / "scores")],
+        preexec_fn=lose_permissions,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 4, done.stderr
+    assert has_all_parts(done.stderr), done.stderr
+    assert truth.name in done.stderr
+    assert "ermission" in done.stderr
+
+
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
+@pytest.mark.parametrize("form", ["--workers=1", "--json"])
+def test_scores_that_a_full_disk_cannot_take_are_told(
+    form: str, files: Path, bench: ScoreBench, tmp_path: Path
+) -> None:
+    """The exit code says that the output is not whole; the files of scores are."""
+    words = ["score", str(files / "good.nc"), "--root", str(bench.root), form]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "lagbench", *words, "-o", str(tmp_path)],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 5, done.stderr
+    assert has_all_parts(done.stderr), done.stderr
+    assert (tmp_path / "scores.json").exists()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")

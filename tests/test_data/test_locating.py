@@ -188,6 +188,10 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     (mini_folder / "0000.nc").touch()
     one_of_three = locate("cavity", root=tmp_path)
     assert one_of_three.size.name == "mini"
+    for reading in (lagbench.open_split, lagbench.windows):
+        with pytest.raises(DataError) as damaged:
+            reading("cavity", subset="test", root=tmp_path)
+        assert str(mini_folder) in str(damaged.value.where)
     # Nothing is removed by a default.
     with pytest.raises(UsageError) as unnamed:
         clean("cavity", root=tmp_path)

@@ -228,6 +228,22 @@ def test_page_is_whole_and_harmless(page: Page, split: str) -> None:
 
 
 @EVERY_PAGE
+def test_the_page_opens_folded(page: Page, split: str) -> None:
+    """All sections fold; two at most are open, and no table of numbers."""
+    reading = read_html(page(split))
+    sections = []
+    tables = []
+    for element in reading.named("details"):
+        is_section = element.attributes.get("class") == "part"
+        (sections if is_section else tables).append(element)
+    titles = reading.named("h2")
+    assert len(sections) == len(titles) > 2
+    open_sections = [one for one in sections if "open" in one.attributes]
+    assert 1 <= len(open_sections) <= 2
+    assert not any("open" in one.attributes for one in tables)
+
+
+@EVERY_PAGE
 def test_every_figure_of_the_thesis_has_its_counterpart(page: Page, split: str) -> None:
     """Captions name the figure of the thesis, and figures are numbered in order."""
     reading = read_html(page(split))
