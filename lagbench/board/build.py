@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.addresses import DOCUMENTATION
 from lagbench.atomic import write_atomically
 from lagbench.data.box import Box
 from lagbench.data.registry import Registry, Size, load
@@ -72,7 +73,7 @@ from .model import (
     Tab,
     Value,
 )
-from .page import LINKS, links_in, render, same_page
+from .page import links_in, links_to, render, same_page
 from .ranking import CombinedScore, combine, read_references
 from .sampling import coarsen, spaced
 from .selection import is_current
@@ -1035,7 +1036,11 @@ class BuildResult:
 
 
 def build(
-    board: str | Path, *, check: bool = False, registry: Registry | None = None
+    board: str | Path,
+    *,
+    check: bool = False,
+    registry: Registry | None = None,
+    documentation: str = DOCUMENTATION,
 ) -> BuildResult:
     """Write page and schema.json where they are stale.
 
@@ -1043,6 +1048,7 @@ def build(
         board: the leaderboard's folder.
         check: whether to write nothing; stale files are an error then.
         registry: where splits are described; ours when None.
+        documentation: address of the documentation's site; empty where it has none.
 
     Raises:
         ChecksFailedError: with ``check``, a file is stale.
@@ -1052,7 +1058,8 @@ def build(
     page = folder.path / PAGE
     schema = folder.path / SCHEMA
     content = collect(board, registry=registry, scope=PAGE_SCOPE)
-    new_page = render(content, _links_of(folder, check=check))
+    links = _links_of(folder, links_to(documentation), check=check)
+    new_page = render(content, links)
     new_schema = schema_bytes()
 
     stale = {}
@@ -1086,17 +1093,19 @@ def _is_file(path: Path) -> bool:
     return path.is_file() and not path.is_symlink()
 
 
-def _links_of(folder: Folder, *, check: bool) -> dict[str, str]:
-    """Return the links of the page: to files that are there.
+def _links_of(
+    folder: Folder, known_links: Mapping[str, str], *, check: bool
+) -> dict[str, str]:
+    """Return the links of the page: to a site with an address, or to files there are.
 
     A copy of the folder elsewhere still has the links of where its page was drawn, so a
     page that is checked keeps its links.
     """
     page = folder.path / PAGE
     if check and page.is_file():
-        return links_in(page.read_bytes())
+        return links_in(page.read_bytes(), known_links)
     links = {}
-    for label, address in LINKS.items():
-        if (folder.path / address).exists():
+    for label, address in known_links.items():
+        if "://" in address or (folder.path / address).exists():
             links[label] = address
     return links

@@ -93,13 +93,25 @@ PAGES = {
 }
 """Pages of the documentation's site that the page links, by label."""
 
-LINKS: Mapping[str, str] = {
-    label: f"{DOCUMENTATION.rstrip('/') or '../site'}/{name}.html"
-    for label, name in PAGES.items()
-}
-"""Links of the page, from the leaderboard's folder; where the site has no address, it
-is the one that mkdocs makes in a clone. Links to missing files are left out.
-"""
+
+def links_to(documentation: str = DOCUMENTATION) -> dict[str, str]:
+    """Return the links of the page, from the leaderboard's folder.
+
+    Where the site has no address, it is the one that mkdocs makes in a clone. Links to
+    missing files are left out later.
+
+    >>> links_to("https://example.org/docs/")["All results"]
+    'https://example.org/docs/results.html'
+    """
+    site = documentation.rstrip("/") or "../site"
+    links = {}
+    for label, name in PAGES.items():
+        links[label] = f"{site}/{name}.html"
+    return links
+
+
+LINKS: Mapping[str, str] = links_to()
+"""Links of the page at the address of the site that is set."""
 
 TAKE_PART = """\
 # once, in a clone of the repository
@@ -234,10 +246,10 @@ def _encode_same(first: str, second: str) -> bool:
         return False
 
 
-def links_in(page: bytes) -> dict[str, str]:
+def links_in(page: bytes, known_links: Mapping[str, str]) -> dict[str, str]:
     """Return those of our links that a page has."""
     links = {}
-    for label, address in LINKS.items():
+    for label, address in known_links.items():
         if str(tag("a", label, href=address)).encode() in page:
             links[label] = address
     return links

@@ -33,6 +33,7 @@ from lagbench.board.entry import Weights
 from lagbench.board.folder import Folder
 from lagbench.board.gates import gates_failed_by, read_failed_gates
 from lagbench.board.model import Board, BoardRow
+from lagbench.board.page import PAGES
 from lagbench.board.ranking import combine
 from lagbench.board.selection import choose_data_sets
 from lagbench.board.show import tables, to_plain
@@ -466,7 +467,7 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
     damped = rows["damped"]
     rank = row_of(board, "damped").rank
     assert damped[0] == str(rank)
-    assert damped[5] == "0.5"
+    assert damped[5] == "0.5*"  # stated in the entry, and measured by nobody
     for row in table.rows:
         assert "\n" not in row[-1]
     (wide,) = tables(board, wide=True)
@@ -515,6 +516,24 @@ def test_boards_without_an_entry_are_named(
     assert choose_data_sets([], None, None) == ()
     result = build(tmp_path, registry=bench.registry)
     assert result.rows == 0
+
+
+def test_the_page_links_to_the_documentation_where_that_has_an_address(
+    tmp_path: Path,
+) -> None:
+    """Without an address only files that are there are linked, and nothing is told."""
+    (tmp_path / "submissions").mkdir()
+    result = build(tmp_path, documentation="https://example.org/docs/")
+    page = result.page.read_text("utf-8")
+    for label, name in PAGES.items():
+        link = f'<a href="https://example.org/docs/{name}.html">{label}</a>'
+        assert link in page
+    build(tmp_path, documentation="https://example.org/docs/", check=True)
+
+    build(tmp_path, documentation="")
+    page = result.page.read_text("utf-8")
+    for label in PAGES:
+        assert f">{label}</a>" not in page
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan])
