@@ -164,7 +164,7 @@ def check_arguments(
     def checked(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         place = function.__name__
         parameters = list(signature.parameters.values())
-        values = args
+        values: tuple[object, ...] = args
         if is_constructor:
             # of the class that the user called, which may have inherited it
             place = type(args[0]).__name__

@@ -107,10 +107,10 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
         room = _room_for_remarks([line[:KEYS] for line in lines])
 
     table_rows = []
-    for row, line in zip(rows, lines[1:], strict=True):
-        remarks = _join_remarks(row, wide=wide)
+    for table_row, line in zip(rows, lines[1:], strict=True):
+        remarks = _join_remarks(table_row, wide=wide)
         if not wide and len(remarks) > room:
-            remarks = _shorten_remarks(row, room)
+            remarks = _shorten_remarks(table_row, room)
         table_rows.append((*line, remarks))
     legend = _legend_of(tab, table_rows, wide=wide)
     return Table(
