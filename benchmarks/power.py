@@ -189,8 +189,9 @@ two seeds of the same method? `python benchmarks/power.py --write` writes this p
 
 ## Differences that the test finds
 
-**Model.** The value of seed s in scenario i is m (1 + a_i + b_i + c_s + e_si). Here m
-is the mean of the method. The other four terms are random:
+**Model.** We draw random scores of two methods. A method has the score
+m (1 + a_i + b_i + c_s + e_si) with seed s in scenario i. Here m is the mean of the
+method. The other four terms are random:
 
 - a_i belongs to the scenario. It is the same for both methods.
 - b_i belongs to the method in this scenario (column "method in scenario").
@@ -226,8 +227,8 @@ difference in at most 5 % of the draws. The shares have a statistical error: 5 %
 With one seed on each side the test is the sign-flip test over scenarios. Its answer
 is correct for the two trained models, that is, for these weights. But it is often
 wrong for the methods, as the column "1 seed each" shows. Therefore the leaderboard
-speaks of "these weights" if a side has only one seed. This is also true if the other
-side has several seeds, because the scatter between seeds is then known for one side
+speaks of "these weights" if a side has only one seed. It does so even if the other
+side has several seeds. In this case the scatter between seeds is known for one side
 only.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
