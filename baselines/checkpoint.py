@@ -440,7 +440,7 @@ def _check_other_size(
     command = f"lagbench train --baseline {entry.name} {trained.split} --size {size}"
     if not entry.model.any_size:
         raise UsageError(
-            f"{entry.model.method} has weights for the particles of one size",
+            f"{entry.model.method} predicts only the size that it was trained on",
             where="--size",
             expected=trained.size,
             got=size,

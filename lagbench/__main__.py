@@ -7,6 +7,7 @@ import errno
 import functools
 import importlib
 import io
+import itertools
 import os
 import re
 import sys
@@ -104,9 +105,41 @@ class _CheckedCommand(TyperCommand):
     """A command that takes none of its own options for the value of another one."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401
+        _refuse_empty_paths(ctx, args)
         rest = super().parse_args(ctx, args)
         _refuse_options_as_values(ctx)
         return rest
+
+
+def _refuse_empty_paths(context: Any, args: list[str]) -> None:  # noqa: ANN401 (as above)
+    """Refuse an empty word where a path belongs: it would mean the working folder.
+
+    Raises:
+        UsageError: there is one, as in ``--output ""`` with an unset variable.
+    """
+    for parameter in context.command.get_params(context):
+        if parameter.param_type_name != "option" or parameter.type.name != "path":
+            continue
+        for name in parameter.opts:
+            if _is_left_empty(name, args):
+                raise UsageError(
+                    f"{name} is empty",
+                    where=f"{PROGRAM} {_command_words(context)}",
+                    expected=f"{name} {parameter.metavar or 'PATH'}",
+                    got="an empty text",
+                    fix="name a path; . is the working folder",
+                )
+
+
+def _is_left_empty(name: str, args: list[str]) -> bool:
+    """Tell whether an empty word follows an option.
+
+    >>> _is_left_empty("-o", ["-o", ""])
+    True
+    """
+    if f"{name}=" in args:
+        return True
+    return (name, "") in itertools.pairwise(args)
 
 
 def _refuse_options_as_values(context: Any) -> None:  # noqa: ANN401 (two copies of click)

@@ -16,7 +16,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import ChecksFailedError, DataError, LagbenchError
+from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.task import ScoredTask, load_scored_task
@@ -97,7 +97,8 @@ def score_on_shift(
         progress: called as the work advances.
 
     Raises:
-        UsageError: there is no leaderboard, no such entry, or one without a model.
+        UsageError: there is no leaderboard, no such entry, one without a model, or
+            nothing to run.
         DataError: the data of a named entry are missing or others.
         UnreadableFileError: a model of a named entry cannot be read.
         WorkFailedError: the disk or the memory is full.
@@ -115,10 +116,12 @@ def score_on_shift(
         meter=Meter(progress),
         result=ShiftResult(folder=folder.path),
     )
-    for entry in choose_entries(folder, entries, described, split=split, size=size):
-        tier = described.size(entry.split, entry.size)
-        if not entries and SUBSET not in tier.subsets:
-            continue
+    chosen = choose_entries(folder, entries, described, split=split, size=size)
+    if not entries:
+        chosen = [entry for entry in chosen if _has_shift(entry, described)]
+        _require_some(chosen, folder, split, size)
+
+    for entry in chosen:
         path = entry.yaml_path.as_posix()
         try:
             run.score(entry)
@@ -130,6 +133,26 @@ def score_on_shift(
         if scores is not None:
             run.result.entries[path] = scores
     return run.result
+
+
+def _has_shift(entry: Entry, registry: Registry) -> bool:
+    """Tell whether the data set of an entry has the subset ``shift``."""
+    return SUBSET in registry.size(entry.split, entry.size).subsets
+
+
+def _require_some(
+    chosen: Sequence[Entry], folder: Folder, split: str | None, size: str | None
+) -> None:
+    """Refuse a choice of data sets in which there is nothing to run."""
+    if chosen:
+        return
+    raise UsageError(
+        f"no entry to score on {SUBSET}",
+        where=str(folder.path),
+        expected=f"active entries with models, of data sets with {SUBSET}",
+        got=f"none of --split {split or 'any'} and --size {size or 'any'}",
+        fix="`lagbench list` shows the subsets of a data set",
+    )
 
 
 @dataclass(kw_only=True)

@@ -266,6 +266,8 @@ def test_what_cannot_be_run_is_refused(
         score_on_shift(
             model_board.folder, ["curl-noise/tiny/gns"], root=model_board.root
         )
+    with pytest.raises(UsageError):
+        score_on_shift(model_board.folder, root=model_board.root)
     (own.folder / "shift.yaml").unlink()
     with pytest.raises(DataError):
         score_on_shift(own.folder, [NAME], root=tmp_path / "nowhere")

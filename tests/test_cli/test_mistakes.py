@@ -387,6 +387,19 @@ def test_an_option_is_no_value_of_another_one(
     assert set(os.listdir()) == files_before
 
 
+@pytest.mark.parametrize("words", [["-o", ""], ["--output", ""], ["--output="]])
+@pytest.mark.parametrize("command", ["score good.nc", "template curl-noise"])
+def test_an_empty_path_is_refused(
+    command: str, words: list[str], run: Callable[..., Result]
+) -> None:
+    """It would mean the working folder, to whoever has left a variable unset."""
+    files_before = set(os.listdir())
+    result = run(*command.split(), *words)
+    assert result.exit_code == 2
+    assert has_all_parts(result.stderr), result.stderr
+    assert set(os.listdir()) == files_before
+
+
 @pytest.mark.parametrize("command", ["score", "validate", "compare", "submit"])
 def test_a_size_that_the_file_states_is_not_asked_for(
     command: str, run: Callable[..., Result]
