@@ -118,14 +118,15 @@ def _refuse_empty_paths(context: Any, args: list[str]) -> None:  # noqa: ANN401 
         UsageError: there is one, as in ``--output ""`` with an unset variable.
     """
     for parameter in context.command.get_params(context):
-        if parameter.param_type_name != "option" or parameter.type.name != "path":
+        is_option = parameter.param_type_name == "option"
+        if not is_option or parameter.metavar not in ("FILE", "FOLDER"):
             continue
         for name in parameter.opts:
             if _is_left_empty(name, args):
                 raise UsageError(
                     f"{name} is empty",
                     where=f"{PROGRAM} {_command_words(context)}",
-                    expected=f"{name} {parameter.metavar or 'PATH'}",
+                    expected=f"{name} {parameter.metavar}",
                     got="an empty text",
                     fix="name a path; . is the working folder",
                 )

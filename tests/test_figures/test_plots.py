@@ -217,7 +217,8 @@ def test_a_figure_has_one_unit_of_time(
     """Colour bars are in seconds, and so is the number at a moving wall."""
     texts: list[str] = []
 
-    def collect(drawn: Figure, output: Path) -> Path:
+    def collect(drawn: Figure, output: Path, *, option: str) -> Path:
+        assert option == "--output"
         for text in drawn.findobj(Text):
             texts.append(text.get_text())
         return output

@@ -79,7 +79,8 @@ def texts(monkeypatch: pytest.MonkeyPatch) -> list[Text]:
     """All texts of the figures that are drawn, beside their figures."""
     collected: list[Text] = []
 
-    def collect(drawn: Figure, output: Path) -> Path:
+    def collect(drawn: Figure, output: Path, *, option: str) -> Path:
+        assert option == "--output"
         drawn.draw_without_rendering()
         collected.extend(drawn.findobj(Text))
         return output
