@@ -54,9 +54,9 @@ def list_effective_settings(
     """Return the settings of a prediction that change the model, in one form and order.
 
     A setting that states the value of the weights' own recipe, or of its default,
-    changes nothing and is left out. Nor do settings change anything that the model does
-    not take: nobody can predict with them. Settings of a model that is not installed
-    are returned as they are written.
+    changes nothing and is left out. If the model refuses one setting, the result is
+    empty: nobody can predict with them. Settings of a model that is not installed are
+    returned as they are written.
 
     Args:
         baseline: name of the baseline in the weights.

@@ -111,7 +111,7 @@ class _CheckedCommand(TyperCommand):
         return rest
 
 
-def _refuse_empty_paths(context: Any, args: list[str]) -> None:  # noqa: ANN401 (as above)
+def _refuse_empty_paths(context: Any, args: list[str]) -> None:  # noqa: ANN401 (two copies)
     """Refuse an empty word where a path belongs: it would mean the working folder.
 
     Raises:

@@ -308,7 +308,8 @@ def _format_value(value: Value | None, *, wide: bool, is_skill: bool) -> str:
         return NOTHING
     if is_skill and not wide:
         # less than a thousandth of the naive baseline's score says nothing
-        return f"{round(value.mean, 3):.3g}"
+        rounded = round(value.mean, 3) + 0.0  # without the sign of -0
+        return f"{rounded:.3g}"
     if math.isnan(value.std) or not wide:
         return f"{value.mean:.3g}"
     return f"{value.mean:.4g} ± {value.std:.2g}"

@@ -59,8 +59,12 @@ def close_command(
         str | None, option("--size NAME", "Freeze entries of this size only.")
     ] = None,
     scenarios: Annotated[
-        int, option("--scenarios N", "Blind scenarios of each data set.")
-    ] = SCENARIOS,
+        int | None,
+        option(
+            "--scenarios N",
+            f"Blind scenarios of each data set; {SCENARIOS} by default.",
+        ),
+    ] = None,
     budget: Annotated[
         float | None,
         option(
@@ -119,7 +123,7 @@ def close_command(
             name,
             split=split,
             size=size,
-            scenarios=scenarios,
+            scenarios=SCENARIOS if scenarios is None else scenarios,
             budget=budget,
             source=source or "",
             root=root,
@@ -134,13 +138,12 @@ def _refuse_closing_options(options: Mapping[str, object]) -> None:
     """Refuse options that a season is closed with, where it is closed already.
 
     Args:
-        options: values by option; None, or the default number of scenarios, where an
-            option was not given.
+        options: values by option; None where an option was not given.
 
     Raises:
         UsageError: one of them was given beside ``--value``.
     """
-    given = [name for name, value in options.items() if value not in (None, SCENARIOS)]
+    given = [name for name, value in options.items() if value is not None]
     if not given:
         return
     raise UsageError(

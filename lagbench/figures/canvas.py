@@ -279,8 +279,12 @@ def renamed(path: Path, ending: str) -> str:
 def save(drawn: Figure, output: str | Path, *, option: str = "--output") -> Path:
     """Write the figure to a file, with equal bytes every time; return its path.
 
-    The file appears whole or not at all. ``option`` is what names another place, for
-    messages.
+    The file appears whole or not at all.
+
+    Args:
+        drawn: the figure.
+        output: path of the file.
+        option: name of the option for the path, used in error messages.
 
     Raises:
         UsageError: the name ends in none of :data:`ENDINGS`.

@@ -68,6 +68,9 @@ def end_after(seconds: float | None) -> Iterator[None]:
     if seconds is None or sys.platform == "win32":
         yield
         return
+    # a parent may have told its children to ignore the signal
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGPROF})
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
@@ -195,7 +198,26 @@ def _advance(
     request: dict[str, Any],
 ) -> NDArray[np.float64]:
     """Return the next frames, at least one, shape [frame, particle, axis]."""
-    radius = request["radius"]
+    # edges are pairs of particles that the model itself may have put into one place
+    with end_after(request["seconds_per_call"]):
+        values = _inputs_of_call(inputs, given, window, done, request["radius"])
+        (output,) = session.run([OUTPUT], values)
+    if output.ndim != 3 or output.shape[1:] != window.shape[1:] or len(output) == 0:
+        raise ValueError(
+            f"{OUTPUT} of shape {list(output.shape)}, expected [frame, "
+            f"{window.shape[1]}, {window.shape[2]}]"
+        )
+    return np.asarray(output, np.float64)
+
+
+def _inputs_of_call(
+    inputs: dict[str, str],
+    given: dict[str, NDArray[Any]],
+    window: NDArray[np.float64],
+    done: int,
+    radius: float,
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays of one call, by the name of the input."""
     values: dict[str, NDArray[Any]] = {}
     for name, type_name in inputs.items():
         value: NDArray[Any]
@@ -211,14 +233,7 @@ def _advance(
         else:
             raise ValueError(f"the input {name}, which this data set does not have")
         values[name] = np.asarray(value, np.dtype(type_name), order="C")
-    with end_after(request["seconds_per_call"]):
-        (output,) = session.run([OUTPUT], values)
-    if output.ndim != 3 or output.shape[1:] != window.shape[1:] or len(output) == 0:
-        raise ValueError(
-            f"{OUTPUT} of shape {list(output.shape)}, expected [frame, "
-            f"{window.shape[1]}, {window.shape[2]}]"
-        )
-    return np.asarray(output, np.float64)
+    return values
 
 
 def find_edges(

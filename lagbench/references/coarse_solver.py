@@ -6,9 +6,8 @@ end. Its grid has half as many cells along each axis, or a quarter, and its time
 two or four times as long. Where the walls do not lie on nodes of the half grid, it has
 two thirds of the cells and a time step that is 1.5 times as long. A seeded subset of
 the particles, as many to a cell as before and as evenly spread, carries the mass. In a
-full box the others
-move as those around them do (see :mod:`.predictor`); on a free surface each keeps its
-offset to the nearest particle of its material that carries mass.
+full box the others move as those around them do (see :mod:`.predictor`); on a free
+surface each keeps its offset to the nearest particle of its material that carries mass.
 
 The solver starts from displacements alone: in full boxes the velocity of the last given
 frame is extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall it is

@@ -198,7 +198,7 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
             attributes = {}
             for name in ("split", "size", "version"):
-                attributes[name] = scenario.attrs[name]
+                attributes[name] = _require_text(scenario.attrs[name])
             attributes["scenario"] = int(scenario.attrs["scenario"])
             _check_positions(file["position"])
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
@@ -227,11 +227,22 @@ def _check_positions(position: xr.DataArray) -> None:
         raise ValueError(message)
 
 
+def _require_text(attribute: object) -> str:
+    """Return an attribute that must be a text.
+
+    Raises:
+        TypeError: it is something else, as an array of numbers.
+    """
+    if not isinstance(attribute, str):
+        raise TypeError(f"{attribute!r:.80} is no text")
+    return attribute
+
+
 def _is_of(key: ScenarioKey, attributes: Mapping[str, Any]) -> bool:
     """Tell whether attributes name a scenario; MINOR and PATCH may differ."""
     return (
         attributes["split"] == key.split
         and attributes["size"] == key.size
         and attributes["scenario"] == key.scenario
-        and str(attributes["version"]).split(".")[0] == str(key.major)
+        and attributes["version"].split(".")[0] == str(key.major)
     )

@@ -182,6 +182,7 @@ MISTAKES = {
     "a source without a name": "season close may --source ''",
     "a value and a split": "season close may --value 12 --split cavity",
     "a value and a number of scenarios": "season close may --value 12 --scenarios 4",
+    "a value and a budget": "season close may --value 12 --budget 8",
     "a description with an unknown key": "submit good.nc --from bad_key.yaml",
     "a description that is no YAML": "submit good.nc --from bad.yaml",
     "neither added nor replaced": "submit good.nc --add --replace --board .",

@@ -136,9 +136,10 @@ def test_each_call_of_a_model_has_a_limit(
     """A graph that is fast in its first call may not be slow in a later one."""
     model = opened(works_later(tmp_path / "model.onnx"), generated, 0.5)
     model.predict(first_scenario(generated), 1)
-    with pytest.raises(WorkFailedError) as caught:
+    started = processor_time()
+    with pytest.raises(WorkFailedError):
         model.predict(first_scenario(generated), 90)
-    assert "computing time" in str(caught.value.got)
+    assert processor_time() - started < MOST_SECONDS
 
 
 def test_the_time_of_a_short_rollout_is_measured(

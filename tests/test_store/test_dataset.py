@@ -178,10 +178,20 @@ def test_an_id_that_is_no_number_is_damage(ragged: Path, scenario: object) -> No
         open_tiny(ragged)
 
 
+@pytest.mark.parametrize("name", ["split", "size", "version"])
+def test_numbers_in_place_of_a_name_are_damage(ragged: Path, name: str) -> None:
+    path = scenario_path(ragged, TEST_IDS[0])
+    with h5py.File(path, "r+") as file:
+        del file.attrs[name]
+        file.attrs[name] = [1, 2]
+    with pytest.raises(DataError, match=rf"(?s)damaged.*{path.name}"):
+        open_tiny(ragged)
+
+
 @pytest.mark.parametrize(
     "position", [np.zeros((9, 9, 2), np.int32), np.zeros((9, 2)), b"text"]
 )
-def test_positions_that_are_none_are_damage(ragged: Path, position: object) -> None:
+def test_other_data_as_positions_are_damage(ragged: Path, position: object) -> None:
     path = scenario_path(ragged, TEST_IDS[0])
     with h5py.File(path, "r+") as file:
         del file["position"]
