@@ -196,7 +196,7 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             frame_bytes = value_bytes * file.sizes["particle"] * file.sizes["space"]
             frames_per_chunk = max(1, CHUNK_BYTES // frame_bytes)
             scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
-            attributes = {}
+            attributes: dict[str, Any] = {}
             for name in ("split", "size", "version"):
                 attributes[name] = _require_text(scenario.attrs[name])
             attributes["scenario"] = int(scenario.attrs["scenario"])
@@ -240,7 +240,7 @@ def _require_text(attribute: object) -> str:
 
 def _is_of(key: ScenarioKey, attributes: Mapping[str, Any]) -> bool:
     """Tell whether attributes name a scenario; MINOR and PATCH may differ."""
-    return (
+    return bool(
         attributes["split"] == key.split
         and attributes["size"] == key.size
         and attributes["scenario"] == key.scenario
