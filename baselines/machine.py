@@ -60,22 +60,24 @@ def use_threads(count: int | None, *, processes: int = 1) -> Iterator[None]:
     Raises:
         UsageError: there are so many that OpenMP might end the process.
     """
-    most_threads = max(MOST_THREADS, available_cores())
-    if count is not None and count > most_threads:
-        raise UsageError(
-            "so many threads cannot be used",
-            where="--threads",
-            expected=f"at most {most_threads}",
-            got=count,
-            fix=f"leave --threads out; this machine has {available_cores()} cores",
-        )
-    before = torch.get_num_threads()
+    source = "--threads"
     if not count:
         environment = os.environ.get("OMP_NUM_THREADS", "")
         if environment.isdecimal():
+            source = "OMP_NUM_THREADS"
             count = max(1, int(environment))
         else:
             count = max(1, available_cores() // processes)
+    most_threads = max(MOST_THREADS, available_cores())
+    if count > most_threads:
+        raise UsageError(
+            "so many threads cannot be used",
+            where=source,
+            expected=f"at most {most_threads}",
+            got=count,
+            fix=f"leave {source} out; this machine has {available_cores()} cores",
+        )
+    before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
         yield

@@ -7,12 +7,11 @@ import errno
 import functools
 import importlib
 import io
-import itertools
 import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import Annotated, Any, ClassVar
@@ -97,81 +96,78 @@ _LONG_OPTION = re.compile(r"--[a-z][a-z-]*(=.*)?", re.DOTALL)
 SIZE_NAMES = frozenset({"tiny", "mini", "full"})
 """Names of sizes that a user may write behind the split."""
 
+PATH_PLACEHOLDERS = frozenset({"FILE", "FOLDER"})
+"""What the help shows in place of a path."""
+
 NEAR_NAME = 0.8
 """Likeness of two options, of 1, from which one is a misspelt other."""
 
 
 class _CheckedCommand(TyperCommand):
-    """A command that takes none of its own options for the value of another one."""
+    """A command that checks the words of its options and arguments as they are typed.
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401
-        _refuse_empty_paths(ctx, args)
+    Values lose what is checked here: an empty path becomes that of the working folder.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 (two copies of click)
+        typed_words = list(args)
         rest = super().parse_args(ctx, args)
-        _refuse_options_as_values(ctx)
+
+        names: set[str] = set()
+        for parameter in self.get_params(ctx):
+            names.update(parameter.opts)
+            names.update(parameter.secondary_opts)
+        values, _, _ = self.make_parser(ctx).parse_args(args=typed_words)
+        for parameter in self.get_params(ctx):
+            value = values.get(parameter.name)
+            words = value if isinstance(value, list | tuple) else [value]
+            for word in words:
+                if isinstance(word, str):
+                    _check_typed_word(ctx, parameter, word, names)
         return rest
 
 
-def _refuse_empty_paths(context: Any, args: list[str]) -> None:  # noqa: ANN401 (two copies)
-    """Refuse an empty word where a path belongs: it would mean the working folder.
+def _check_typed_word(
+    context: Any,  # noqa: ANN401 (two copies of click)
+    parameter: Any,  # noqa: ANN401 (as above)
+    word: str,
+    names: Collection[str],
+) -> None:
+    """Refuse an empty path, and an option that was read as the value of another one.
+
+    Args:
+        context: context of the command.
+        parameter: the option or argument.
+        word: its value as typed.
+        names: names of all options of the command.
 
     Raises:
-        UsageError: there is one, as in ``--output ""`` with an unset variable.
+        UsageError: as in ``--output ""`` or ``--output --overwrite``.
     """
-    for parameter in context.command.get_params(context):
-        is_option = parameter.param_type_name == "option"
-        if not is_option or parameter.metavar not in ("FILE", "FOLDER"):
-            continue
-        for name in parameter.opts:
-            if _is_left_empty(name, args):
-                raise UsageError(
-                    f"{name} is empty",
-                    where=f"{PROGRAM} {_command_words(context)}",
-                    expected=f"{name} {parameter.metavar}",
-                    got="an empty text",
-                    fix="name a path; . is the working folder",
-                )
-
-
-def _is_left_empty(name: str, args: list[str]) -> bool:
-    """Tell whether an empty word follows an option.
-
-    >>> _is_left_empty("-o", ["-o", ""])
-    True
-    """
-    if f"{name}=" in args:
-        return True
-    return (name, "") in itertools.pairwise(args)
-
-
-def _refuse_options_as_values(context: Any) -> None:  # noqa: ANN401 (two copies of click)
-    """Refuse an option that was read as the text or the path of another one.
-
-    Raises:
-        UsageError: there is one, as in ``--output --overwrite``.
-    """
-    options = []
-    names: set[str] = set()
-    for parameter in context.command.get_params(context):
-        if parameter.param_type_name == "option":
-            options.append(parameter)
-            names.update(parameter.opts)
-            names.update(parameter.secondary_opts)
-    for parameter in options:
-        value = context.params.get(parameter.name)
-        values = value if isinstance(value, list | tuple) else [value]
-        for item in values:
-            word = str(item)
-            if word not in names and not _LONG_OPTION.fullmatch(word):
-                continue
-            name = max(parameter.opts, key=len)
-            raise UsageError(
-                f"{name} has no value",
-                where=f"{PROGRAM} {_command_words(context)}",
-                expected=f"{name} {parameter.metavar or 'VALUE'}",
-                got=f"{name} {shorten_word(word)}, which is written as an option is",
-                fix=f"add a value behind {name}; a file of that name is "
-                f"./{shorten_word(word)}",
-            )
+    where = f"{PROGRAM} {_command_words(context)}"
+    is_option = parameter.param_type_name == "option"
+    name = max(parameter.opts, key=len) if is_option else parameter.metavar
+    is_path = parameter.metavar in PATH_PLACEHOLDERS
+    if is_path and not word:
+        raise UsageError(
+            f"{name} is empty",
+            where=where,
+            expected=f"a path as {name}",
+            got="an empty text",
+            fix="name a path; . is the working folder",
+        )
+    if not is_option or (word not in names and not _LONG_OPTION.fullmatch(word)):
+        return
+    advice = f"add a value behind {name}"
+    if is_path:
+        advice = f"{advice}; a file of that name is ./{shorten_word(word)}"
+    raise UsageError(
+        f"{name} has no value",
+        where=where,
+        expected=f"{name} {parameter.metavar or 'VALUE'}",
+        got=f"{name} {shorten_word(word)}, which is written as an option is",
+        fix=advice,
+    )
 
 
 class _LazyCommand(TyperCommand):

@@ -1099,13 +1099,20 @@ def _links_of(
     """Return the links of the page: to a site with an address, or to files there are.
 
     A copy of the folder elsewhere still has the links of where its page was drawn, so a
-    page that is checked keeps its links.
+    page that is checked keeps its links to files.
     """
     page = folder.path / PAGE
+    drawn_links = None
     if check and page.is_file():
-        return links_in(page.read_bytes(), known_links)
+        drawn_links = links_in(page.read_bytes(), known_links)
     links = {}
     for label, address in known_links.items():
-        if "://" in address or (folder.path / address).exists():
+        if "://" in address:
+            is_shown = True
+        elif drawn_links is not None:
+            is_shown = label in drawn_links
+        else:
+            is_shown = (folder.path / address).exists()
+        if is_shown:
             links[label] = address
     return links

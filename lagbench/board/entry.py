@@ -43,10 +43,19 @@ from .folder import Place, entry_path, score_paths, weights_path
 
 OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
-LEAST_SCORE = 1e-38  # to which the difference of two scores is relative, at least
+LEAST_SCORE = 1e-38
+"""Size of a score, at least, to which a difference is relative: about the smallest
+normal number of float32.
+"""
+
 BUDGET_COUNTS = ("windows", "steps", "start_steps")
 BUDGET_AMOUNTS = ("epochs", "cpu_hours", "validation_hours", "gpu_hours")
 BUDGET_LABELS = ("device", "threads", "metric")
+
+
+def relative_difference(submitted: float, reproduced: float) -> float:
+    """Return the difference of two scores, relative to the submitted one."""
+    return abs(reproduced - submitted) / max(abs(submitted), LEAST_SCORE)
 
 
 class Status(enum.StrEnum):
@@ -292,8 +301,7 @@ class Reproduction(Strict):
     @property
     def has_stated_difference(self) -> bool:
         """Whether the difference is that of both scores, up to the digits they have."""
-        scale = max(abs(self.submitted), LEAST_SCORE)
-        difference = abs(self.reproduced - self.submitted) / scale
+        difference = relative_difference(self.submitted, self.reproduced)
         return math.isclose(difference, self.difference, rel_tol=0.1, abs_tol=1e-8)
 
     @property

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import stat
 import statistics
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import format_ids
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     LagbenchError,
@@ -458,16 +459,15 @@ class FolderChecks:
         if not line.is_reproduced:
             return
         where = f"{VERIFIED}, {entry.yaml_path}"
-        seeds = sorted(reproduction.seed or 0 for reproduction in line.reproduced)
-        proofs = [_proves_score(each, entry) for each in line.reproduced]
-        has_all_seeds = seeds == sorted(seed or 0 for seed in entry.seeds)
-        if not has_all_seeds or not all(proofs) or not _states_score(line, entry):
+        faults = list(_faults_of_records(line, entry))
+        if faults:
             self._add(
                 "verified",
                 where,
-                f"{sum(proofs)} records with the same scores",
+                "; ".join(faults),
                 what=f"the level is {line.level}, and the records do not show it",
-                expected=f"a record of each of {len(entry.seeds)} seeds that agrees",
+                expected=f"a record of each of {len(entry.seeds)} seeds that agrees "
+                "with the score of the entry",
             )
         size = self.registry.size(entry.split, entry.size)
         test_count = len(size.scored_scenarios)
@@ -483,6 +483,18 @@ class FolderChecks:
                 what="other numbers of scenarios than the test subset has",
                 expected=f"at most {test_count} of {test_count}",
             )
+
+
+def _faults_of_records(line: Verification, entry: Entry) -> Iterator[str]:
+    """Yield why the records of a line do not show that the models gave the scores."""
+    seeds = sorted(reproduction.seed or 0 for reproduction in line.reproduced)
+    if seeds != sorted(seed or 0 for seed in entry.seeds):
+        yield f"records of the seeds {format_ids(seeds)}"
+    proofs = [_proves_score(reproduction, entry) for reproduction in line.reproduced]
+    if not all(proofs):
+        yield f"{sum(proofs)} of {len(proofs)} records agree"
+    if not _states_score(line, entry):
+        yield "another submitted score than that of the entry"
 
 
 def _proves_score(reproduction: Reproduction, entry: Entry) -> bool:

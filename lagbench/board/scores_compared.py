@@ -11,7 +11,7 @@ from lagbench.errors import ChecksFailedError
 from lagbench.metrics.aggregate import Tally, score
 from lagbench.metrics.table import METRICS
 
-from .entry import Reproduction
+from .entry import Reproduction, relative_difference
 
 TOLERANCE = 1e-3
 """Relative difference of the ranking metric, its mean over scenarios, up to which a
@@ -46,11 +46,10 @@ def compare(
             got="scenarios without a value",
             fix="score the predictions again: lagbench submit --replace",
         )
-    scale = np.maximum(np.abs(before.values), np.finfo(np.float32).tiny)
-    relative = np.abs(after.values - before.values) / scale
-    difference = abs(after.mean - before.mean) / max(
-        abs(before.mean), float(np.finfo(np.float32).tiny)
-    )
+    differences = []
+    for submitted_value, value in zip(before.values, after.values, strict=True):
+        differences.append(relative_difference(submitted_value, value))
+    difference = relative_difference(before.mean, after.mean)
     return Reproduction(
         seed=seed,
         model=model,
@@ -61,5 +60,5 @@ def compare(
         reproduced=round_digits(after.mean, DIGITS),
         difference=round_digits(difference, DIFFERENCE_DIGITS),
         tolerance=TOLERANCE,
-        greatest=round_digits(float(np.max(relative)), DIFFERENCE_DIGITS),
+        greatest=round_digits(float(np.max(differences)), DIFFERENCE_DIGITS),
     )

@@ -98,7 +98,8 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
 
     names = _columns_of(tab, metrics, wide=wide)
     lines = _format_lines(tab, rows, names, wide=wide)
-    if not wide and SHIFT in names and _room_for_remarks(lines) < LEAST_REMARKS:
+    has_shift = SHIFT in names
+    if not wide and has_shift and _room_for_remarks(lines) < LEAST_REMARKS:
         names.remove(SHIFT)
         lines = _format_lines(tab, rows, names, wide=wide)
     room = _room_for_remarks(lines)
@@ -112,7 +113,9 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
         if not wide and len(remarks) > room:
             remarks = _shorten_remarks(table_row, room)
         table_rows.append((*line, remarks))
-    legend = _legend_of(tab, table_rows, wide=wide)
+    legend = list(_legend_of(tab, table_rows, wide=wide))
+    if has_shift and SHIFT not in names:
+        legend.append(f"{SHIFT}: only with --wide")
     return Table(
         "\n".join([_title_of(tab), *legend]),
         (*lines[0], "remarks"),

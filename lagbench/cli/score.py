@@ -68,10 +68,7 @@ def score_command(
     ] = False,
     all_references: Annotated[
         bool,
-        option(
-            "--all-references",
-            "Show every reference predictor, not only the best one.",
-        ),
+        option("--all-references", "Show all reference predictors, not only the best."),
     ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,

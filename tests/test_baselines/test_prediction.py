@@ -829,10 +829,19 @@ def test_threads_are_those_asked_for(
     assert torch.get_num_threads() == before
 
 
-def test_so_many_threads_that_a_process_may_end_are_refused() -> None:
+@pytest.mark.parametrize("source", ["--threads", "OMP_NUM_THREADS"])
+def test_so_many_threads_that_a_process_may_end_are_refused(
+    source: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """OpenMP ends a process that asks for a million threads, without a message."""
     before = torch.get_num_threads()
-    with pytest.raises(UsageError) as caught, use_threads(1_000_000):
+    count = 1_000_000
+    if source == "OMP_NUM_THREADS":
+        monkeypatch.setenv(source, str(count))
+    with (
+        pytest.raises(UsageError) as caught,
+        use_threads(count if source == "--threads" else None),
+    ):
         pass
-    assert caught.value.where == "--threads"
+    assert caught.value.where == source
     assert torch.get_num_threads() == before

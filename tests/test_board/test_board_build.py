@@ -534,6 +534,8 @@ def test_the_page_links_to_the_documentation_where_that_has_an_address(
     page = result.page.read_text("utf-8")
     for label in PAGES:
         assert f">{label}</a>" not in page
+    with pytest.raises(ChecksFailedError):
+        build(tmp_path, documentation="https://example.org/docs/", check=True)
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan])

@@ -388,7 +388,9 @@ def test_an_option_is_no_value_of_another_one(
     assert set(os.listdir()) == files_before
 
 
-@pytest.mark.parametrize("words", [["-o", ""], ["--output", ""], ["--output="]])
+@pytest.mark.parametrize(
+    "words", [["-o", ""], ["-qo", ""], ["--output", ""], ["--output="]]
+)
 @pytest.mark.parametrize("command", ["score good.nc", "template curl-noise"])
 def test_an_empty_path_is_refused(
     command: str, words: list[str], run: Callable[..., Result]

@@ -351,7 +351,7 @@ def test_a_shape_of_terabytes_in_kilobytes_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["x.y", "", "1.0", "9" * 5000 + ".0.0", 3])
-def test_a_version_that_is_none_is_damage(written: Written, version: object) -> None:
+def test_an_invalid_version_is_damage(written: Written, version: object) -> None:
     path, _ = written
     with h5py.File(path, "r+") as file:
         file.attrs["version"] = version
