@@ -115,7 +115,7 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
         table_rows.append((*line, remarks))
     legend = list(_legend_of(tab, table_rows, wide=wide))
     if has_shift and SHIFT not in names:
-        legend.append(f"{SHIFT}: only with --wide")
+        legend.append(f"{HEADINGS[SHIFT]}: only with --wide")
     return Table(
         "\n".join([_title_of(tab), *legend]),
         (*lines[0], "remarks"),
