@@ -26,7 +26,15 @@ from lagbench.errors import (
     suggest_name,
 )
 
-from . import bodies, conservation, distributions, pointwise, transport, vorticity
+from . import (
+    bodies,
+    conservation,
+    distributions,
+    lagrangebench,
+    pointwise,
+    transport,
+    vorticity,
+)
 from .frame import FramePair
 from .metric import Metric, observable
 
@@ -45,6 +53,7 @@ FAMILIES: Mapping[str, Sequence[Metric]] = MappingProxyType(
         "conservation": conservation.METRICS,
         "bodies": bodies.METRICS,
         "transport": transport.METRICS,
+        "lagrangebench": lagrangebench.METRICS,
     }
 )
 """Our metrics by family, in the order in which they are shown."""

@@ -254,7 +254,7 @@ def test_tallies_add() -> None:
 NAMES = sorted(METRICS)
 MEASURED = select(known=METRICS)  # Sinkhorn, optional and slow, has tests of its own
 LENGTHS = re.compile(
-    r"(1|%|nat|frame|(mass )?length(\^2)?(/frame(\^2)?)?|1/frame(\^2)?)"
+    r"(1|%|nat|frame|(mass(\^2)? )?length(\^[24])?(/frame(\^[24])?)?|1/frame(\^2)?)"
 )
 SOURCES = re.compile(
     r"Eqs?\. \d|Figs?\. \d|section \d|.* \(?(19|20)\d\d\b|docs/scoring\.md"

@@ -1,0 +1,43 @@
+"""The table beside LagrangeBench's errors: the docs have it, and a row by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import Folder
+from lagbench.data.registry import load
+from lagbench.scoring.score_file import read_statistics
+from studies.lagrangebench import errors_of, table
+
+REPOSITORY = Path(__file__).parents[2]
+BOARD = REPOSITORY / "leaderboard"
+
+
+def test_the_docs_have_the_table() -> None:
+    """docs/exchange.md shows what the command prints."""
+    page = (REPOSITORY / "docs/exchange.md").read_text()
+    assert table(BOARD) in page
+
+
+def test_errors_of_an_entry_by_hand() -> None:
+    """Means over scenarios of the stored statistics, one seed."""
+    size = load().size("poiseuille", "mini")
+    entry = read_entry(BOARD / "submissions/poiseuille/mini/neuralmpm.yaml")
+    errors = errors_of(entry, Folder(BOARD), size)
+
+    path = BOARD / "scores/poiseuille/mini/neuralmpm.nc"
+    mse_20 = []
+    e_kin = []
+    for statistics in read_statistics(path).tallies.values():
+        row = dict(zip(statistics.names, statistics.values, strict=True))
+        mse_20.append(row["position_mse"][:20].mean())
+        # sum of m |u|^2 in units of volume and second
+        unit = 2.0 / (size.value("density") * size.frame_interval**2)
+        gap = unit * (row["energy_predicted"] - row["energy_true"])
+        e_kin.append((gap[1::10] ** 2).mean())
+    assert errors["position_mse_20"] == pytest.approx(np.mean(mse_20))
+    assert errors["e_kin_mse"] == pytest.approx(np.mean(e_kin))
