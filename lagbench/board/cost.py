@@ -15,7 +15,14 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
-from lagbench.figures.chart import WIDTH, Plot, Spot, close_logarithmic
+from lagbench.figures.chart import (
+    WIDTH,
+    KeyItem,
+    Plot,
+    Spot,
+    close_logarithmic,
+    key_height,
+)
 from lagbench.figures.html import Markup, tag, text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
@@ -25,7 +32,7 @@ from .columns import cost_of
 from .entry import EntryCost
 from .model import Board, Tab
 
-HEIGHT = 330
+HEIGHT = 330  # of the chart without its key [pixel]
 
 # The axis of time reaches so many times the dearest, so that its name has a place
 # beside it.
@@ -41,22 +48,32 @@ STYLE = """
 .front{fill:none;stroke:#2458d3;stroke-dasharray:4 4}
 .end{text-anchor:end}
 .middle{text-anchor:middle}
-.dot circle{fill:#fff;stroke:#2458d3;stroke-width:1.8}
-.dot.best circle{fill:#2458d3}
-.dot.naive circle{stroke:#667085}
-.dot.classical circle{fill:#667085;stroke:#667085}
+.dot circle{stroke-width:1.8}
+.dot.learned circle{fill:#2458d3;stroke:#fff}
+.dot.hybrid circle{fill:#c2410c;stroke:#fff}
+.dot.classical circle{fill:#667085;stroke:#fff}
+.dot.naive circle{fill:#fff;stroke:#667085}
 .classical-front{fill:none;stroke:#667085;stroke-width:1.5}
-.dot .reach,.dot.best .reach,.dot.classical .reach,.dot.naive .reach{
-fill:none;stroke:none}
+.dot circle.reach{fill:none;stroke:none}
 .name{paint-order:stroke;stroke:#fff;stroke-width:4px}
 """
 """Colours of a picture on its own; on the page the style sheets have them."""
 
 DESCRIPTIONS = {
-    "entry": "",
+    "learned": ", a learned model",
+    "hybrid": ", a hybrid",
     "naive": ", a naive predictor",
     "classical": ", a classical solver",
 }
+
+KEY = (
+    KeyItem("dot learned", "learned model"),
+    KeyItem("dot hybrid", "hybrid"),
+    KeyItem("line front", "best per cost"),
+    KeyItem("dot classical", "classical solver"),
+    KeyItem("dot naive", "naive predictor"),
+    KeyItem("line classical-front", "best solver per cost"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +83,7 @@ class CostPoint:
     name: str
     seconds: float  # processor time of a frame [s]
     error: float  # ranking metric
-    kind: str  # "entry", "naive" or "classical"
+    kind: str  # "learned", "hybrid", "classical" or "naive"
     href: str | None = None
 
     @property
@@ -86,7 +103,7 @@ def points_of(tab: Tab) -> list[CostPoint]:
             name=row.entry.name,
             seconds=_seconds_here(cost, tab.solver_seconds),
             error=row.values[tab.ranking].mean,
-            kind="entry",
+            kind=str(row.entry.kind),
             href=f"#tab={tab.id}&entry={row.id}",
         )
         points.append(point)
@@ -148,6 +165,7 @@ def draw(
         x_label="time of a frame [s]",
         y_label=_label_of(ranking),
         height=HEIGHT,
+        key=KEY,
     )
     if solver:
         plot.upright(solver, "the simulator")
@@ -159,10 +177,7 @@ def draw(
     solver_times = [point.seconds for point in solvers]
     solver_errors = [point.error for point in solvers]
     plot.line(solver_times, solver_errors, "classical-front")
-    spots = []
-    for point in points:
-        spots.append(_spot_of(point, ranking, is_best=point in front))
-    plot.spots(spots)
+    plot.spots([_spot_of(point, ranking) for point in points])
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:
@@ -176,20 +191,17 @@ def _label_of(ranking: str) -> str:
     return f"{words(ranking)} [{METRICS[ranking].unit}]"
 
 
-def _spot_of(point: CostPoint, ranking: str, *, is_best: bool) -> Spot:
+def _spot_of(point: CostPoint, ranking: str) -> Spot:
     description = (
         f"{point.name}{DESCRIPTIONS[point.kind]}: {text(point.seconds)} s per frame, "
         f"{words(ranking)} {text(point.error)}"
     )
-    kind = point.kind
-    if is_best and kind == "entry":
-        kind = "entry best"
     return Spot(
         x=point.seconds,
         y=point.error,
         name=point.name,
         description=description,
-        kind=kind,
+        kind=point.kind,
         href=point.href,
     )
 
@@ -198,16 +210,14 @@ def cost_figure(tab: Tab) -> Markup:
     """Return the figure of a tab as it stands on the page."""
     points = points_of(tab)
     caption = (
-        "Further left is cheaper, further down more accurate; the line joins the "
-        "methods that no other beats in both. The full grey line joins the classical "
-        "solvers that are more accurate than every cheaper one: an entry below it is "
-        "more accurate than every solver of its cost. "
+        "Further left is cheaper, further down more accurate. The dashed line joins "
+        "the methods that are more accurate than every cheaper method. The grey line "
+        "joins the classical solvers that are more accurate than every cheaper one: "
+        "an entry below it is more accurate than every solver of its cost. "
         "The upright line is the time of the simulator that made the data. Costs of "
         "entries are measured or self-reported, as the table says, and brought to the "
         "machine of the reference predictors by the simulator's time on both."
     )
-    if any(point.kind == "classical" for point in points):
-        caption += " Filled grey dots are classical solvers, hollow ones naive."
     silent_count = sum(row.active and cost_of(row) is None for row in tab.rows)
     if silent_count == 1:
         caption += " 1 entry states no cost."
@@ -262,14 +272,15 @@ def picture(board: Board, size: Size) -> str:
     drawing = draw(
         points, solver_seconds(size), ranking, f"{name}: accuracy against cost"
     )
+    height = HEIGHT + key_height(KEY)
     svg = tag(
         "svg",
         tag("style", STYLE),
         drawing,
         xmlns="http://www.w3.org/2000/svg",
-        viewBox=f"0 0 {WIDTH} {HEIGHT}",
+        viewBox=f"0 0 {WIDTH} {height}",
         width=2 * WIDTH,
-        height=2 * HEIGHT,
+        height=2 * height,
     )
     return f"{svg}\n"
 

@@ -209,7 +209,12 @@ BOTTOM = 40
 MARGIN = 3  # marks may reach so far over the rim of the plot
 DOT_RADIUS = 5
 REACH_RADIUS = 14  # of the disc around a dot that the pointer meets
-LABEL_ROOM = 22  # letters of a dot's label
+LABEL_ROOM = 26  # letters of a dot's label
+KEY_COLUMNS = 3
+KEY_GAP = 8  # above the key
+KEY_ROW = 17  # height of a row of the key
+KEY_MARK = 22  # width of a mark of the key
+TICK_LETTER = 6.0  # width of a letter of a tick
 
 FAR = 3.0
 """Marks are cut off at so many heights or widths of the plot."""
@@ -227,8 +232,33 @@ class Spot:
     href: str | None = None  # where it leads
 
 
+@dataclass(frozen=True)
+class KeyItem:
+    """A mark of the chart, and what it stands for."""
+
+    kind: str  # classes of the mark; the first is "dot" or "line"
+    name: str
+
+
+def key_height(items: Sequence[KeyItem]) -> int:
+    """Return the height of a key below a chart [pixel]."""
+    if not items:
+        return 0
+    rows = math.ceil(len(items) / KEY_COLUMNS)
+    return KEY_GAP + KEY_ROW * rows
+
+
 class Plot:
-    """One chart, built mark by mark."""
+    """One chart, built mark by mark.
+
+    Args:
+        x: scale of the horizontal axis.
+        y: scale of the vertical axis.
+        x_label: name of the horizontal axis.
+        y_label: name of the vertical axis.
+        height: height of the chart without its key [pixel].
+        key: marks that are explained below the chart, row by row.
+    """
 
     def __init__(
         self,
@@ -238,6 +268,7 @@ class Plot:
         x_label: str,
         y_label: str,
         height: int = HEIGHT,
+        key: Sequence[KeyItem] = (),
     ) -> None:
         self._x = x
         self._y = y
@@ -247,6 +278,7 @@ class Plot:
         self._plot_width = WIDTH - LEFT - RIGHT
         self._plot_height = height - TOP - BOTTOM
         self._marks: list[Markup] = []
+        self._key = tuple(key)
         self._notes: list[LabelBox] = []  # text that labels of dots must not cover
         self._is_interactive = False
 
@@ -337,8 +369,10 @@ class Plot:
             *self._draw_x_axis(),
             *self._draw_axis_labels(),
             area,
+            *self._draw_key(),
         ]
-        return _wrap_svg(self._height, title, description, parts, role=role)
+        height = self._height + key_height(self._key)
+        return _wrap_svg(height, title, description, parts, role=role)
 
     def _add_path(self, data: str, kind: str, title: str = "") -> None:
         children = []
@@ -380,7 +414,10 @@ class Plot:
         for tick in self._x.ticks:
             column = LEFT + float(self._columns(tick.value))
             mark = _draw_line((column, bottom), (column, mark_bottom), "mark")
-            label = draw_text(tick.label, column, base_line, "tick middle")
+            # a label at the end of the axis stays inside the chart
+            half_width = TICK_LETTER * len(tick.label) / 2
+            middle = min(column, WIDTH - half_width)
+            label = draw_text(tick.label, middle, base_line, "tick middle")
             drawn += [mark, label]
         axis = _draw_line((LEFT, bottom), (right, bottom), "axis")
         drawn.append(axis)
@@ -395,6 +432,25 @@ class Plot:
             draw_text(x_label, right, below, "label end"),
             draw_text(y_label, 2, 14, "label"),
         ]
+
+    def _draw_key(self) -> list[Markup]:
+        """Return the marks below the chart with their names, row by row."""
+        column_width = WIDTH / KEY_COLUMNS
+        drawn = []
+        for number, item in enumerate(self._key):
+            row, column = divmod(number, KEY_COLUMNS)
+            left = 2 + column * column_width
+            base_line = self._height + KEY_GAP + row * KEY_ROW + 10
+            middle = base_line - 4
+            if item.kind.startswith("dot"):
+                place = {"cx": f"{left + KEY_MARK / 2:.1f}", "cy": f"{middle:.1f}"}
+                circle = tag("circle", **place, r=DOT_RADIUS)
+                mark = tag("g", circle, class_=item.kind)
+            else:
+                mark = _draw_line((left, middle), (left + KEY_MARK, middle), item.kind)
+            name = draw_text(item.name, left + KEY_MARK + 5, base_line, "note")
+            drawn += [mark, name]
+        return drawn
 
 
 def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:

@@ -27,6 +27,7 @@ from .colours import MUTED
 from .panels import (
     VIEWS,
     Panel,
+    box_of,
     colour_bar,
     draw,
     limit_of,
@@ -77,6 +78,7 @@ HEAD = 0.7
 FOOT = 0.58
 NARROWEST = 5.0
 
+LEAST_RIM = 0.03  # width of the walls that a cell shows at least [length]
 COLUMNS = 6  # of a table of scenarios at one frame
 # moments of a row over time, as shares of the last frame; those of a long recording
 # are close where bodies fall and collide
@@ -508,12 +510,14 @@ def _draw_sheet(
     """Draw a contact sheet; return the path of its file."""
     columns = max(map(len, sheet.rows))
     width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, NARROWEST)
-    row_height = CELL + LABEL + CELL_GAP
+    low, high = _heights_shown(sheet.rows[0][0].scene.recording)
+    panel_height = CELL * (high - low)
+    row_height = panel_height + LABEL + CELL_GAP
     height = HEAD + len(sheet.rows) * row_height + FOOT
     with figure(width, height, dpi=dpi) as drawn:
         draw_header(drawn, title, sheet.subtitle, left=RIM)
         cell_width = CELL / width
-        cell_height = CELL / height
+        cell_height = panel_height / height
         for row, cells in enumerate(sheet.rows):
             bottom = height - HEAD - (row + 1) * row_height + CELL_GAP
             for column, cell in enumerate(cells):
@@ -521,8 +525,21 @@ def _draw_sheet(
                 place = (left / width, bottom / height, cell_width, cell_height)
                 axes = drawn.add_axes(place)
                 _draw_cell(axes, sheet.panel, cell)
+                axes.set(ylim=(low, high))
         _draw_key(drawn, sheet, width=width, height=height)
         return save(drawn, output, option=option)
+
+
+def _heights_shown(recording: Recording) -> tuple[float, float]:
+    """Return the lowest and the highest place that a cell shows [length].
+
+    A cell shows the unit square, or of a low channel the channel and its walls.
+    """
+    if recording.is_solid:
+        return 0.0, 1.0
+    left, right, bottom, top = box_of(recording)
+    rim = max(left, 1.0 - right, LEAST_RIM)
+    return max(0.0, bottom - rim), min(1.0, top + rim)
 
 
 def _draw_cell(axes: Axes, panel: Panel, cell: SheetCell) -> None:

@@ -42,7 +42,7 @@ def seconds_by_name(tab: Tab) -> dict[str, float]:
     return {point.name: point.seconds for point in points_of(tab)}
 
 
-def point(seconds: float, error: float, kind: str = "entry") -> CostPoint:
+def point(seconds: float, error: float, kind: str = "learned") -> CostPoint:
     """Return a point named after its place."""
     return CostPoint(
         name=f"{seconds:g} {error:g}",
@@ -122,7 +122,7 @@ def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
         point(0.05, 0.9, "naive"),
     ]
     svg = drawn(points, 0.02)
-    dots = [element for element in svg.iter() if "dot" in classes_of(element)]
+    dots = [element for element in svg.iter() if "tabindex" in element.attrib]
     first, second, third, _ = [place_of(dot[1]) for dot in dots]
     first_step = np.subtract(second, first)
     second_step = np.subtract(third, second)
@@ -210,7 +210,7 @@ def test_a_crowd_at_the_edge_keeps_its_names() -> None:
     }
     points = []
     for name, (seconds, error) in places.items():
-        cost = CostPoint(name=name, seconds=seconds, error=error, kind="entry")
+        cost = CostPoint(name=name, seconds=seconds, error=error, kind="learned")
         points.append(cost)
     svg = drawn(points, None)
     names = set()

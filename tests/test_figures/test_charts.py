@@ -13,10 +13,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lagbench.figures.chart import (
+    WIDTH,
     Bar,
+    KeyItem,
     Plot,
     Spot,
     bar_chart,
+    close_logarithmic,
+    key_height,
     linear,
     logarithmic,
     spanning,
@@ -262,6 +266,33 @@ def test_a_long_label_near_the_rim_ends_there() -> None:
     first, *_ = place_labels(names, dots, plot=PLOT_BOX)
     assert first is not None
     assert first.box.right == PLOT_BOX.right
+
+
+def test_a_label_at_the_end_of_an_axis_stays_in_the_chart() -> None:
+    """5×10⁴ is the last tick, at the right rim of the plot; a letter is 6 pixels."""
+    x = close_logarithmic(250.0, 4e4)
+    assert x.ticks[-1].value == x.high
+    plot = Plot(x, linear(0, 1), x_label="x", y_label="y")
+    for element in read_plot(plot).of_class("middle"):
+        half_width = 6.0 * len(element.text) / 2
+        assert float(element.attributes["x"]) + half_width <= WIDTH
+
+
+def test_a_key_lies_below_the_chart() -> None:
+    """Five marks in rows of three: every name is below the plot and in the picture."""
+    names = ["first", "second", "third", "fourth", "fifth"]
+    items = [KeyItem("dot naive", name) for name in names]
+    axis = linear(0, 1)
+    plot = Plot(axis, axis, x_label="x", y_label="y", height=200, key=items)
+    reading = read_plot(plot)
+    bases = []
+    for element in reading.of_class("note"):
+        bases.append(float(element.attributes["y"]))
+    assert [element.text for element in reading.of_class("note")] == names
+    assert min(bases) > 200
+    assert max(bases) < 200 + key_height(items)
+    assert len(set(bases)) == 2
+    assert len(reading.named("circle")) == len(names)
 
 
 def test_a_dot_without_room_for_a_label_says_its_name() -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 from matplotlib.patches import Polygon
 from scenario_draws import draw
 
@@ -17,7 +20,9 @@ from lagbench.data import registry
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import read_scenario
 from lagbench.figures.canvas import figure
+from lagbench.figures.colours import WALL
 from lagbench.figures.panels import draw_walls
+from lagbench.figures.plot import contact_sheet
 from lagbench.figures.recording import open_recording
 from lagbench.generators import cylinder
 from lagbench.make.generate import GenerationResult
@@ -178,3 +183,19 @@ def test_pictures_show_the_disc(tiny_split: Callable[..., GenerationResult]) -> 
                 distances = np.hypot(corners[:, 0] - x, corners[:, 1] - y)
                 np.testing.assert_allclose(distances, radius, rtol=1e-5)
                 np.testing.assert_allclose(corners[:-1].mean(axis=0), [x, y], atol=2e-3)
+
+
+def test_a_sheet_of_a_channel_is_low(
+    tiny_split: Callable[..., GenerationResult], tmp_path: Path
+) -> None:
+    """A cell shows the channel and thin walls: less than a tenth of the page is wall.
+
+    The square around the channel would be wall for one half.
+    """
+    root = tiny_split("cylinder").root
+    path = contact_sheet("cylinder", "tiny", tmp_path / "sheet.png", root=root)
+    image = imread(path)
+    wall_colour = to_rgb(WALL)
+    is_wall = np.all(np.isclose(image[..., :3], wall_colour, atol=1e-3), axis=-1)
+    share = is_wall.mean()
+    assert 0.0 < share < 0.1
