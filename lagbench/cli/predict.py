@@ -32,6 +32,8 @@ from .output import print_result, print_warning
 from .progress import progress_bar
 from .solver_bench import SolverBench, bench_apart
 
+LARGEST_SEED = 2**31 - 1
+
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.models.predict_onnx import OnnxPredictionResult
@@ -73,6 +75,15 @@ BatchOption = Annotated[
 MethodOption = Annotated[
     str | None, option("--method NAME", "Name of the method on a leaderboard.")
 ]
+TrainingSeedOption = Annotated[
+    int | None,
+    option(
+        "--seed N",
+        "Seed of the training of an ONNX file, which does not state it; 0 by default.",
+        min=0,
+        max=LARGEST_SEED,
+    ),
+]
 BenchFlag = Annotated[
     bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
 ]
@@ -91,6 +102,7 @@ def predict_command(
     threads: ThreadsOption = None,
     batch: BatchOption = None,
     method: MethodOption = None,
+    seed: TrainingSeedOption = None,
     bench: BenchFlag = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -114,6 +126,7 @@ def predict_command(
             size=size,
             subset=subset,
             method=method,
+            seed=seed or 0,
             root=root,
             time_solver=time_solver,
             quiet=quiet,
@@ -126,6 +139,7 @@ def predict_command(
         print_result(value, lines, as_json=as_json, quiet=quiet)
         return
 
+    _refuse_stated_seed(seed)
     require_libraries(PREDICTION_LIBRARIES)
     from lagbench.baselines.predict import predict
 
@@ -183,6 +197,18 @@ def _refuse_options_of_weights(
         )
 
 
+def _refuse_stated_seed(seed: int | None) -> None:
+    """Refuse a seed for weights, which state the seed of their training."""
+    if seed is not None:
+        raise UsageError(
+            "weights state the seed of their training",
+            where="--seed",
+            expected="a seed only with an ONNX file",
+            got=str(seed),
+            fix="leave it out",
+        )
+
+
 def _predict_onnx(
     model: Path,
     output: Path,
@@ -192,6 +218,7 @@ def _predict_onnx(
     size: str | None,
     subset: str,
     method: str | None,
+    seed: int,
     root: Path | None,
     time_solver: _SolverClock | None,
     quiet: bool,
@@ -216,6 +243,7 @@ def _predict_onnx(
             size=size,
             subset=subset,
             method=method,
+            seed=seed,
             root=root,
             time_solver=time_solver,
             progress=progress,

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,9 @@ from hostile_onnx import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from lagbench.__main__ import app
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
 from lagbench.board.entry import Level, Meta
@@ -422,6 +425,24 @@ def test_a_step_over_a_grid_of_particles_is_exported(
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_predictions_state_the_seed_that_is_given(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """An ONNX file does not state its seed: the option does. Weights state theirs."""
+    model = straight_on(tmp_path / "lines.onnx")
+    predictions = tmp_path / "predictions.nc"
+    words = ["predict", str(model), "--split", SIZE.split, "--size", SIZE.name]
+    options = ["--root", str(generated.root), "--no-bench", "-o", str(predictions)]
+    result = CliRunner().invoke(app, [*words, *options, "--seed", "3"])
+    assert result.exit_code == 0, result.output
+    with h5py.File(predictions) as file:
+        assert file.attrs["seed"] == 3
+
+    weights = CliRunner().invoke(app, ["predict", "weights.pt", "--seed", "3"])
+    assert weights.exit_code == 2
+    assert "--seed" in weights.output
 
 
 @pytest.mark.slow
