@@ -82,6 +82,9 @@ VANISHED_ERRORS = {
 MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 """What a library says that finds no memory while it is loaded."""
 
+PROCESSOR_WORDS = "NumPy was built with baseline optimizations"
+"""What NumPy says, as it is imported, on a processor that lacks instructions."""
+
 _UNREADABLE_PATH = re.compile(r"'(.+)' is not readable")
 """What click says of a file without permission."""
 
@@ -594,6 +597,19 @@ def _output_errors() -> Iterator[None]:
             got=f"{type(error).__name__}: {str(error)[:200]}",
             fix="raise the limit (`ulimit -v unlimited`, or that of the batch system), "
             "close other programs, or take fewer --workers",
+        ) from error
+    except RuntimeError as error:
+        if PROCESSOR_WORDS not in str(error):
+            raise
+        # The help of a group shall load no other module.
+        from .work.machine import processor_name
+
+        raise WorkFailedError(
+            "the installed NumPy cannot run on this processor",
+            where=processor_name(),
+            expected="a processor with the instructions that NumPy was built for",
+            got=" ".join(str(error).split()),
+            fix="install an older NumPy, which needs fewer: pip install 'numpy<2.4'",
         ) from error
     except OSError as error:
         if isinstance(error, PermissionError) and error.filename is not None:

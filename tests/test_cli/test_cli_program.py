@@ -243,6 +243,33 @@ def test_a_vanished_disk_and_full_memory_are_no_faults_of_lagbench(
     assert "unexpected" not in result.stderr
 
 
+@pytest.mark.parametrize("command", ["list", "doctor"])
+def test_a_processor_too_old_for_numpy_is_no_fault_of_lagbench(
+    command: str, tmp_path: Path
+) -> None:
+    """The words are those of NumPy 2.4.6 on an emulated Penryn (`qemu-x86_64`)."""
+    package = tmp_path / "numpy"
+    package.mkdir()
+    refusal = (
+        "NumPy was built with baseline optimizations: \n(X86_V2) but your machine "
+        "doesn't support:\n(X86_V2)."
+    )
+    text = f"raise RuntimeError({refusal!r})\n"
+    (package / "__init__.py").write_text(text, encoding="utf-8")
+    search_path = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    done = subprocess.run(
+        [*PROGRAM, command],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(search_path)},
+    )
+    assert done.returncode == 5, done.stderr
+    assert "X86_V2" in done.stderr
+    assert "fix: install an older NumPy" in done.stderr
+    assert "unexpected" not in done.stderr
+
+
 @pytest.mark.parametrize(
     "words",
     [
