@@ -17,7 +17,12 @@ from .checkpoint import load, restore
 from .recipe_changes import list_effective_settings
 
 SECONDS = 20.0  # processor time of reading and building, without imports [s]
-WALL_SECONDS = 120.0  # time of the clock, with imports on a busy machine [s]
+WALL_SECONDS = 600.0
+"""Time of the clock, with the imports [s]; only a child that waits gets that far.
+
+What computes too long is stopped by its limit of processor time. On a machine that is
+busy with other work the import of torch alone may take minutes.
+"""
 MEMORY = 8 << 30
 """Address space of the child [bytes]; importing torch for the CPU takes 1 GB of it, for
 CUDA several.

@@ -34,7 +34,13 @@ MEMORY = 4 << 30  # address space of a rollout [bytes]
 SECONDS_PER_CALL = 3.0  # processor time of loading, and of each call of a model [s]
 LEAST_SECONDS = 1e-6  # processor time of a rollout, which is never nothing [s]
 WALL_FACTOR = 4.0  # time of the clock over processor time, on a busy machine
-START_SECONDS = 30.0  # time of the clock for the start of a child [s]
+START_SECONDS = 600.0
+"""Time of the clock for the start of a child and its checks [s].
+
+Only a child that waits gets that far: what computes too long is stopped by its limit of
+processor time. On a machine that is busy with other work the imports alone may take
+minutes.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
