@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from .conservation import ENERGIES
 from .frame import Floats
 from .metric import Direction, FirstFrames, Metric, mean
 
@@ -58,7 +57,7 @@ METRICS = (
         name="e_kin_mse",
         unit="mass^2 length^4/frame^4",
         summary="MSE of E_kin: squared error of the sum of m u^2, every tenth frame",
-        of=ENERGIES,
+        of=("energy_predicted", "energy_true"),
         series=squared_energy_errors,
         over_frames=_mean_of_every_tenth,
         horizon=2,
