@@ -67,15 +67,19 @@ def combine(
 ) -> dict[str, CombinedScore]:
     """Return the scores of a method by metric, from tallies by scenario of each seed.
 
-    Metrics of packages are left out, and so are metrics that a seed lacks. With names,
-    these metrics alone are formed.
+    Metrics of packages are left out, and so are metrics that a seed lacks and metrics
+    that are formed only when they are named. With names, these metrics alone are
+    formed.
     """
     statistics = set(_statistics_of(seeds[0]))
     for tallies in seeds[1:]:
         statistics.intersection_update(_statistics_of(tallies))
     metrics = []
     for metric in METRICS.values():
-        is_needed = names is None or metric.name in names
+        if names is None:
+            is_needed = not metric.is_on_request
+        else:
+            is_needed = metric.name in names
         if is_needed and statistics.issuperset(metric.of):
             metrics.append(metric)
 

@@ -321,6 +321,11 @@ class Metric:
         return error
 
     @property
+    def is_on_request(self) -> bool:
+        """Whether it is of an extra, though every score file has its statistics."""
+        return self.extra is not None and self.statistic is None
+
+    @property
     def value_range(self) -> tuple[float, float]:
         """Least and greatest value that the metric can have, infinite without end."""
         least = self.least

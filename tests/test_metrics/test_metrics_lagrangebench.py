@@ -6,14 +6,18 @@ written with NumPy.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
+from lagbench.board.ranking import combine
 from lagbench.data.box import Box
 from lagbench.data.grid import Grid, Placement
 from lagbench.metrics import (
+    METRICS,
     Scenario,
     TaskConfig,
     aggregate,
@@ -22,8 +26,11 @@ from lagbench.metrics import (
     tally,
 )
 from lagbench.metrics.frame import FramePair
+from lagbench.scoring.score_file import read_statistics
 
 Floats = NDArray[np.float64]
+
+BOARD = Path(__file__).parents[2] / "leaderboard"
 
 GIVEN = 3
 HORIZON = 42
@@ -105,3 +112,16 @@ def test_they_are_measured_when_asked_for() -> None:
     by_default = {metric.name for metric in select()}
     with_extra = {metric.name for metric in select(extras=("lagrangebench",))}
     assert with_extra - by_default == {"position_mse_20", "e_kin_mse"}
+
+
+def test_entries_of_a_leaderboard_do_not_state_them() -> None:
+    """Every score file has their statistics, but an entry states what it was scored by.
+
+    The Sinkhorn divergence is stated where it was measured.
+    """
+    path = BOARD / "scores/poiseuille/mini/neuralmpm.nc"
+    tallies = read_statistics(path).tallies
+    assert "energy_error" in combine([tallies])
+    assert "e_kin_mse" not in combine([tallies])
+    assert "e_kin_mse" in combine([tallies], names=["e_kin_mse"])
+    assert not METRICS["sinkhorn_pot"].is_on_request
