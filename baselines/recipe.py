@@ -201,6 +201,18 @@ class TrainingOptions(Settings):
         return step >= steps or step % self.validate_every == 0
 
 
+FITTED_OPTIONS = (
+    "windows",
+    "validate_every",
+    "validation_frames",
+    "validation_scenarios",
+    "seed",
+)
+"""Options of the training that a closed form uses: it is fitted, and takes no steps."""
+
+REFUSED_BY_FIT = ("compile", "ema")
+"""Options that the fit of a closed form refuses where they are on."""
+
 LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
     "training": {
         "compile": False,
@@ -365,7 +377,10 @@ def recipe_for(
     if settings:
         where += ", and --set"
     for setting in settings:
-        layers = _merge(layers, _parse_setting(setting))
+        change = _parse_setting(setting)
+        if entry.model.closed_form:
+            _refuse_unused(entry, change, setting)
+        layers = _merge(layers, change)
     if seed is not None:
         layers["training"]["seed"] = seed
 
@@ -398,7 +413,10 @@ def _no_recipe_of_split(
 ) -> UsageError:
     """Return the error of a split that a baseline knows nothing of, as a user's own."""
     splits = sorted(_splits_of(file))
-    example = f"{{format: 1, recipes: {{{name}: {{training: {{steps: 2000}}}}}}}}"
+    changes = "{training: {steps: 2000}}"
+    if entry.model.closed_form:
+        changes = "{}"
+    example = f"{{format: 1, recipes: {{{name}: {changes}}}}}"
     return UsageError(
         f"{entry.name} has no recipe {name!r}",
         where="--recipe",
@@ -533,6 +551,23 @@ def _check_unchanged(
         fix="leave it out, or train with it; docs/baselines.md says which options a "
         "trained model takes",
     )
+
+
+def _refuse_unused(entry: CatalogueEntry, change: Layer, setting: str) -> None:
+    """Refuse a known option of the training that a closed form does not use."""
+    known_names = (*FITTED_OPTIONS, *REFUSED_BY_FIT)
+    for name in change.get("training", {}):
+        if name in known_names or name not in TrainingOptions.model_fields:
+            continue
+        used = [f"training.{known}" for known in FITTED_OPTIONS]
+        raise UsageError(
+            f"{entry.name} does not use training.{name}: it is fitted, without steps",
+            where="--set",
+            expected=f"an option of the model, or {', '.join(used)}",
+            got=setting,
+            fix="leave it out; docs/baselines.md says which options of the model bound "
+            "the fit",
+        )
 
 
 def _read_file(path: Path) -> _RecipeFile:

@@ -79,6 +79,31 @@ def list_effective_settings(
     return tuple(sorted(changes))
 
 
+def find_refusal(
+    baseline: str, options: Mapping[str, Any], settings: Sequence[str]
+) -> str | None:
+    """Return why a model does not take the settings of a prediction, None if it does.
+
+    None also where nobody can say: the model is not installed, or has other options
+    than the weights state.
+
+    Args:
+        baseline: name of the baseline in the weights.
+        options: options of the model in the weights.
+        settings: settings of the prediction, as in ``model.average=true``.
+    """
+    try:
+        entry = find(baseline)
+        change_options(entry, options, ())
+    except LagbenchError:
+        return None
+    try:
+        change_options(entry, options, settings)
+    except LagbenchError as error:
+        return f"{error.what}: {error.got}"
+    return None
+
+
 def _find_shipped_recipe(recipe: Mapping[str, Any]) -> Recipe | None:
     """Return the shipped recipe that a log names; None where there is none."""
     split, _, size_name = str(recipe.get("name")).partition("/")

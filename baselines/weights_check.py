@@ -14,7 +14,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.work.machine import run_in_child
 
 from .checkpoint import load, restore
-from .recipe_changes import list_effective_settings
+from .recipe_changes import find_refusal, list_effective_settings
 
 SECONDS = 20.0  # processor time of reading and building, without imports [s]
 WALL_SECONDS = 600.0
@@ -77,10 +77,12 @@ def check_in_child(path: Path) -> None:
         )
 
 
-def read_effective_settings(request: Sequence[str]) -> list[str]:
-    """Return the settings of a prediction that change the model of its weights.
+def check_settings(request: Sequence[str]) -> dict[str, Any]:
+    """Return how the model of some weights takes the settings of a prediction.
 
-    Where the weights cannot be read, the settings are returned as they are written. It
+    ``effective`` are those that change the model, in one form and order; ``refused`` is
+    why the model does not take them, None if it does. Where the weights cannot be read,
+    or their model is not installed, the settings are returned as they are written. It
     is run in a child process.
 
     Args:
@@ -89,28 +91,35 @@ def read_effective_settings(request: Sequence[str]) -> list[str]:
     path, *settings = request
     try:
         checkpoint = load(path)
+        refused = find_refusal(checkpoint.baseline, checkpoint.options, settings)
         effective = list_effective_settings(
             checkpoint.baseline, checkpoint.options, settings
         )
     except Exception:  # options of a stranger may break a model in any way
-        return sorted(set(settings))
-    return list(effective)
+        return _as_written(settings)
+    return {"effective": list(effective), "refused": refused}
 
 
-def read_in_child(requests: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Return what `read_effective_settings` returns for each request.
+def check_settings_in_child(
+    requests: Sequence[Sequence[str]],
+) -> list[dict[str, Any]]:
+    """Return what `check_settings` returns for each request.
 
     All files are read in one child process. Where it is stopped, the settings of the
     file that stopped it, and of those after it, are returned as they are written.
     """
     answers = run_in_child(
-        f"{__name__}.{read_effective_settings.__name__}",
+        f"{__name__}.{check_settings.__name__}",
         requests,
         seconds=SECONDS,
         wall=WALL_SECONDS,
         memory=MEMORY,
     )
-    settings = list(answers.values)
-    for request in requests[len(settings) :]:
-        settings.append(sorted(set(request[1:])))
-    return settings
+    checked = list(answers.values)
+    for request in requests[len(checked) :]:
+        checked.append(_as_written(request[1:]))
+    return checked
+
+
+def _as_written(settings: Sequence[str]) -> dict[str, Any]:
+    return {"effective": sorted(set(settings)), "refused": None}

@@ -12,7 +12,7 @@ from lagbench.submission.provenance import TrainingProvenance
 
 from .checkpoint import count_rounded_parameters, load
 from .provenance import training_provenance
-from .recipe_changes import list_effective_settings
+from .recipe_changes import find_refusal, list_effective_settings
 from .weights_check import check_in_child
 
 
@@ -33,6 +33,10 @@ class WeightsFile:
     def list_effective_settings(self, settings: Sequence[str]) -> tuple[str, ...]:
         """Return the settings of a prediction that change the model."""
         return list_effective_settings(self.baseline, self.options, settings)
+
+    def find_refusal(self, settings: Sequence[str]) -> str | None:
+        """Return why the model does not take the settings of a prediction."""
+        return find_refusal(self.baseline, self.options, settings)
 
 
 def inspect_weights(path: Path) -> WeightsFile:

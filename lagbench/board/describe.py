@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.errors import UsageError, UsageErrorCollector
+from lagbench.references.predictor import Kind
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.submission.format import Header
 
 from .draft import Draft, PredictionsFile, find_entries_to_differ_from, require_valid
 from .entry import About, Entry, EntryBudget, Meta, Prediction, mean_cost
+from .entry_checks import find_contradiction, find_training_fault
 from .entry_file import examine, read_rivals
 from .fields import LONGEST_TEXT, latest_date
 from .folder import Folder, Place, entry_path
@@ -94,10 +96,10 @@ def _urls_of(meta: Meta, count: int) -> Sequence[str | None]:
     if len(meta.urls) != count:
         raise UsageError(
             "addresses do not match the files",
-            where="--url",
+            where="urls in --from meta.yaml",
             expected=f"{count}, one for each file, or none",
             got=len(meta.urls),
-            fix="give the addresses in the order of the files, or leave --url out",
+            fix="give the addresses in the order of the files, or leave urls out",
         )
     return meta.urls
 
@@ -139,6 +141,33 @@ def _require_free(folder: Folder, place: Place) -> None:
         )
 
 
+def _require_possible_training(headers: Sequence[Header], kind: Kind) -> None:
+    """Refuse a training that the board would refuse."""
+    fault = find_training_fault(kind, headers)
+    if fault is not None:
+        raise UsageError(
+            "the predictions state a training that cannot be",
+            where="kind in --from meta.yaml, and training of the predictions",
+            expected="a training on train; kind: learned or hybrid where something is "
+            "learned",
+            got=fault,
+            fix="correct kind in meta.yaml, or predict with a model that was not "
+            "trained on scored scenarios",
+        )
+    for header in headers:
+        if header.budget is None:
+            continue
+        contradiction = find_contradiction(header.budget)
+        if contradiction is not None:
+            raise UsageError(
+                "the budget of the predictions contradicts itself",
+                where="budget of the predictions",
+                expected="steps up to the last one, and the least validation as best",
+                got=contradiction,
+                fix="state it as training.json does, or leave it out",
+            )
+
+
 def _name_of(header: Header, meta: Meta, extended: Entry | None) -> str:
     if meta.name:
         return meta.name
@@ -175,6 +204,7 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
     """
     if extended is not None:
         meta = _fill_from_entry(meta, extended)
+    _require_possible_training(headers, meta.kind)
     header = headers[0]
     keys: dict[str, Any] = {}
     for name in About.model_fields:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from lagbench.data.checksums import round_digits
 from lagbench.references.predictor import Kind
@@ -24,6 +24,7 @@ from lagbench.submission.provenance import TrainingProvenance
 from .fields import (
     MOST_BYTES,
     MOST_SEEDS,
+    Command,
     Date,
     Hash,
     InnerPath,
@@ -48,6 +49,11 @@ LEAST_SCORE = 1e-38
 normal number of float32.
 """
 
+EQUALITY = 1e-6
+"""Relative difference up to which two numbers are equal; NumPy versions may differ in
+the last bits.
+"""
+
 BUDGET_COUNTS = ("windows", "steps", "start_steps")
 BUDGET_AMOUNTS = ("epochs", "cpu_hours", "validation_hours", "gpu_hours")
 BUDGET_LABELS = ("device", "threads", "metric")
@@ -64,6 +70,12 @@ class Status(enum.StrEnum):
     ACTIVE = "active"
     SUPERSEDED = "superseded"
     WITHDRAWN = "withdrawn"
+
+
+def _check_kind(kind: Kind) -> Kind:
+    if kind is Kind.NAIVE:
+        raise ValueError("is not learned, hybrid or classical")
+    return kind
 
 
 class Strict(BaseModel):
@@ -401,7 +413,7 @@ class About(Strict):
     weights: Link | None = None
     date: Date | None = None
     notes: Long = ""
-    kind: Annotated[Kind, Field(strict=False)] = Field(
+    kind: Annotated[Kind, Field(strict=False), AfterValidator(_check_kind)] = Field(
         default=Kind.LEARNED,
         description="learned, or hybrid: a solver with a learned part; "
         "classical where nothing is learned",
@@ -412,7 +424,7 @@ class About(Strict):
         default=None, ge=0, lt=10**15, description="trainable parameters"
     )
     hardware: Line = Field(default="", description="machine of the training")
-    command: Long = Field(
+    command: Command = Field(
         default="", description="shell commands that make the predictions again"
     )
     cost: EntryCost | None = None
@@ -469,7 +481,7 @@ class Entry(About):
         tuple[Short, ...], Field(min_length=1, max_length=50, strict=False)
     ]
     date: Date
-    command: Annotated[Long, Field(min_length=1)]
+    command: Annotated[Command, Field(min_length=1)]
     status: Annotated[Status, Field(strict=False)] = Status.ACTIVE
     superseded_by: Name | None = None
     reason: Long = Field(default="", description="why it was superseded or withdrawn")

@@ -62,6 +62,12 @@ def _check_lines(text: str) -> str:
     return text
 
 
+def _check_not_blank(text: str) -> str:
+    if text and not text.strip():
+        raise ValueError("holds blanks only")
+    return text
+
+
 def _check_visible(text: str) -> str:
     has_letter = any(letter.isalnum() for letter in text)
     if text != text.strip() or not has_letter:
@@ -130,6 +136,7 @@ Line = Annotated[str, StringConstraints(max_length=200), AfterValidator(_check_l
 Long = Annotated[
     str, StringConstraints(max_length=LONGEST_TEXT), AfterValidator(_check_lines)
 ]
+Command = Annotated[Long, AfterValidator(_check_not_blank)]
 Link = Annotated[
     str, StringConstraints(pattern=WEB, max_length=300), AfterValidator(_check_host)
 ]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import stat
-import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import format_ids
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     LagbenchError,
@@ -18,6 +16,7 @@ from lagbench.errors import (
     UsageError,
     format_count,
 )
+from lagbench.metrics.aggregate import Score
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.score_file import SubmissionStatistics
 from lagbench.scoring.score_file_checks import (
@@ -28,27 +27,32 @@ from lagbench.scoring.score_file_checks import (
 from lagbench.submission.issues import ValidationIssue
 
 from .entry import (
+    EQUALITY,
     Entry,
     EntryBudget,
     Prediction,
-    Reproduction,
     Status,
     Summary,
     Verification,
 )
+from .entry_checks import check_diverged, check_training
 from .entry_file import examine, load_plain
 from .fields import latest_date
-from .folder import VERIFIED, Folder, Place, entry_path
+from .folder import GATES, VERIFIED, Folder, Place, entry_path
+from .gates import read_failed_gates
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
-from .ranking import TOLERANCE, combine, dataset_of, summarise
-from .scores_compared import TOLERANCE as REPRODUCED_TOLERANCE
+from .ranking import combine, dataset_of, summarise
 from .selection import is_current
 from .shift import check_shift
 from .verified import read_verified, verification_of
+from .verified_checks import check_line
 from .weights import check_weights
 
 SHOWN_DIGITS = 16  # digits of a hash in an issue
+
+# first bytes of an HDF5 file, as which netCDF-4 files are stored
+NETCDF_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,8 @@ class FolderChecks:
     verifications: list[Verification] = field(default_factory=list)
     # entries by content hash and by fingerprint of their predictions
     _scored: dict[str, list[ScoredEntry]] = field(default_factory=dict)
+    # ranking metric by scenario, by score file; of entries whose files are sound
+    _ranking_values: dict[Path, dict[int, float]] = field(default_factory=dict)
 
     def run(self) -> None:
         """Make all checks."""
@@ -96,6 +102,7 @@ class FolderChecks:
         self._check_names()
         self._check_stray_score_files(unreadable_places)
         self._check_verified(unreadable_places)
+        self._check_gates()
         self.issues += check_shift(
             self.folder,
             self.entries,
@@ -153,6 +160,7 @@ class FolderChecks:
         if entry.date > latest:
             self._add("date", path, entry.date, expected=f"at most {latest}")
         self._check_predictions(path, entry)
+        self.issues += check_training(entry)
         self._check_budget(path, entry)
         self._check_scores(path, entry, size)
 
@@ -192,9 +200,13 @@ class FolderChecks:
             status = (self.folder.path / path).lstat()
         except OSError:
             return "no such file"
-        if stat.S_ISREG(status.st_mode):
-            return status.st_size
-        return "something that is no regular file"
+        if not stat.S_ISREG(status.st_mode):
+            return "something that is no regular file"
+        with (self.folder.path / path).open("rb") as stream:
+            signature = stream.read(len(NETCDF_SIGNATURE))
+        if signature != NETCDF_SIGNATURE:
+            return "something that is no netCDF file"
+        return status.st_size
 
     def _check_budget(self, path: Path, entry: Entry) -> None:
         budgets = [prediction.budget for prediction in entry.predictions]
@@ -220,6 +232,9 @@ class FolderChecks:
             if stored is None:
                 continue
             self._check_identity(score_path, stored.scores, entry, prediction)
+            self.issues += check_diverged(
+                file, stored.scores, f"{path}, score.files, diverged_at"
+            )
             impossible_values = list(find_impossible_values(stored))
             if impossible_values:
                 got = impossible_values[0]
@@ -325,7 +340,10 @@ class FolderChecks:
                 entry.score.ranking_metric,
                 expected=f"ranking_metric {ranking}",
             )
-        formed = summarise(combine([stored.tallies for stored in scores]))
+        combined = combine([stored.tallies for stored in scores])
+        if ranking in combined:
+            self._keep_ranking_values(entry, combined[ranking].seeds)
+        formed = summarise(combined)
         stated = entry.score.metrics
         differing = []
         for name in {**formed, **stated}:
@@ -339,6 +357,12 @@ class FolderChecks:
                 got += f"; and {others}"
             expected = f"{name}: {_format_summary(formed.get(name))}"
             self._add("score", where, got, expected=expected)
+
+    def _keep_ranking_values(self, entry: Entry, seeds: Sequence[Score]) -> None:
+        """Keep the ranking metric of each seed, for the lines of verified.yaml."""
+        for score_path, score in zip(entry.score_paths, seeds, strict=True):
+            values = zip(score.scenarios, score.values.tolist(), strict=True)
+            self._ranking_values[score_path] = dict(values)
 
     def _check_reference(self, path: Path) -> None:
         """Check the scores of a reference predictor."""
@@ -443,6 +467,7 @@ class FolderChecks:
         except LagbenchError as error:
             self.issues.append(issue_from_error("verified", error, VERIFIED))
             return
+        seasons = {path.parts[1] for path in self.folder.season_files()}
         names = {entry_path(place).as_posix() for place in unreadable_places}
         for entry in self.entries:
             line = verification_of(entry, verified)
@@ -450,75 +475,23 @@ class FolderChecks:
                 names.add(entry.yaml_path.as_posix())
                 if entry.status is Status.ACTIVE:
                     self.verifications.append(line)
-                self._check_level(entry, line)
+                size = self.registry.size(entry.split, entry.size)
+                self.issues += check_line(
+                    line,
+                    entry,
+                    size,
+                    ranking_values=self._ranking_values,
+                    seasons=seasons,
+                )
         for name in sorted(verified.keys() - names):
             self._add("verified", VERIFIED, ascii(name)[:120])
 
-    def _check_level(self, entry: Entry, line: Verification) -> None:
-        """Check that the level of a line follows from what was predicted anew."""
-        if not line.is_reproduced:
-            return
-        where = f"{VERIFIED}, {entry.yaml_path}"
-        faults = list(_faults_of_records(line, entry))
-        if faults:
-            self._add(
-                "verified",
-                where,
-                "; ".join(faults),
-                what=f"the level is {line.level}, and the records do not show it",
-                expected=f"a record of each of {len(entry.seeds)} seeds that agrees "
-                "with the score of the entry",
-            )
-        size = self.registry.size(entry.split, entry.size)
-        test_count = len(size.scored_scenarios)
-        counts = {reproduction.of for reproduction in line.reproduced}
-        beyond = max(reproduction.scenarios for reproduction in line.reproduced)
-        if is_current(entry.dataset, size) and (
-            counts != {test_count} or beyond > test_count
-        ):
-            self._add(
-                "verified",
-                where,
-                f"up to {beyond} of {sorted(counts)} scenarios",
-                what="other numbers of scenarios than the test subset has",
-                expected=f"at most {test_count} of {test_count}",
-            )
-
-
-def _faults_of_records(line: Verification, entry: Entry) -> Iterator[str]:
-    """Yield why the records of a line do not show that the models gave the scores."""
-    seeds = sorted(reproduction.seed or 0 for reproduction in line.reproduced)
-    if seeds != sorted(seed or 0 for seed in entry.seeds):
-        yield f"records of the seeds {format_ids(seeds)}"
-    proofs = [_proves_score(reproduction, entry) for reproduction in line.reproduced]
-    if not all(proofs):
-        yield f"{sum(proofs)} of {len(proofs)} records agree"
-    if not _states_score(line, entry):
-        yield "another submitted score than that of the entry"
-
-
-def _proves_score(reproduction: Reproduction, entry: Entry) -> bool:
-    """Tell whether a record shows that a model gave the score of its entry again."""
-    return (
-        reproduction.metric == entry.score.ranking_metric
-        and reproduction.tolerance <= REPRODUCED_TOLERANCE
-        and reproduction.has_stated_difference
-        and reproduction.agrees
-    )
-
-
-def _states_score(line: Verification, entry: Entry) -> bool:
-    """Tell whether the submitted scores of a line are those of its entry.
-
-    A record of a part of the scenarios has another mean than the entry.
-    """
-    if not all(reproduction.is_complete for reproduction in line.reproduced):
-        return True
-    summary = entry.score.metrics.get(entry.score.ranking_metric)
-    if summary is None or summary.mean is None:
-        return False
-    scores = [reproduction.submitted for reproduction in line.reproduced]
-    return math.isclose(statistics.fmean(scores), summary.mean, rel_tol=TOLERANCE)
+    def _check_gates(self) -> None:
+        """Check that gates.json can be read, if there is one."""
+        try:
+            read_failed_gates(self.folder)
+        except LagbenchError as error:
+            self.issues.append(issue_from_error("gates", error, GATES))
 
 
 def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:
@@ -535,7 +508,7 @@ def _is_same_summary(first: Summary | None, second: Summary | None) -> bool:
         if a is None or b is None:
             if a is not b:
                 return False
-        elif not math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=1e-300):
+        elif not math.isclose(a, b, rel_tol=EQUALITY, abs_tol=1e-300):
             return False
     return True
 

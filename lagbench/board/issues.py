@@ -84,7 +84,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "predictions": BoardCheck(
         "predictions that the entry names as a file in the folder, if this file is "
-        "missing or has another length",
+        "missing, has another length or is no netCDF file",
         "the predictions do not lie where the entry says",
         "a file of that length",
         "correct path and bytes, or remove path",
@@ -111,20 +111,31 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scores that a prediction can have",
     ),
     "score": BoardCheck(
-        "a score in the entry that disagrees with its score files",
+        "a score or a diverged rollout in the entry that disagrees with its score "
+        "files",
         "the score block is not what the score files give",
         "what the score files give",
     ),
     "budget": BoardCheck(
         "a budget or track in the entry that disagrees with the budgets of its "
-        "predictions",
+        "predictions; a budget that contradicts itself",
         "the budget is not what those of the predictions give",
         "no track, since the predictions have no budgets",
     ),
+    "training": BoardCheck(
+        "a training on windows of `test` or `shift`; a `kind: classical` with "
+        "predictions of a trained model; weights beside an entry of another data set",
+        "the entry states a training that cannot be",
+        "a training on other subsets; kind: learned or hybrid where something is "
+        "learned",
+        "correct kind, or predict with a model that was not trained on scored "
+        "scenarios",
+    ),
     "weights": BoardCheck(
         "weights that are missing, edited or in a wrong place; weights that no entry "
-        "names; weights that two active entries use in the same way; shared weights "
-        "that are not those of the entry in `shared_with`; more than 60 MB of weights, "
+        "names; weights that two active entries use in the same way; options of a "
+        "prediction that the model in the weights does not take; shared weights that "
+        "are not those of the entry in `shared_with`; more than 60 MB of weights, "
         "or a file of more than 40 MB; a training log that is too long or broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
@@ -153,7 +164,9 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "verified": BoardCheck(
         "a line of verified.yaml about an entry that does not exist, or whose score "
-        "files have changed; a level without the records that prove it",
+        "files have changed; a level without the records that prove it; a date in the "
+        "future; a cost of a reference predictor that the data set does not have; a "
+        "blind score of a season that is not there",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
@@ -164,6 +177,12 @@ CHECKS: Mapping[str, BoardCheck] = {
         "shift.yaml has scores that belong to no entry",
         "scores of the entry's own models on the present data",
         "remove the line, and score anew: lagbench leaderboard shift ENTRY",
+    ),
+    "gates": BoardCheck(
+        "a gates.json that cannot be read",
+        "the gates cannot be read",
+        "the JSON that `python -m studies.gates` writes",
+        "restore the file, or write it anew: python -m studies.gates",
     ),
     "season": BoardCheck(
         "a file of a blind season that cannot be read; seeds, scenarios or models "

@@ -39,11 +39,6 @@ from .selection import is_current
 
 NO_PREDICTIONS = "0" * 64  # hash in score files of reference predictors
 
-TOLERANCE = 1e-6
-"""Relative difference up to which two numbers are equal; NumPy versions may differ in
-the last bits.
-"""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CombinedScore:

@@ -11,8 +11,7 @@ how far two processors differ; :data:`TOLERANCE` follows from that.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -49,7 +48,7 @@ from .entry import (
 from .entry_file import is_unchanged
 from .folder import Folder
 from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
-from .scores_compared import compare
+from .scores_compared import compare, sample_scenarios
 from .selection import choose_entries
 from .verified import read_verified, record, verification_of
 
@@ -195,22 +194,6 @@ def reproduce(
         if line is not None:
             run.result.lines[entry.yaml_path.as_posix()] = line
     return run.result
-
-
-def sample_scenarios(
-    scenarios: Collection[int], model_sha256: str, count: int | None
-) -> tuple[int, ...]:
-    """Return the scenarios to predict anew, ascending.
-
-    A sample follows from the model, so it is the same in every run.
-    """
-    if count is None or count >= len(scenarios):
-        return tuple(sorted(scenarios))
-
-    def digest(scenario: int) -> bytes:
-        return hashlib.sha256(f"{model_sha256} {scenario}".encode()).digest()
-
-    return tuple(sorted(sorted(scenarios, key=digest)[:count]))
 
 
 def open_model(

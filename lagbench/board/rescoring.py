@@ -25,10 +25,10 @@ from lagbench.scoring.score_layout import FILM_RANGE, LAST_STEP, SUBMISSION
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import Entry, EntryFlag, Prediction, ScoredFile
+from .entry import EQUALITY, Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
 from .issues import REFERENCES_ANEW, make_issue
-from .ranking import TOLERANCE, scored_file
+from .ranking import scored_file
 from .scores_compared import compare
 
 # step of packed film positions [length]
@@ -311,7 +311,7 @@ def compare_tallies(
 
     first_tally = next(iter(first.values()))
     second_tally = next(iter(second.values()))
-    tolerance = TOLERANCE
+    tolerance = EQUALITY
     if len(second_tally.frames) > LONG_ROLLOUT:
         # the last bits may have pushed a value over to the next step of its rounding
         tolerance = 2.0 ** (1 - LONG_BITS)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -20,6 +21,22 @@ score counts as reproduced.
 
 DIGITS = 9  # of scores in a record
 DIFFERENCE_DIGITS = 2
+
+
+def sample_scenarios(
+    scenarios: Collection[int], model_sha256: str, count: int | None
+) -> tuple[int, ...]:
+    """Return the scenarios to predict anew, ascending.
+
+    A sample follows from the model, so it is the same in every run.
+    """
+    if count is None or count >= len(scenarios):
+        return tuple(sorted(scenarios))
+
+    def digest(scenario: int) -> bytes:
+        return hashlib.sha256(f"{model_sha256} {scenario}".encode()).digest()
+
+    return tuple(sorted(sorted(scenarios, key=digest)[:count]))
 
 
 def compare(

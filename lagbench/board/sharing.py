@@ -1,4 +1,4 @@
-"""Weights that several entries share. No two active entries use them in the same way.
+"""How entries use weights. No two active entries use shared ones in the same way.
 
 A use of weights consists of the file, the data set and the options of the prediction.
 Some options change nothing: they repeat a value of the recipe in the weights, or its
@@ -41,6 +41,15 @@ class WeightsUse:
     def is_shared(self) -> bool:
         """Whether the keeper of the weights is another entry."""
         return self.weights.shared_with is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckedSettings:
+    """Options of a prediction, as the model of its weights takes them."""
+
+    # those that change the model, in one form and order
+    effective: tuple[str, ...]
+    refused: str | None = None  # why the model does not take them
 
 
 def weights_key(entry: Entry, number: int) -> str:
@@ -180,23 +189,32 @@ def _hashes_of_kept_weights(keeper: Entry) -> set[str]:
 def check_uses(
     folder: Folder, entries: Sequence[Entry], *, isolated: bool
 ) -> Iterator[ValidationIssue]:
-    """Yield shared weights that two active entries use in the same way."""
+    """Yield options that models do not have, and weights used in the same way twice."""
     groups: dict[tuple[str, str, str], list[WeightsUse]] = {}
-    for use in list_uses(entries):
+    uses = list_uses(entries)
+    checked_settings = _check_settings(folder, uses, isolated=isolated)
+    for use in uses:
+        refused = checked_settings[use.where].refused
+        if refused is not None:
+            yield make_issue(
+                "weights",
+                f"{use.entry.yaml_path}, predictions.{use.number}.provenance."
+                "prediction_overrides",
+                ascii(refused)[1:-1][:200],
+                what="options of the prediction that the model does not take",
+                expected="options of the model in the weights, as `lagbench predict "
+                "--set` takes them",
+                fix="submit what `lagbench predict` wrote, or leave the weights out",
+            )
+            continue
         key = (use.weights.sha256, use.entry.split, use.entry.size)
         groups.setdefault(key, []).append(use)
-    shared_groups = []
-    shared_uses = []
-    for group in groups.values():
-        if len(group) > 1 and any(use.is_shared for use in group):
-            shared_groups.append(group)
-            shared_uses.extend(group)
 
-    effective_settings = _read_settings(folder, shared_uses, isolated=isolated)
-    for group in shared_groups:
+    for group in groups.values():
         first_uses: dict[tuple[str, ...], WeightsUse] = {}  # by effective settings
         for use in group:
-            first_use = first_uses.setdefault(effective_settings[use.where], use)
+            effective = checked_settings[use.where].effective
+            first_use = first_uses.setdefault(effective, use)
             if first_use is not use and use.is_shared:
                 yield make_issue(
                     "weights",
@@ -207,10 +225,10 @@ def check_uses(
                 )
 
 
-def _read_settings(
+def _check_settings(
     folder: Folder, uses: Sequence[WeightsUse], *, isolated: bool
-) -> Mapping[str, tuple[str, ...]]:
-    """Return the settings of each use that change the model, by ``use.where``.
+) -> Mapping[str, CheckedSettings]:
+    """Return the settings of each use as its model takes them, by ``use.where``.
 
     The settings are returned as the entry writes them if torch is not installed. So are
     those of a file that the entry does not name: another check reports that file.
@@ -220,9 +238,10 @@ def _read_settings(
     requests = []
     for use in uses:
         path = Path(use.weights.path)
-        settings_of_uses[use.where] = tuple(sorted(set(use.settings)))
+        written = tuple(sorted(set(use.settings)))
+        settings_of_uses[use.where] = CheckedSettings(effective=written)
         if path.suffix == ".onnx":  # it has no options
-            settings_of_uses[use.where] = ()
+            settings_of_uses[use.where] = CheckedSettings(effective=())
         elif use.settings and is_unchanged(folder, path, use.weights.sha256):
             uses_to_read.append(use)
             requests.append((str((folder.path / path).absolute()), *use.settings))
@@ -230,14 +249,16 @@ def _read_settings(
         return settings_of_uses
 
     from lagbench.baselines.weights_check import (
-        read_effective_settings,
-        read_in_child,
+        check_settings,
+        check_settings_in_child,
     )
 
     if isolated:
-        answers = read_in_child(requests)
+        answers = check_settings_in_child(requests)
     else:
-        answers = [read_effective_settings(request) for request in requests]
-    for use, settings in zip(uses_to_read, answers, strict=True):
-        settings_of_uses[use.where] = tuple(settings)
+        answers = [check_settings(request) for request in requests]
+    for use, answer in zip(uses_to_read, answers, strict=True):
+        settings_of_uses[use.where] = CheckedSettings(
+            effective=tuple(answer["effective"]), refused=answer["refused"]
+        )
     return settings_of_uses

@@ -33,8 +33,8 @@ MOST_SHIFT_BYTES = 4_000_000
 """Longest file [bytes]; a model takes about 500."""
 
 
-MetricValue = Annotated[Number, Field(ge=-1e100, le=1e100)]
-"""Value of a metric of positions in float32; its square is a number too."""
+MetricValue = Annotated[Number, Field(ge=0.0, le=1e100)]
+"""Value of a metric that ranks, an error; its square is a number too."""
 
 
 class ShiftModel(Strict):

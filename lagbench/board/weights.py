@@ -110,7 +110,9 @@ def require_weights(
             )
         if file.sha256 in owners and keeper is None:
             raise _error_of_owned_weights(path, owners[file.sha256])
-        _require_new_use(file, headers[index], uses)
+        settings = _settings_of(headers[index])
+        _require_known_settings(file, settings)
+        _require_new_use(file, settings, uses)
         _require_made_by(file, headers[index])
         chosen[index] = path
     return tuple(chosen)
@@ -180,16 +182,33 @@ def _error_of_owned_weights(path: Path, owner: str) -> UsageError:
     )
 
 
+def _settings_of(header: Header) -> tuple[str, ...]:
+    """Return the options that a prediction changed."""
+    if header.provenance is None:
+        return ()
+    return header.provenance.prediction_overrides
+
+
+def _require_known_settings(file: WeightsFile, settings: Sequence[str]) -> None:
+    """Refuse predictions with options that the model of the weights does not take."""
+    refused = file.find_refusal(settings)
+    if refused is not None:
+        raise UsageError(
+            "the model does not take the options that the predictions state",
+            where=str(file.path),
+            expected="options of the model in the weights",
+            got=ascii(refused)[1:-1][:200],
+            fix="predict with these weights: lagbench predict; or leave them out",
+        )
+
+
 def _require_new_use(
-    file: WeightsFile, header: Header, uses: Sequence[WeightsUse]
+    file: WeightsFile, settings: Sequence[str], uses: Sequence[WeightsUse]
 ) -> None:
     """Refuse predictions that an active entry makes with the same weights and options.
 
     Options that change nothing in the recipe of the weights do not count.
     """
-    settings: tuple[str, ...] = ()
-    if header.provenance is not None:
-        settings = header.provenance.prediction_overrides
     effective = file.list_effective_settings(settings)
     for use in uses:
         is_same_file = use.weights.sha256 == file.sha256

@@ -76,6 +76,7 @@ def generate_command(
     An interrupted call goes on where it stopped.
     """
     if season is None:
+        _refuse_board(board)
         split = choose_split(split_argument, split_option)
         if size is None and not quiet:
             print_note(_describe_default_size(split, root))
@@ -110,6 +111,18 @@ def generate_command(
             if result.complete and season is None:
                 lines += recording_hint(result.split, result.size, result.root)
         print_result(result, lines, as_json=as_json, quiet=quiet)
+
+
+def _refuse_board(board: Path | None) -> None:
+    """Refuse a leaderboard where no season is read from it."""
+    if board is not None:
+        raise UsageError(
+            "only a season is read from a leaderboard",
+            where="--board",
+            expected="--season NAME beside it",
+            got=str(board),
+            fix="name the season: --season NAME; or leave --board out",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,10 +49,6 @@ def submit_command(
     command: Annotated[
         str | None, option("--command TEXT", "Command that makes the predictions.")
     ] = None,
-    urls: Annotated[
-        list[str] | None,
-        option("--url URL", "Public address of a FILE; one for each FILE."),
-    ] = None,
     weights: Annotated[
         list[Path] | None,
         option(
@@ -85,7 +81,6 @@ def submit_command(
         "method": method,
         "authors": authors,
         "command": command,
-        "urls": urls,
     }
     meta = read_meta(source, description)
     with progress_bar(quiet=quiet or as_json) as progress:

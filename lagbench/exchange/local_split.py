@@ -209,7 +209,7 @@ def make_local_split(
         manifest = builder.finish(command)
         built = root / description.name
         size = load(built / DESCRIPTION).size(description.name, SIZE)
-        built.replace(folder)
+        _move_to_place(built, folder)
     return _summarise(folder, size, manifest, spacing=builder.spacing)
 
 
@@ -251,26 +251,65 @@ def _describe_motion(statistics: Mapping[str, Sequence[float]]) -> Iterator[str]
 
 @contextmanager
 def _staging_folder(folder: Path) -> Iterator[Path]:
-    """Yield a folder beside the target that vanishes at the end."""
+    """Yield a folder beside the target that vanishes at the end.
+
+    Raises:
+        WorkFailedError: it cannot be made or written to, or another call has it.
+    """
     root = temporary_name(folder)
     try:
         root.mkdir(parents=True)
-        try:
-            yield root
-        finally:
-            shutil.rmtree(root, ignore_errors=True)
-    except (OSError, WorkFailedError) as error:
-        reason: object = error
-        if isinstance(error, WorkFailedError):
-            reason = error.got
-        elif error.strerror:
-            reason = error.strerror
+    except FileExistsError as error:
         raise WorkFailedError(
-            "cannot write there",
+            "another call makes this folder",
             where=str(folder),
-            expected="a folder that you may write to, on a disk with space",
-            got=reason,
-            fix="free disk space, or name another folder: --output",
+            expected="one call at a time for a folder",
+            got=f"{root.name} beside it, in which another call writes",
+            fix="wait until that one ends, or name another folder: --output",
+        ) from error
+    except OSError as error:
+        raise _write_error(folder, error.strerror or error) from error
+
+    try:
+        yield root
+    except WorkFailedError as error:
+        raise _write_error(folder, error.got) from error
+    except OSError as error:
+        raise _write_error(folder, error.strerror or error) from error
+    finally:
+        shutil.rmtree(root, ignore_errors=True)
+
+
+def _write_error(folder: Path, reason: object) -> WorkFailedError:
+    return WorkFailedError(
+        "cannot write there",
+        where=str(folder),
+        expected="a folder that you may write to, on a disk with space",
+        got=reason,
+        fix="free disk space, or name another folder: --output",
+    )
+
+
+def _move_to_place(built: Path, folder: Path) -> None:
+    """Rename a folder that is whole to the folder to make.
+
+    The operating system renames no folder over one with files, so that of two calls for
+    the same folder one is first, and the other one is refused.
+
+    Raises:
+        UsageError: another call made the folder meanwhile.
+    """
+    try:
+        built.replace(folder)
+    except OSError as error:
+        if not os.path.lexists(folder):
+            raise
+        raise UsageError(
+            "another call made this folder meanwhile",
+            where=str(folder),
+            expected="no such folder, as at the start of this call",
+            got="a folder or file of that name, which is left as it is",
+            fix="use what is there, or call again with another name: --output",
         ) from error
 
 

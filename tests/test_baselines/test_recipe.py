@@ -370,6 +370,46 @@ def test_mistakes_in_settings(
         recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
+@pytest.mark.parametrize("name", ["var", "hybrid-projection", "hybrid-coarse"])
+def test_a_fit_refuses_options_of_steps(name: str) -> None:
+    """A fitted model takes no steps; what it uses of a training can be set."""
+    entry = find(name)
+    split = "fluid"
+    if name == "hybrid-projection":
+        split = "cavity"
+    unused = [
+        "training.steps=3",
+        "training.epochs=2",
+        "training.batch=4",
+        "training.learning_rate=1",
+        "training.schedule.floor=0.5",
+        "training.patience=1",
+    ]
+    for setting in unused:
+        with pytest.raises(UsageError) as caught:
+            recipe_for(entry, split, "mini", settings=[setting])
+        error = caught.value
+        assert error.exit_code == 2
+        assert error.where == "--set"
+        assert error.got == setting
+        assert error.expected
+        assert error.fix
+    used = ["training.validate_every=0", "training.windows=[train, extra]"]
+    recipe = recipe_for(entry, split, "mini", settings=used, seed=3)
+    assert recipe.training.validate_every == 0
+    assert recipe.training.windows == ("train", "extra")
+    with pytest.raises(UsageError, match="did you mean"):
+        recipe_for(entry, split, "mini", settings=["training.stps=3"])
+
+
+def test_a_fit_is_not_told_to_take_steps() -> None:
+    """The example of a recipe for a user's own split has no steps then."""
+    with pytest.raises(UsageError) as caught:
+        recipe_for(find("hybrid-coarse"), "own", "full")
+    assert "recipes: {own/full: {}}" in str(caught.value.fix)
+    assert "steps" not in str(caught.value.fix)
+
+
 def test_no_such_recipe(entry: CatalogueEntry) -> None:
     """A split or variant without a recipe is a usage error that names the nearest."""
     bare = replace(entry, recipes=None)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import statistics
 from collections.abc import Callable
 from functools import reduce
 from operator import getitem
@@ -30,12 +31,19 @@ from board_bench import (
 from lagbench.board import folder_checks
 from lagbench.board.build import build
 from lagbench.board.check import check_board
+from lagbench.board.entry import Level, Reproduction, Verification
+from lagbench.board.entry_file import read_entry
 from lagbench.board.identity import confusable_key
 from lagbench.board.issues import CHECKS
+from lagbench.board.scores_compared import sample_scenarios
+from lagbench.board.verified_checks import check_line
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
+from lagbench.metrics.aggregate import Score
+from lagbench.scoring.score_file_checks import read_score_file
 
 NOISY = f"{SCORES}/noisy.nc"
+MODEL = "0" * 64
 PREDICTOR = "floors/cavity/tiny/persistence.nc"
 
 
@@ -79,6 +87,7 @@ def test_nothing_is_wrong_with_what_submit_writes(home: Path) -> None:
 
 Damage = Callable[[BoardBench], object]
 Entry = dict[str, Any]
+Content = dict[str, Any]
 
 
 def scores_of(bench: BoardBench, name: str) -> Path:
@@ -134,6 +143,75 @@ def verify(bench: BoardBench, method: str) -> None:
     }
     lines = {f"{PLACE}/{method}.yaml": line}
     (bench.folder / "verified.yaml").write_text(yaml.safe_dump(lines))
+
+
+def verified(**changes: Any) -> Damage:
+    """Return what writes a line about noisy that holds, with changes of it."""
+
+    def write(bench: BoardBench) -> None:
+        entry = yaml.safe_load(bench.entry("noisy").read_text())
+        line = {
+            "scores": [file["sha256"] for file in entry["score"]["files"]],
+            "lagbench": "0.1.0",
+            "date": "2026-01-31",
+        }
+        lines = {f"{PLACE}/noisy.yaml": line | changes}
+        (bench.folder / "verified.yaml").write_text(yaml.safe_dump(lines))
+
+    return write
+
+
+def cost(**changes: Any) -> Content:
+    """Return a measured cost, with changes of it."""
+    values = {
+        "machine": "a machine",
+        "date": "2026-01-31",
+        "repeats": 3,
+        "seconds_per_frame": 0.5,
+        "classical": {"projection": 0.1},
+        "naive": {"persistence": 1e-6},
+    }
+    return values | changes
+
+
+def trained_on(*subsets: str) -> Content:
+    """Return the provenance of a training on some subsets."""
+    return {
+        "split": "cavity",
+        "size": "tiny",
+        "subsets": list(subsets),
+        "recipe": "cavity/tiny",
+        "step": 6,
+    }
+
+
+def call_trained_model_classical(entry: Content) -> None:
+    """Say that nothing is learned, of a model that was trained."""
+    entry["kind"] = "classical"
+    entry["predictions"][0]["provenance"] = trained_on("train")
+
+
+def budgeted(**budget: Any) -> Damage:
+    """Return what states a budget, the same in the entry and its predictions."""
+
+    def change(entry: Content) -> None:
+        entry["predictions"][0]["budget"] = budget
+        means = {name: budget[name] for name in ("steps",) if name in budget}
+        entry["budget"] = means
+
+    return edited(change)
+
+
+def diverge(entry: Content, *, frame: int) -> None:
+    """Say that the first scenario of test diverges at a frame."""
+    scenario = min(load().size("cavity", "tiny").subsets["test"])
+    entry["score"]["files"][0]["diverged_at"] = {scenario: frame}
+
+
+def name_program(bench: BoardBench) -> None:
+    """Name a program as predictions, with its true length."""
+    (bench.folder / "x.nc").write_text("import os")
+    put("predictions", 0, path="x.nc", bytes=9)(bench)
 
 
 def superseded(bench: BoardBench, one: str, two: str) -> None:
@@ -301,6 +379,54 @@ DAMAGE: dict[str, Damage] = {
     "verified: verified without an entry": lambda b: verify(b, "nobody"),
     "verified: verified with other scores": lambda b: verify(b, "noisy"),
     "verified: list that is none": text("- a\n", "verified.yaml"),
+    "nothing: verified": verified(cost=cost()),
+    "verified: verified in the future": verified(date="2999-01-01"),
+    "verified: cost measured in the future": verified(cost=cost(date="2999-01-01")),
+    "verified: cost of an unknown solver": verified(
+        cost=cost(classical={"projection-9x": 1.0})
+    ),
+    "verified: cost of a naive predictor as classical": verified(
+        cost=cost(classical={"persistence": 1.0})
+    ),
+    "verified: cost of an unknown naive predictor": verified(
+        cost=cost(naive={"ballistic": 1.0})
+    ),
+    "verified: blind score of no season": verified(
+        blind={"season": "s", "public": 0.5, "blind": 0.5, "low": -0.1, "high": 0.1}
+    ),
+    "gates: gates that are none": text("{", "gates.json"),
+    "schema: kind of a reference": put(kind="naive"),
+    "schema: blank command": put(command=" "),
+    "schema: cost of nothing": put(cost={"seconds_per_frame": 0.0, "device": "a"}),
+    "schema: cost that is no number": put(
+        cost={"seconds_per_frame": float("nan"), "device": "a"}
+    ),
+    "schema: negative steps": put("predictions", 0, budget={"steps": -1}),
+    "nothing: trained on train": put("predictions", 0, provenance=trained_on("train")),
+    "training: trained on test": put(
+        "predictions", 0, provenance=trained_on("train", "test")
+    ),
+    "training: classical and trained": edited(call_trained_model_classical),
+    "nothing: a budget": budgeted(
+        steps=9, best_step=9, best=0.1, validations=[[3, 0.2], [9, 0.1]]
+    ),
+    "budget: best step after the last one": budgeted(steps=9, best_step=10),
+    "budget: validation after the last step": budgeted(
+        steps=9, validations=[[10, 0.1]]
+    ),
+    "budget: validations in another order": budgeted(
+        steps=9, validations=[[6, 0.1], [3, 0.2]]
+    ),
+    "budget: best that is not the least": budgeted(
+        steps=9, best=0.2, validations=[[3, 0.1]]
+    ),
+    "score: diverged scenario that was not predicted": put(
+        "score", "files", 0, diverged_at={999: 9}
+    ),
+    "score: diverged after the last frame": edited(
+        lambda entry: diverge(entry, frame=10**6)
+    ),
+    "predictions: a program as predictions": name_program,
     # what may happen to files
     "score_file: edited score file": lambda b: halve(b.folder / NOISY),
     "score: edited score file, hash forged": halve_and_rehash,
@@ -371,7 +497,6 @@ def test_all_checks_have_damage() -> None:
         "base",
         "measured",
         "weights",
-        "budget",
         "season",
         "shift",
     }
@@ -395,6 +520,75 @@ def test_one_bad_file_hides_nothing(
     monkeypatch.setattr(folder_checks, "load_plain", failing)
     own.edit("noisy", set_mean)
     assert found(own) == ["readable", "score"]
+
+
+def reproduced(
+    scores: Score, *, seed: int, sample: tuple[int, ...], factor: float = 1.0
+) -> Reproduction:
+    """Return a record of some scenarios, with the submitted score times a factor."""
+    values = dict(zip(scores.scenarios, scores.values.tolist(), strict=True))
+    submitted = factor * statistics.fmean(values[scenario] for scenario in sample)
+    return Reproduction(
+        seed=seed,
+        model=MODEL,
+        metric=scores.metric.name,
+        scenarios=len(sample),
+        of=len(values),
+        submitted=submitted,
+        reproduced=submitted,
+        difference=0.0,
+        tolerance=1e-3,
+    )
+
+
+def test_each_record_of_an_entry_is_compared_with_the_score_file_of_its_seed(
+    own: BoardBench,
+) -> None:
+    """A record of a sample exempts no record of another seed, and not itself; two
+    wrong records do not make up for each other.
+    """
+    entry = read_entry(own.entry("damped"))
+    size = own.registry.size("cavity", "tiny")
+    scores = {}
+    values = {}
+    for seed, path in zip(entry.seeds, entry.score_paths, strict=True):
+        stored = read_score_file(own.folder / path).scores
+        scores[seed] = stored.scores()[stored.ranking]
+        values[path] = dict(
+            zip(scores[seed].scenarios, scores[seed].values.tolist(), strict=True)
+        )
+    whole = scores[0].scenarios
+    sample = sample_scenarios(whole, MODEL, 1)
+    (other,) = set(whole) - set(sample)
+
+    def find(*records: Reproduction) -> list[str]:
+        line = Verification(
+            scores=tuple(file.sha256 for file in entry.score.files),
+            lagbench="0.1.0",
+            date=entry.date,
+            level=Level.REPRODUCED,
+            reproduced=records,
+        )
+        issues = check_line(line, entry, size, ranking_values=values)
+        return [str(issue.got) for issue in issues]
+
+    right = reproduced(scores[0], seed=0, sample=whole)
+    right_of_3 = reproduced(scores[3], seed=3, sample=whole)
+    sampled = reproduced(scores[0], seed=0, sample=sample)
+    assert find(right, right_of_3) == []
+    assert find(sampled, right_of_3) == []
+
+    wrong = reproduced(scores[3], seed=3, sample=whole, factor=0.9)
+    (got,) = find(sampled, wrong)
+    assert str(entry.score_paths[1]) in got
+    (got,) = find(reproduced(scores[0], seed=0, sample=(other,)), right_of_3)
+    assert str(entry.score_paths[0]) in got
+    means = [statistics.fmean(scores[seed].values) for seed in (0, 3)]
+    up = reproduced(scores[0], seed=0, sample=whole, factor=1.0 + 0.1 / means[0])
+    down = reproduced(scores[3], seed=3, sample=whole, factor=1.0 - 0.1 / means[1])
+    (got,) = find(up, down)
+    assert str(entry.score_paths[0]) in got
+    assert str(entry.score_paths[1]) in got
 
 
 def test_later_entries_may_supersede_twins(own: BoardBench) -> None:

@@ -124,9 +124,9 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (["submit"], 2, "FILE"),
         (["submit", "none.nc"], 3, "none.nc"),
         (
-            ["submit", "x.nc", "--url", "javascript:alert(1)"],
+            ["submit", "x.nc", "--url", "https://example.org/x.nc"],
             2,
-            "https://",
+            "--url",
         ),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),

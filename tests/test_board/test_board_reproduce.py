@@ -15,8 +15,8 @@ from typer.testing import Result
 from lagbench.board.check import CheckResult
 from lagbench.board.entry import Level, Verification
 from lagbench.board.folder import Folder
-from lagbench.board.reproduce import ReproduceResult, reproduce, sample_scenarios
-from lagbench.board.scores_compared import TOLERANCE
+from lagbench.board.reproduce import ReproduceResult, reproduce
+from lagbench.board.scores_compared import TOLERANCE, sample_scenarios
 from lagbench.board.verified import read_verified
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError
@@ -182,8 +182,10 @@ def test_check_counts_whole_and_partial_reproductions(own: ModelBoard) -> None:
         own.edit(verified, change)
         return checks_of(own.find())
 
-    assert change_record(scenarios=1, of=2) == []
-    assert change_record(scenarios=1, of=1) == ["verified"]
+    # the submitted score is that of both scenarios
+    assert change_record(scenarios=1, of=2) == ["verified"]
+    # another number of scenarios, and another score of that one
+    assert change_record(scenarios=1, of=1) == ["verified", "verified"]
     assert change_record(scenarios=3, of=2) == ["verified"]
     assert change_record(difference=0.5) == ["verified"]
     assert change_record(reproduced=0.123) == ["verified"]

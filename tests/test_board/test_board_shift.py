@@ -206,6 +206,11 @@ def set_huge_value(line: Content) -> None:
     values[min(values)] = 1e200
 
 
+def set_negative_value(line: Content) -> None:
+    values = line["models"][0]["values"]
+    values[min(values)] = -0.5
+
+
 def add_key(line: Content) -> None:
     line["comment"] = "better"
 
@@ -225,6 +230,7 @@ def checks_of(own: ModelBoard) -> list[str]:
         repeat_seed,
         drop_models,
         set_huge_value,
+        set_negative_value,
         add_key,
     ],
 )

@@ -286,6 +286,40 @@ def test_a_cost_of_predictions_that_no_entry_can_hold(
     assert f"{key}: " in str(caught.value.got)
 
 
+@pytest.mark.parametrize("keys", [{"kind": "naive"}, {"command": "  "}])
+def test_a_description_that_the_board_would_refuse(keys: Keys) -> None:
+    """Naive predictors are references; blanks are no command."""
+    with pytest.raises(UsageError) as caught:
+        read_meta(None, keys)
+    (key,) = keys
+    assert f"{key}: " in str(caught.value.got)
+
+
+TRAINED_ON_TEST = "cavity tiny train+test, recipe cavity/tiny, step 6"
+TRAINED = "cavity tiny train, recipe cavity/tiny, step 6"
+
+
+@pytest.mark.parametrize(
+    ("kind", "labels", "word"),
+    [
+        ("classical", {"training": TRAINED}, "classical"),
+        ("classical", {"budget": '{"steps": 6}'}, "classical"),
+        ("learned", {"training": TRAINED_ON_TEST}, "test"),
+        ("learned", {"budget": '{"steps": 6, "best_step": 7}'}, "best_step"),
+    ],
+)
+@pytest.mark.usefixtures("unscored")
+def test_a_training_that_cannot_be_is_refused_before_the_scoring(
+    own: BoardBench, kind: str, labels: Keys, word: str
+) -> None:
+    before = tree(own.folder)
+    path = own.predict(nearer, "trained", **labels)
+    with pytest.raises(UsageError) as caught:
+        own.submit(path, kind=kind)
+    assert word in str(caught.value.got)
+    assert tree(own.folder) == before
+
+
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     """All that is wrong with an entry is in one error: whoever mends it all can
     submit.

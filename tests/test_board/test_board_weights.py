@@ -17,7 +17,7 @@ from file_size_limit import largest_file
 from simple_models import INFO, Drift, install
 
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
-from lagbench.baselines.weights_check import read_in_child
+from lagbench.baselines.weights_check import check_settings_in_child
 from lagbench.board import submit as submitting
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
@@ -602,8 +602,8 @@ def test_one_option_in_two_spellings_is_one(
 def test_a_child_process_reads_the_options_of_weights(
     own: BoardBench, first: Path
 ) -> None:
-    """Options of a file that it cannot read stay as written; those that the model lacks
-    change nothing.
+    """Options of a file that it cannot read stay as written; those that the model does
+    not take are refused.
     """
     checkpoint = replace(load(first / "weights.pt"), baseline="neuralmpm")
     save(first / "neuralmpm.pt", checkpoint)
@@ -616,7 +616,8 @@ def test_a_child_process_reads_the_options_of_weights(
         (path, "nothing"),
         (str(first / "predictions.nc"), "model.b=1", "model.a=1"),
     ]
-    assert read_in_child(requests) == [
+    answers = check_settings_in_child(requests)
+    assert [answer["effective"] for answer in answers] == [
         [],
         ["model.average=true"],
         [],
@@ -624,6 +625,61 @@ def test_a_child_process_reads_the_options_of_weights(
         [],
         ["model.a=1", "model.b=1"],
     ]
+    is_refused = [answer["refused"] is not None for answer in answers]
+    assert is_refused == [False, False, True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("setting", "is_known"),
+    [
+        ("model.fail_at=1000", True),
+        ("model.fail_at=many", False),
+        ("model.nonsense=true", False),
+        ("training.steps=3", False),
+        ("nonsense", False),
+    ],
+)
+@pytest.mark.usefixtures("first")
+def test_options_that_the_model_does_not_take_are_found(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch, setting: str, is_known: bool
+) -> None:
+    """Also in an entry that shares its weights with no other; where the model is not
+    installed, nobody can say.
+    """
+
+    def predict_otherwise(entry: dict[str, Any]) -> None:
+        entry["predictions"][0].pop("provenance", None)
+        entry["training"] = f"{OURS}, predicted with {setting}"
+
+    own.edit("drift", predict_otherwise)
+    assert_sound(own)
+    install(monkeypatch, drift=Drift)
+    assert failing_checks(own) == (set() if is_known else {"weights"})
+
+
+@pytest.mark.usefixtures("first")
+def test_weights_of_another_data_set_are_found(own: BoardBench) -> None:
+    """The training that the predictions state is that of the entry's data set."""
+    for place in ("fluid tiny", "cavity mini"):
+
+        def train_elsewhere(entry: dict[str, Any], place: str = place) -> None:
+            entry["predictions"][0].pop("provenance", None)
+            entry["training"] = OURS.replace("cavity tiny", place)
+
+        own.edit("drift", train_elsewhere)
+        assert failing_checks(own) == {"training"}
+
+
+def test_options_that_the_model_does_not_take_are_not_submitted(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(monkeypatch, drift=Drift)
+    run = trained(own, 0, f"{OURS}, predicted with model.nonsense=1")
+    before = own.state()
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run)
+    assert "model.nonsense" in str(caught.value.got)
+    assert own.state() == before
 
 
 @pytest.mark.parametrize("change", ["supersede", "withdraw"])

@@ -271,6 +271,7 @@ HINTS = {
     f"{ADOPT} runs.npy --radius big": "expected: a number",
     f"{ADOPT} runs.npy --radius 0,1": "fix: write a decimal point: --radius 0.1",
     "generate cavity --size": "where: lagbench generate",
+    "generate cavity --board near/board": "fix: name the season: --season NAME",
     "leaderboard show --size": "where: lagbench leaderboard show",
     "score good.nc --all=3": "--all takes no value",
     "compare good.nc": "A predictions.nc",

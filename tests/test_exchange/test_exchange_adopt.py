@@ -10,6 +10,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -493,6 +494,64 @@ def test_the_folder_of_another_writer_is_left_alone(
         adopted(tmp_path, runs)
     assert caught.value.where.endswith("/mine")
     assert theirs.is_dir()
+
+
+def assert_says_what_happened(error: LagbenchError) -> None:
+    """Assert that an error has all its parts and blames no full disk."""
+    for part in (error.what, error.expected, error.got, error.fix):
+        assert part
+    assert "disk space" not in str(error)
+
+
+def test_the_folder_that_another_process_made_meanwhile_stays_whole(
+    tmp_path: Path, runs: Runs
+) -> None:
+    """Of two that adopt into one folder at once the first one to end wins; the other
+    one says so, and leaves nothing behind.
+    """
+    sources = save_runs(tmp_path / "other", runs)
+    command = [sys.executable, "-m", "lagbench", "adopt", *map(str, sources)]
+    command += ["--radius", "0.1", "--frame-interval", "0.5"]
+    command += ["-o", str(tmp_path / "mine"), "--quiet"]
+
+    has_ended: list[bool] = []
+
+    def adopt_elsewhere(progress: Progress) -> None:
+        if progress.done and not has_ended:
+            subprocess.run(command, check=True, timeout=600)
+            has_ended.append(True)
+
+    with pytest.raises(UsageError) as caught:
+        adopted(tmp_path, runs, progress=adopt_elsewhere)
+    assert has_ended
+    assert caught.value.where == str(tmp_path / "mine")
+    assert_says_what_happened(caught.value)
+
+    size, root, _ = locate(str(tmp_path / "mine"))
+    assert size.value("frame_rate") == 2.0  # of the other process, not 1/0.25
+    assert size.measured is not None
+    for scenario, beginning in size.measured.scenario_sha256.items():
+        assert check_scenario(size.path(root, scenario))[:16] == beginning
+    assert {path.name for path in tmp_path.iterdir()} == {"in", "other", "mine"}
+
+
+def test_a_call_of_the_same_process_into_the_same_folder_is_refused(
+    tmp_path: Path, runs: Runs
+) -> None:
+    """The call that began first ends well; the other one says who is in the way."""
+    errors: list[WorkFailedError] = []
+
+    def adopt_too(progress: Progress) -> None:
+        if progress.done and not errors:
+            with pytest.raises(WorkFailedError) as caught:
+                adopted(tmp_path, runs)
+            errors.append(caught.value)
+
+    split = adopted(tmp_path, runs, progress=adopt_too)
+    assert errors[0].where == str(tmp_path / "mine")
+    assert_says_what_happened(errors[0])
+    assert split.folder == tmp_path / "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"in", "mine"}
 
 
 def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:

@@ -1,0 +1,132 @@
+"""What an entry states of a training and of diverged rollouts, and what cannot be.
+
+`lagbench submit` refuses it before the scoring, and ``leaderboard check`` reports it in
+an entry that was written by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+from lagbench.references.predictor import Kind
+from lagbench.scoring.score_file import SubmissionStatistics
+from lagbench.submission.budget import Budget
+from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
+
+from .entry import Entry, Prediction, ScoredFile
+from .issues import make_issue
+
+SCORED_SUBSETS = frozenset({"test", "shift"})
+"""Subsets whose scenarios no model may learn from."""
+
+
+def find_training_fault(
+    kind: Kind, predictions: Sequence[Header | Prediction]
+) -> str | None:
+    """Return what predictions state of a training that cannot be; None if all can be.
+
+    Args:
+        kind: what the submitter says of the method.
+        predictions: what the files of predictions state.
+    """
+    for prediction in predictions:
+        provenance = prediction.provenance
+        if provenance is not None:
+            scored = sorted(SCORED_SUBSETS.intersection(provenance.subsets))
+            if scored:
+                return f"a training on windows of {' and '.join(scored)}"
+        has_training = provenance is not None or prediction.budget is not None
+        if kind is Kind.CLASSICAL and has_training:
+            return "kind: classical, and predictions of a trained model"
+    return None
+
+
+def find_contradiction(budget: Budget) -> str | None:
+    """Return where a budget contradicts itself, None where it does not.
+
+    No step is later than the last one, and the best validation is the least one.
+    """
+    steps = [step for step, _ in budget.validations]
+    values = [value for _, value in budget.validations]
+    if any(later <= earlier for earlier, later in pairwise(steps)):
+        return "validations whose steps do not ascend"
+    if budget.steps is not None:
+        if steps and steps[-1] > budget.steps:
+            return f"a validation at step {steps[-1]} of {budget.steps}"
+        if budget.best_step is not None and budget.best_step > budget.steps:
+            return f"best_step {budget.best_step} of {budget.steps} steps"
+    if budget.best is not None and values and budget.best > min(values):
+        return f"best {budget.best}, and a validation of {min(values)}"
+    return None
+
+
+def check_training(entry: Entry) -> Iterator[ValidationIssue]:
+    """Yield what an entry states of its training that cannot be."""
+    path = entry.yaml_path
+    fault = find_training_fault(entry.kind, entry.predictions)
+    if fault is not None:
+        yield make_issue("training", path, fault)
+    for number, prediction in enumerate(entry.predictions):
+        stranger = _find_other_data_set(entry, prediction)
+        if stranger is not None:
+            yield make_issue(
+                "training",
+                f"{path}, predictions.{number}",
+                f"a training on {stranger}",
+                what="the weights lie beside an entry of another data set",
+                expected="weights beside an entry of the data set of their training",
+                fix="submit predictions and weights of one training",
+            )
+        if prediction.budget is None:
+            continue
+        contradiction = find_contradiction(prediction.budget)
+        if contradiction is not None:
+            yield make_issue(
+                "budget",
+                f"{path}, predictions.{number}.budget",
+                contradiction,
+                what="a budget that contradicts itself",
+                expected="steps up to the last one, and the least validation as best",
+                fix="state the budget as `lagbench train` wrote it",
+            )
+
+
+def _find_other_data_set(entry: Entry, prediction: Prediction) -> str | None:
+    """Return the data set that weights on the board were trained on, if it is another.
+
+    Weights lie beside an entry of the data set of their training; other entries share
+    them from there. None where no weights or no training are known.
+    """
+    weights = prediction.weights
+    provenance = prediction.provenance or entry.provenance
+    if weights is None or provenance is None or weights.path.endswith(".onnx"):
+        return None
+    split, size, _ = weights.place_of(entry.place)
+    if (provenance.split, provenance.size) == (split, size):
+        return None
+    return f"{provenance.split} {provenance.size}"
+
+
+def check_diverged(
+    file: ScoredFile, scores: SubmissionStatistics, where: str
+) -> Iterator[ValidationIssue]:
+    """Yield diverged rollouts of scenarios or frames that were not predicted.
+
+    Args:
+        file: a score file, as its entry describes it.
+        scores: what the score file holds.
+        where: key of the entry, for messages.
+    """
+    for scenario, frame in file.diverged_at.items():
+        tally = scores.tallies.get(scenario)
+        if tally is None or not tally.frames[0] <= frame <= tally.frames[-1]:
+            yield make_issue(
+                "score",
+                where,
+                f"scenario {scenario}, frame {frame}",
+                what="a diverged rollout that was not predicted",
+                expected="scenarios and frames of the score file",
+            )
+            return
