@@ -60,7 +60,7 @@ def test_equal_compute(
         ((), None),
     ],
 )
-def test_converged(
+def test_the_track_is_converged_when_the_last_doubling_gains_little(
     validations: tuple[tuple[int, float], ...], track: str | None
 ) -> None:
     """The best validation falls by less than 2 % over the last doubling of the

@@ -737,7 +737,7 @@ def test_a_users_fit_gets_whole_scenarios_as_batches(
 
 
 def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
-    """A fit that measures rollouts takes minutes; each measurement is told."""
+    """A fit that measures rollouts takes minutes; each measurement is reported."""
     reports: list[Progress] = []
     evaluations = 4
     run(
