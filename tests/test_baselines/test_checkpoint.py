@@ -51,7 +51,7 @@ def example(**changes: Any) -> Checkpoint:
     return Checkpoint(**{**fields, **changes})
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_a_checkpoint_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     """Everything comes back as it was stored, the optimiser's state too."""
     weight = torch.nn.Parameter(torch.ones(2))
     optimizer = torch.optim.AdamW([weight])
@@ -76,7 +76,7 @@ def bits_of(tensor: torch.Tensor) -> NDArray[np.uint32]:
     return tensor.detach().numpy().view(np.uint32)
 
 
-def test_rounding() -> None:
+def test_parameters_are_rounded_and_buffers_keep_every_bit() -> None:
     """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every
     bit.
     """
@@ -311,7 +311,7 @@ NO_CALLS = torch.tensor(0)
         ),
     ],
 )
-def test_unfit_weights(
+def test_weights_that_do_not_fit_the_model_are_refused(
     changes: dict[str, Any],
     message: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -322,7 +322,7 @@ def test_unfit_weights(
         restore(example(**changes))
 
 
-def test_unknown_baseline() -> None:
+def test_the_error_for_an_unknown_baseline_names_the_file() -> None:
     """A checkpoint of a baseline that is not installed says so, and which file it
     is.
     """

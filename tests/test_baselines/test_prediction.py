@@ -725,7 +725,9 @@ def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -
     assert (tmp_path / "predictions.nc").read_bytes() == before
 
 
-def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_prediction_without_memory_is_a_work_error(
+    run: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
     error = torch.OutOfMemoryError("no memory left")
     monkeypatch.setattr(Drift, "advance", Mock(side_effect=error))
     with pytest.raises(WorkFailedError):

@@ -189,7 +189,7 @@ def test_a_recipe_may_choose_the_validated_steps() -> None:
     assert validated_steps(never, steps=10, validations=8) == []
 
 
-def test_what_a_training_says(run: Run) -> None:
+def test_a_training_records_windows_times_and_validations(run: Run) -> None:
     """Record, weights and result hold windows, epochs, times, machine, and the best
     validation.
     """

@@ -105,7 +105,7 @@ def own(made: LocalSplit, tmp_path: Path) -> Path:
     return tmp_path / "root" / "own"
 
 
-def test_all_ways_to_name_it(
+def test_a_local_split_is_located_by_path_or_by_name(
     own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is

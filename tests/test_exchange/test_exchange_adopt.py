@@ -402,7 +402,9 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(
     assert_allclose(size.bounds, expected)
 
 
-def test_named_arrays(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
+def test_an_npz_file_may_hold_velocities_materials_and_walls(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
     wall_velocity = np.zeros((4, 2))
     wall_velocity[3, 0] = 0.5
@@ -441,7 +443,9 @@ def variable(
     return file.createVariable("position", kind, names)
 
 
-def test_netcdf(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
+def test_netcdf_files_are_adopted_frame_by_frame(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame,
     rounded once.
     """
@@ -762,7 +766,9 @@ def test_what_a_user_says_is_checked(
     assert names == ["in"]
 
 
-def test_command(tmp_path: Path, run: Run) -> None:
+def test_the_adopt_command_makes_a_split_that_other_commands_take(
+    tmp_path: Path, run: Run
+) -> None:
     """`lagbench adopt` says what it made, and other commands take the folder it
     names.
     """

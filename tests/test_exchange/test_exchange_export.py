@@ -555,7 +555,9 @@ def test_missing_and_exchanged_scenarios_stop_the_export(tmp_path: Path) -> None
     assert not (tmp_path / "out").exists()
 
 
-def test_command(mixed: LocalSplit, tmp_path: Path, run: Callable[..., Result]) -> None:
+def test_the_export_command_counts_trajectories_by_subset(
+    mixed: LocalSplit, tmp_path: Path, run: Callable[..., Result]
+) -> None:
     """`lagbench export` writes into the folder of its option and prints a summary; an
     unknown format names the nearest.
     """

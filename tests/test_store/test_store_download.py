@@ -453,7 +453,9 @@ def test_simulated_splits_come_from_a_store_or_are_simulated(
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()
 
 
-def test_command(server: Mirror, here: Path) -> None:
+def test_the_download_command_counts_files_by_origin(
+    server: Mirror, here: Path
+) -> None:
     """`lagbench download` says what came from where; a lie is exit code 4."""
     arguments = ["download", "--split", str(here / "own"), "--from", server.url]
     done = CliRunner().invoke(app, arguments)
