@@ -321,6 +321,8 @@ def _has_two_thirds_only(size: Size) -> bool:
 def _make_predictor(
     name: str, times: int | Fraction, share: str, applies: Callable[[Size], bool]
 ) -> ReferencePredictor:
+    """Return the solver with ``times`` fewer cells along each axis, as a predictor."""
+
     def predict_scenario(given: Given) -> Prediction:
         return predict(given, times)
 
