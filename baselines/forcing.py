@@ -182,19 +182,19 @@ def require_force(given: Batch, info: DatasetInfo) -> Tensor:
     return given.body_force * info.frame_interval**2
 
 
-def skip_frames(forcing: Tensor, count: int = 1, *, least: int = 1) -> Tensor:
-    """Return the forcing from some frames later on; the last known one stays.
+def skip_frames(forcing: Tensor, count: int = 1, *, min_frames: int = 1) -> Tensor:
+    """Return the forcing from some frames later on; the last known one repeats.
 
     Args:
         forcing: what drives the flow in the coming frames, shape
             [window, frame, ...].
         count: frames to skip.
-        least: frames that the result has at least; the last known one repeats.
+        min_frames: least number of frames of the result.
     """
     last_frame = forcing.shape[1] - 1
     skipped = min(count, last_frame)
     later = forcing[:, skipped:]
-    missing_frames = least - later.shape[1]
+    missing_frames = min_frames - later.shape[1]
     if missing_frames <= 0:
         return later
     last = forcing[:, -1:]

@@ -276,7 +276,7 @@ class FrameModel(Baseline):
         states = torch.cat([latest_states, new_frame], dim=1)
         force = state.body_force
         if force is not None:
-            force = skip_frames(force, least=states.shape[1])
+            force = skip_frames(force, min_frames=states.shape[1])
         window = replace(state, state=states, body_force=force)
 
         position = self.frame_state.position(new_state)

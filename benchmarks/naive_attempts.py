@@ -260,7 +260,7 @@ class Library:
         return States(tuple(states), np.array(features))
 
 
-def nearest(
+def find_nearest_states(
     states: States,
     feature: Floats,
     *,
@@ -323,7 +323,7 @@ class Predictors:
             return [], []
         feature = describe(position, velocity, case.material, kinds, weight)
         count = int(choice["analogs"])
-        return nearest(states, feature, count=count, without=case.without)
+        return find_nearest_states(states, feature, count=count, without=case.without)
 
     def _paths(
         self,
@@ -518,7 +518,7 @@ class Predictors:
                     velocity = position - before
                     start += window
                 feature = describe(position, velocity, case.material, kinds, weight)
-                analogs, _ = nearest(
+                analogs, _ = find_nearest_states(
                     states,
                     feature,
                     count=1,
@@ -547,7 +547,9 @@ class Predictors:
         position, velocity = case.flown(0)
         feature = describe(position, velocity, case.material, kinds, weight)
         count = int(choice["analogs"])
-        chosen, _ = nearest(starts, feature, count=count, without=case.without)
+        chosen, _ = find_nearest_states(
+            starts, feature, count=count, without=case.without
+        )
         followers = []
         everybody = np.arange(len(position))
         for number, state in enumerate(chosen):

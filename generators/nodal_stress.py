@@ -82,7 +82,7 @@ class NodalStress:
         atomic: bool,
         threads: int,
     ) -> None:
-        """Round the constants and take the memory."""
+        """Compute the constants of the scheme and allocate the fields."""
         p = parameters
         dx = 1.0 / p.grid
         self.parameters = parameters  # constants that the scenarios share

@@ -262,12 +262,12 @@ def check_call(
 def check_argument(
     name: str, value: object, kinds: Sequence[ArgumentKind], *, where: str
 ) -> None:
-    """Refuse a value of none of some kinds.
+    """Refuse a value that is of no accepted kind.
 
     Args:
         name: name of the argument.
         value: what the user gave.
-        kinds: what the value may be; none of them: anything.
+        kinds: accepted kinds; if there are none, every value is accepted.
         where: name of the function.
 
     Raises:

@@ -292,7 +292,7 @@ def test_advised_values_are_accepted(value: object, annotation: str) -> None:
 @pytest.mark.parametrize(
     "path", ["a" * 300, "a/" * 3000, "a\0b", "\ud800", Path("b" * 300), "\udcff" * 300]
 )
-def test_a_path_that_no_disk_can_hold_is_told(
+def test_a_path_that_no_disk_can_hold_is_a_usage_error(
     path: str | Path, annotation: str
 ) -> None:
     """Paths are looked at before any work, those in lists too."""
@@ -337,7 +337,7 @@ def test_values_with_two_kinds_are_accepted(value: object, annotation: str) -> N
 
 
 def test_one_extra_is_a_text() -> None:
-    """The name of one extra needs no brackets; the missing file is told."""
+    """The name of one extra needs no brackets; the error names the missing file."""
     with pytest.raises(LagbenchError) as caught:
         lagbench.score("p.nc", extras="transport")
     assert "extras" not in str(caught.value.where)

@@ -158,7 +158,7 @@ def test_no_chain_of_imports_is_long() -> None:
     assert not long_chains
 
 
-def test_imports_for_type_checkers_are_told_apart(tmp_path: Path) -> None:
+def test_imports_for_type_checkers_count_separately(tmp_path: Path) -> None:
     """A chain over an import for type checkers is longer by it; a cycle is refused."""
     top = tmp_path / "top.py"
     top.write_text("from . import middle\n", encoding="utf-8")

@@ -235,7 +235,7 @@ def collect(
         DataError: an entry is of a split that is not known.
     """
     board = Folder(folder)
-    described = registry or load()
+    full_registry = registry or load()
     board.require()
 
     paths: dict[tuple[str, ...], list[Path]] = {}
@@ -244,21 +244,21 @@ def collect(
         if only is None or data_set in only:
             paths.setdefault(data_set, []).append(path)
     for data_set, paths_of_data_set in paths.items():
-        _require_described(board, data_set, paths_of_data_set, described)
+        _require_described(board, data_set, paths_of_data_set, full_registry)
 
     verified = read_verified(board)
     failed_gates = read_failed_gates(board)
     shift = read_shift(board)
     tabs: list[Tab] = []
     empty = []
-    for split, description in described.splits.items():
+    for split, description in full_registry.splits.items():
         for name in description.sizes:
             data_set = (split, name)
             if only is not None and data_set not in only:
                 continue
-            size = described.size(split, name)
+            size = full_registry.size(split, name)
             methods, truth = _read_methods(
-                board, paths.get(data_set, ()), described, scope
+                board, paths.get(data_set, ()), full_registry, scope
             )
             if truth is not None:
                 tab = _make_tab(

@@ -99,12 +99,12 @@ def check_board(
         UsageError: no leaderboard, or ``base`` is no revision of its repository.
     """
     folder = Folder(board)
-    described = registry or load()
+    full_registry = registry or load()
     folder.require()
 
     checks = FolderChecks(
         folder=folder,
-        registry=described,
+        registry=full_registry,
         unreadable=_find_unreadable(folder) if isolated else {},
         isolated=isolated,
     )
@@ -114,13 +114,13 @@ def check_board(
         folder,
         checks.entries,
         readable_score_files=checks.readable_score_files,
-        registry=described,
+        registry=full_registry,
     )
     if base is not None:
         issues += check_base(folder, base, own)
 
     score_predictions = partial(
-        score, root=root, registry=described, progress=progress, write=False
+        score, root=root, registry=full_registry, progress=progress, write=False
     )
     rescoring = Rescoring(
         folder=folder,
@@ -141,7 +141,7 @@ def check_board(
 
     is_page_checked = page and not issues
     if is_page_checked:
-        issues += _check_page(folder, described)
+        issues += _check_page(folder, full_registry)
     reproduced_wholly, reproduced_partly = _count_reproduced(checks.verifications)
     return CheckResult(
         folder=folder.path,

@@ -425,6 +425,7 @@ class FolderChecks:
                 if is_active and scored.score_path not in paths:
                     paths.append(scored.score_path)
             for path in paths[1:]:
+                # the parts of a path are scores, split, size and file
                 is_same_data_set = path.parts[1:3] == paths[0].parts[1:3]
                 if is_same_data_set and path not in reported:
                     reported.add(path)

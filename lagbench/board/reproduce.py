@@ -299,7 +299,7 @@ class _Reproduction:
                 continue
             reproduction = self._predict(entry, index, task, chosen)
             self._record(entry, reproduction)
-            self.result.predicted.append(_name_seed(entry, prediction))
+            self.result.predicted.append(name_seed(entry, prediction))
 
     def _is_recorded(self, entry: Entry, prediction: Prediction, count: int) -> bool:
         line = self.line_of(entry)
@@ -336,7 +336,7 @@ class _Reproduction:
             threads=self.threads,
         )
         self.meter.begin(
-            _name_seed(entry, prediction), total=len(chosen), scenarios=len(chosen)
+            name_seed(entry, prediction), total=len(chosen), scenarios=len(chosen)
         )
         tallies = {}
         stored_tallies = {}
@@ -482,7 +482,8 @@ def with_reproduction(
     return line.model_copy(update={"reproduced": tuple(reproduced), "level": level})
 
 
-def _name_seed(entry: Entry, prediction: Prediction) -> str:
+def name_seed(entry: Entry, prediction: Prediction) -> str:
+    """Return the name of one seed of an entry, as in ``cavity/mini/gns, seed 0``."""
     name = "/".join(entry.place)
     if prediction.seed is None:
         return name

@@ -366,16 +366,16 @@ def close(
     folder = Folder(board)
     folder.require()
     _check_options(name, scenarios=scenarios, source=source, budget=budget)
-    described = load_rooted_registry(resolve_root(root), registry)
+    rooted_registry = load_rooted_registry(resolve_root(root), registry)
     with board_lock(folder):
         _require_open(folder, name)
-        chosen = choose_entries(folder, (), described, split=split, size=size)
+        chosen = choose_entries(folder, (), rooted_registry, split=split, size=size)
         groups: dict[tuple[str, str], list[Entry]] = {}
         for entry in chosen:
             groups.setdefault((entry.split, entry.size), []).append(entry)
         data_sets = []
         for place in sorted(groups):
-            tier = described.size(*place)
+            tier = rooted_registry.size(*place)
             data_sets.append(
                 _freeze(folder, tier, groups[place], scenarios=scenarios, budget=budget)
             )

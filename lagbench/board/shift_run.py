@@ -24,7 +24,7 @@ from lagbench.work.progress import Meter, Progress
 
 from .entry import Entry, Prediction
 from .folder import Folder
-from .reproduce import Failure, open_model, score_positions
+from .reproduce import Failure, name_seed, open_model, score_positions
 from .scores_compared import DIGITS
 from .selection import choose_entries
 from .shift import (
@@ -106,19 +106,19 @@ def score_on_shift(
     folder = Folder(board)
     folder.require()
     data_root = resolve_root(root)
-    described = load_rooted_registry(data_root, registry)
+    rooted_registry = load_rooted_registry(data_root, registry)
     run = _ShiftRun(
         folder=folder,
         root=data_root,
-        registry=described,
+        registry=rooted_registry,
         again=again,
         threads=threads,
         meter=Meter(progress),
         result=ShiftResult(folder=folder.path),
     )
-    chosen = choose_entries(folder, entries, described, split=split, size=size)
+    chosen = choose_entries(folder, entries, rooted_registry, split=split, size=size)
     if not entries:
-        chosen = [entry for entry in chosen if _has_shift(entry, described)]
+        chosen = [entry for entry in chosen if _has_shift(entry, rooted_registry)]
         _require_some(chosen, folder, split, size)
 
     for entry in chosen:
@@ -183,7 +183,7 @@ class _ShiftRun:
             )
             subset_sha256 = self._subset_sha256(size)
             record_shift(self.folder, entry, size, scores, subset_sha256=subset_sha256)
-            self.result.predicted.append(_name_seed(entry, prediction))
+            self.result.predicted.append(name_seed(entry, prediction))
 
     def scores_of(self, entry: Entry) -> ShiftScores | None:
         """Return the recorded scores of an entry."""
@@ -222,7 +222,7 @@ class _ShiftRun:
         """Return the ranking metric of a model in each scenario."""
         task = self._task(entry)
         metric = entry.score.ranking_metric
-        name = _name_seed(entry, prediction)
+        name = name_seed(entry, prediction)
         model = open_model(
             self.folder,
             entry,
@@ -252,10 +252,3 @@ class _ShiftRun:
         finally:
             model.close()
         return values
-
-
-def _name_seed(entry: Entry, prediction: Prediction) -> str:
-    name = "/".join(entry.place)
-    if prediction.seed is None:
-        return name
-    return f"{name}, seed {prediction.seed}"

@@ -96,14 +96,14 @@ def submit(
         folder, paths, meta, replace=replace, add=add, new_board=new_board
     )
 
-    described = registry or load()
+    full_registry = registry or load()
     files = []
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
         if examined is not None:
             examined(result)
         result.check()
-        files.append(_read_predictions(path, result, described))
+        files.append(_read_predictions(path, result, full_registry))
 
     def draft() -> Draft:
         return draft_entry(
@@ -113,7 +113,7 @@ def submit(
     if folder.staging_folders():
         with board_lock(folder):
             complete_interrupted(folder)
-    draft()  # refuses before the scoring what can be refused
+    draft()  # errors that need no scores come before the scoring
     cards: list[ScoreCard] = []
     for file in files:
         card = score(

@@ -41,7 +41,7 @@ from .model_options import TRAINING_LIBRARIES, require_libraries
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
 from .output import format_seconds, print_result, print_table
 from .progress import progress_bar
-from .solver_bench import SolverBench, bench_apart
+from .solver_bench import SolverBench, bench_in_own_process
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
@@ -307,7 +307,7 @@ def _train_model(
 def bench_demo_solver() -> SolverBench | None:
     """Return the cost of our solver; without it the page shows no speed-up."""
     try:
-        return bench_apart(MODEL_SPLIT, DEMO_SIZE)
+        return bench_in_own_process(MODEL_SPLIT, DEMO_SIZE)
     except LagbenchError:
         return None
 

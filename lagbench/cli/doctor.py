@@ -199,13 +199,14 @@ def _describe_registry() -> str:
 
 
 def _describe_folder(folder: Path) -> str:
-    """Return the folder of all data sets and its free space.
+    """Return the folder of all data sets and its free space, if it can be written.
 
     Raises:
         OSError: nothing can be written there.
     """
-    existing = folder
-    while not existing.exists():
-        existing = existing.parent
-    with tempfile.TemporaryFile(dir=existing):
+    nearest_existing = folder
+    while not nearest_existing.exists():
+        nearest_existing = nearest_existing.parent
+    # raises the error of a folder that cannot be written
+    with tempfile.TemporaryFile(dir=nearest_existing):
         return f"{folder}, {free_bytes(folder)} bytes free"

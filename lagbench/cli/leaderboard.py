@@ -60,7 +60,7 @@ from .output import (
     print_warning,
 )
 from .progress import progress_bar
-from .solver_bench import bench_apart
+from .solver_bench import bench_in_own_process
 
 REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
 
@@ -362,7 +362,7 @@ def reproduce_command(
 def _time_solver(split: str, size: str) -> float | None:
     """Return the solver's time of a frame [s], None where it cannot run."""
     try:
-        return bench_apart(split, size).seconds_per_frame
+        return bench_in_own_process(split, size).seconds_per_frame
     except LagbenchError as error:
         print_warning(f"the solver is not timed: {error}")
         return None

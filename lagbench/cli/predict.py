@@ -30,7 +30,7 @@ from .options import (
 )
 from .output import print_result, print_warning
 from .progress import progress_bar
-from .solver_bench import SolverBench, bench_apart
+from .solver_bench import SolverBench, bench_in_own_process
 
 LARGEST_SEED = 2**31 - 1
 
@@ -274,7 +274,7 @@ def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:
     if split not in load().splits:
         return None
     try:
-        return bench_apart(split, size)
+        return bench_in_own_process(split, size)
     except LagbenchError as error:
         if not quiet:
             print_warning(f"no speed-up over the solver: {error}")

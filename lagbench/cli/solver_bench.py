@@ -34,7 +34,7 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """Simulate the first test scenario and time its frames.
 
     Taichi starts once per process: call this from a process of its own, as
-    :func:`bench_apart` does.
+    :func:`bench_in_own_process` does.
 
     Args:
         split: name of a split.
@@ -66,7 +66,7 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     )
 
 
-def bench_apart(split: str, size: str) -> SolverBench:
+def bench_in_own_process(split: str, size: str) -> SolverBench:
     """Time the solver in a process of its own.
 
     The memory and the threads of this process do not disturb it there.

@@ -614,7 +614,7 @@ def load(path: Path | None = None) -> Registry:
 def _load(path: Path | None, modified: int) -> Registry:
     """Load a file once per modification time."""
     file = path or default_path()
-    our_file = _read(file)
+    our_file = _read_registry_file(file)
     registry = Registry(
         our_file.splits, our_file.measured, dict.fromkeys(our_file.splits, file)
     )
@@ -643,7 +643,7 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
         expected = "an attribute REGISTRY: the path of its datasets.yaml"
         raise UsageError("its module has no registry", expected=expected)
     path = Path(module.REGISTRY)
-    plugin_file = _read(path)
+    plugin_file = _read_registry_file(path)
     split = Registry(plugin_file.splits, {}).split(name)
     measured = plugin_file.measured.get(name, {})
     return Registry(
@@ -662,7 +662,7 @@ def _describe_plugin_error(point: EntryPoint, error: Exception) -> str:
     return f"package {package} adds no split {point.name!r} ({point.value}): {reason}"
 
 
-def _read(path: Path) -> _RegistryFile:
+def _read_registry_file(path: Path) -> _RegistryFile:
     """Validate one datasets.yaml; say where and what is wrong with it."""
     # A child that validates predictions receives the sizes, and starts sooner without
     # YAML.

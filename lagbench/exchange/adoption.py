@@ -136,14 +136,14 @@ def adopt(
     for subset, rows in rows_of.items():
         counts[subset] = len(rows)
         subsets[subset] = map(open_row, rows)
-    facts: dict[str, Any] = {**options}
-    facts.pop("axes", None)
+    stated_fields: dict[str, Any] = {**options}
+    stated_fields.pop("axes", None)
     if options.get("rescale") and "bounds" not in options:
-        facts["bounds"] = find_bounds(map(open_row, chain(*rows_of.values())))
+        stated_fields["bounds"] = find_bounds(map(open_row, chain(*rows_of.values())))
     description = Description(
         name=folder.name,
         source=f"{sum(counts.values())} trajectories of the user's own",
-        **facts,
+        **stated_fields,
     )
     local_split = make_local_split(
         description,

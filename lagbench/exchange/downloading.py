@@ -129,22 +129,24 @@ def download(
     """
     started = time.monotonic()
     _check_connections(connections)
-    entry, folder, splits = locate_new(split, size, root=root, registry=registry)
-    selected = select(entry, subset=subset, scenarios=scenarios)
-    description = splits.split(entry.split)
-    urls = _list_stores(mirror, description, entry)
+    tier, data_root, rooted_registry = locate_new(
+        split, size, root=root, registry=registry
+    )
+    selected = select(tier, subset=subset, scenarios=scenarios)
+    description = rooted_registry.split(tier.split)
+    urls = _list_stores(mirror, description, tier)
     with ExitStack() as stack:
         stack.enter_context(
-            dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait)
+            dataset_lock(data_root, tier.split, tier.name, tier.major, on_wait=on_wait)
         )
         store = None
-        own_url = url_of(folder)
+        own_url = url_of(data_root)
         if own_url is not None:
-            store = stack.enter_context(publish(entry, folder, own_url))
+            store = stack.enter_context(publish(tier, data_root, own_url))
         published = set(selected).intersection(store.stored_entries if store else ())
         job = DownloadJob(
-            entry,
-            folder,
+            tier,
+            data_root,
             [scenario for scenario in selected if scenario not in published],
             meter=Meter(progress),
             connections=connections,
@@ -156,8 +158,8 @@ def download(
             if store:
                 store.put_files(manifest, at_once=True)
         if not job.missing:
-            verdict = compare_hashes(entry, manifest)
-            if job.downloaded and entry.simulated:
+            verdict = compare_hashes(tier, manifest)
+            if job.downloaded and tier.simulated:
                 _describe_data(job, description, manifest, store, sorted(published))
 
     if job.missing:
@@ -166,21 +168,21 @@ def download(
         if announce is not None:
             announce(_describe_fallback(reason, job.missing))
         generated = generate(
-            entry.split,
-            entry.name,
+            tier.split,
+            tier.name,
             scenarios=job.missing,
-            root=folder,
+            root=data_root,
             workers=workers,
             progress=progress,
-            registry=splits,
+            registry=rooted_registry,
         )
         verdict = generated.verdict
-        new_manifest = read_manifest(folder, entry.split, entry.name, entry.major)
+        new_manifest = read_manifest(data_root, tier.split, tier.name, tier.major)
         manifest = new_manifest or manifest
     return DownloadResult(
-        split=entry.split,
-        size=entry.name,
-        folder=entry.folder(folder),
+        split=tier.split,
+        size=tier.name,
+        folder=tier.folder(data_root),
         mirror=job.url,
         downloaded=tuple(sorted(job.downloaded)),
         kept=tuple(sorted((*published, *job.present))),
@@ -367,12 +369,14 @@ class DownloadJob:
             return None
         manifest = parse_manifest(self.size, text, where=place, hint=HINT)
         claims = {entry.scenario: entry for entry in manifest.files}
-        strangers = []
+        foreign_scenarios = []
         for scenario in self.missing:
             claim = claims.get(scenario)
             if claim and not claim.has_hash(self._recorded_hashes[scenario]):
-                strangers.append(scenario)
-        refuse_foreign_hashes(self.size, manifest, strangers, where=place, hint=HINT)
+                foreign_scenarios.append(scenario)
+        refuse_foreign_hashes(
+            self.size, manifest, foreign_scenarios, where=place, hint=HINT
+        )
         return claims
 
     def _list_requests(

@@ -116,47 +116,47 @@ def export(
             nowhere.
         WorkFailedError: the disk is full or not writable.
     """
-    form = parse_format(format)
-    _check_from_walls(form, from_walls=from_walls)
-    entry, folder, splits = locate(split, size, root=root, registry=registry)
+    file_format = parse_format(format)
+    _check_from_walls(file_format, from_walls=from_walls)
+    tier, data_root, rooted_registry = locate(split, size, root=root, registry=registry)
     target = Path(output)
-    file_of = {}
+    path_by_subset = {}
     for subset in HASHED_SUBSETS:
-        file_of[subset] = target / f"{subset}{ENDINGS[form]}"
-    paths = tuple(file_of.values())
+        path_by_subset[subset] = target / f"{subset}{ENDINGS[file_format]}"
+    paths = tuple(path_by_subset.values())
     _check_target(target, paths, overwrite=overwrite)
 
-    frames_of = _frames_by_subset(entry, folder)
-    statistics, dataset_sha256 = _recorded_statistics(entry, folder)
-    spacing, has_moving_walls = _inspect_scenario(next(iter(frames_of["train"])), entry)
+    frames_by_subset = _frames_by_subset(tier, data_root)
+    statistics, dataset_sha256 = _recorded_statistics(tier, data_root)
+    spacing, has_moving_walls = _inspect_scenario(
+        next(iter(frames_by_subset["train"])), tier
+    )
     if from_walls is None:
-        is_measured_from_walls = has_moving_walls or entry.box.is_periodic
+        is_measured_from_walls = has_moving_walls or tier.box.is_periodic
     else:
         is_measured_from_walls = from_walls
     walls = None
     if wall_particles:
-        has_unit_box = from_walls is False and form is Format.LAGRANGEBENCH_H5
-        _check_walls(
-            entry, has_moving_walls=has_moving_walls, has_unit_box=has_unit_box
-        )
-        walls = WallParticles(entry.bounds, spacing)
+        has_unit_box = from_walls is False and file_format is Format.LAGRANGEBENCH_H5
+        _check_walls(tier, has_moving_walls=has_moving_walls, has_unit_box=has_unit_box)
+        walls = WallParticles(tier.bounds, spacing)
     wall_thickness = None
     if walls is not None:
         wall_thickness = walls.thickness
-    origin = (0.0,) * entry.dimension
-    if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
-        origin = _lower_corner(entry, wall_thickness or 0.0)
+    origin = (0.0,) * tier.dimension
+    if file_format is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
+        origin = _lower_corner(tier, wall_thickness or 0.0)
 
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (target / NAME).unlink()
     meter = Meter(progress)
-    scenario_count = sum(map(len, frames_of.values()))
-    meter.begin("exporting", total=len(frames_of), scenarios=scenario_count)
+    scenario_count = sum(map(len, frames_by_subset.values()))
+    meter.begin("exporting", total=len(frames_by_subset), scenarios=scenario_count)
     shapes: dict[str, list[tuple[int, int]]] = {}
-    for subset, frames in frames_of.items():
-        path = file_of[subset]
-        runs = _read_runs(frames, form, entry.frame_interval, walls)
-        if form is Format.GNS_NPZ:
+    for subset, frames in frames_by_subset.items():
+        path = path_by_subset[subset]
+        runs = _read_runs(frames, file_format, tier.frame_interval, walls)
+        if file_format is Format.GNS_NPZ:
             shapes[subset] = gns_npz.write(path, runs)
         else:
             shortest = min(frames.values())
@@ -164,36 +164,36 @@ def export(
         meter.count(1, scenarios=len(frames))
 
     info = ExportInfo(
-        title=splits.split(entry.split).title,
+        title=rooted_registry.split(tier.split).title,
         dataset_sha256=dataset_sha256,
         statistics=statistics,
         spacing=spacing,
         origin=origin,
         from_walls=is_measured_from_walls,
-        is_free_slip=_is_free_slip(entry),
+        is_free_slip=_is_free_slip(tier),
         wall_thickness=wall_thickness,
     )
-    metadata = describe_export(entry, form, shapes, info)
+    metadata = describe_export(tier, file_format, shapes, info)
     metadata_path = write_metadata(target, metadata)
     written = (*paths, metadata_path)
-    return _summarise(entry, form, target, written, frames_of, shapes)
+    return _summarise(tier, file_format, target, written, frames_by_subset, shapes)
 
 
-def _check_from_walls(form: Format, *, from_walls: bool | None) -> None:
+def _check_from_walls(file_format: Format, *, from_walls: bool | None) -> None:
     """Refuse the option --from-walls for a format that has none."""
-    if from_walls and form is not Format.LAGRANGEBENCH_H5:
+    if from_walls and file_format is not Format.LAGRANGEBENCH_H5:
         raise UsageError(
             "this option is for lagrangebench-h5 only",
             where="--from-walls",
             expected="--format lagrangebench-h5",
-            got=form.value,
+            got=file_format.value,
             fix="leave --from-walls out",
         )
 
 
 def _summarise(
     size: Size,
-    form: Format,
+    file_format: Format,
     folder: Path,
     files: tuple[Path, ...],
     frames_of: Mapping[str, Mapping[Path, int]],
@@ -203,7 +203,7 @@ def _summarise(
 
     Args:
         size: the data set.
-        form: format of the files.
+        file_format: format of the files.
         folder: folder of the files.
         files: the files, metadata.json too.
         frames_of: frames of each scenario file by subset.
@@ -219,7 +219,7 @@ def _summarise(
         frame_counts[subset] = written_frames
         left_out += present_frames - written_frames
     return ExportResult(
-        format=form.value,
+        format=file_format.value,
         split=size.split,
         size=size.name,
         folder=folder,
@@ -353,17 +353,20 @@ class WallParticles:
 
 
 def _read_runs(
-    files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None
+    files: Iterable[Path],
+    file_format: Format,
+    interval: float,
+    walls: WallParticles | None,
 ) -> Iterator[Run]:
     """Yield the scenarios of a subset, each open until the next one is asked for."""
     for path in files:
         with read_scenario(path) as file:
-            kinds = material_numbers(form, file.read("material"))
+            kinds = material_numbers(file_format, file.read("material"))
             if walls is None:
                 yield file.header.frames, partial(file.read, "position"), kinds
                 continue
             wall_velocity = file.read("wall_velocity")
-            wall_kinds = _wall_kinds(form, wall_velocity, walls)
+            wall_kinds = _wall_kinds(file_format, wall_velocity, walls)
             travel = _wall_travel(wall_velocity, interval)
             read_position = partial(walls.read_with_walls, file, travel)
             kinds = np.concatenate([kinds, wall_kinds])
@@ -371,10 +374,10 @@ def _read_runs(
 
 
 def _wall_kinds(
-    form: Format, wall_velocity: NDArray[np.floating], walls: WallParticles
+    file_format: Format, wall_velocity: NDArray[np.floating], walls: WallParticles
 ) -> NDArray[np.int64]:
     """Return the number of each wall particle: of a wall at rest, or one that moves."""
-    at_rest, moving = WALL_NUMBERS[form]
+    at_rest, moving = WALL_NUMBERS[file_format]
     ever_moves = (wall_velocity != 0.0).any(axis=(0, 2))
     return np.where(ever_moves[walls.wall], moving, at_rest)
 

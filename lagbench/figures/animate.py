@@ -25,7 +25,14 @@ from .canvas import DPI, figure, pixels_of, renamed, shrink
 from .colours import INK, MUTED
 from .encoders import encode_gif, encode_mp4
 from .painter import Painter, unpack
-from .panels import FEW_NODES, Panel, colour_bar, limit_of, material_key, name_slice
+from .panels import (
+    FEW_NODES,
+    Panel,
+    colour_bar,
+    draw_material_key,
+    limit_of,
+    name_slice,
+)
 from .plot import SEPARATOR, describe
 from .recording import Recording, open_recording
 
@@ -274,7 +281,7 @@ class Film:
             below = drawn.add_axes(place)
             if self._panel is Panel.MATERIAL:
                 materials = [recording.material for recording in self._recordings]
-                material_key(below, np.concatenate(materials))
+                draw_material_key(below, np.concatenate(materials))
             else:
                 is_solid = self._recordings[0].is_solid
                 colour_bar(below, self._panel, self._limit, is_solid=is_solid)

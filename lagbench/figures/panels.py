@@ -501,7 +501,7 @@ def colour_bar(
     bar.ax.locator_params(axis="x", nbins=5)
 
 
-def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
+def draw_material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
     """Draw a key of the materials that occur."""
     handles = []
     for material in np.unique(materials):

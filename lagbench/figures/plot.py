@@ -30,8 +30,8 @@ from .panels import (
     box_of,
     colour_bar,
     draw,
+    draw_material_key,
     limit_of,
-    material_key,
     moving_walls,
     title_of,
 )
@@ -164,7 +164,7 @@ def plot_frame(
             place = (left, bar_bottom, SIDE / width, 0.09 / height)
             below = drawn.add_axes(place)
             if panel is Panel.MATERIAL:
-                material_key(below, recording.material)
+                draw_material_key(below, recording.material)
             else:
                 colour_bar(below, panel, limit, is_solid=recording.is_solid)
         return save(drawn, output, option=option)
@@ -558,7 +558,7 @@ def _draw_key(
         materials = []
         for cell in itertools.chain(*sheet.rows):
             materials.append(cell.scene.recording.material)
-        material_key(below, np.concatenate(materials))
+        draw_material_key(below, np.concatenate(materials))
     else:
         is_solid = sheet.rows[0][0].scene.recording.is_solid
         colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit, is_solid=is_solid)

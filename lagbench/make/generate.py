@@ -158,15 +158,17 @@ def generate(
     address = root_url(root)
     if address is not None:
         check_address(address)
-    tier, folder, splits = locate_new(split, size, root=root, registry=registry)
+    tier, data_root, rooted_registry = locate_new(
+        split, size, root=root, registry=registry
+    )
     wanted_ids = select(tier, subset=subset, scenarios=scenarios)
     target = _find_device(device)
     cores = worker_count(workers, default=None if target is Device.CPU else 1)
-    bytes_free = free_bytes(tier.folder(folder))
+    bytes_free = free_bytes(tier.folder(data_root))
     setup = _Setup(
         size=tier,
-        split=splits.split(tier.split),
-        root=folder,
+        split=rooted_registry.split(tier.split),
+        root=data_root,
         device=target,
         workers=cores,
         scheduler=scheduler,
@@ -182,7 +184,7 @@ def generate(
         if scheduler is None:
             check_installed("taichi", extra="generate")
         with (
-            dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
+            dataset_lock(data_root, tier.split, tier.name, tier.major, on_wait=on_wait),
             _open_store(setup) as store,
         ):
             keeper = _ManifestKeeper(setup, store)
@@ -200,7 +202,7 @@ def generate(
         split=tier.split,
         size=tier.name,
         version=tier.version,
-        root=folder,
+        root=data_root,
         folder=setup.folder,
         device=target.value,
         workers=cores,

@@ -164,7 +164,7 @@ def verify(
             negative number for ``regenerate``.
         WorkFailedError: simulating anew failed.
     """
-    tier, folder, _ = locate(split, size, root=root, registry=registry)
+    tier, data_root, _ = locate(split, size, root=root, registry=registry)
     ids = select(tier, subset=subset, scenarios=scenarios)
     meter = Meter(progress)
     cores = worker_count(workers)
@@ -179,9 +179,9 @@ def verify(
     if regenerate:
         check_installed("taichi", extra="generate")
 
-    update_working_copy(tier, folder, ids, thoroughly=True)
-    manifest, warnings = _read_manifest(tier, folder)
-    inspections = _inspect_files(tier, folder, ids, manifest=manifest, meter=meter)
+    update_working_copy(tier, data_root, ids, thoroughly=True)
+    manifest, warnings = _read_manifest(tier, data_root)
+    inspections = _inspect_files(tier, data_root, ids, manifest=manifest, meter=meter)
     # content hashes of the files that are there and right
     hashes: dict[int, str] = {}
     for scenario, inspection in inspections.items():
@@ -197,7 +197,7 @@ def verify(
 
     subset_digests = _subset_digests(tier, hashes)
     data_set_digest = _data_set_digest(tier, subset_digests)
-    reports = _subset_reports(folder, tier, inspections, subset_digests)
+    reports = _subset_reports(data_root, tier, inspections, subset_digests)
     tolerated = []
     for i, inspection in inspections.items():
         if inspection.tolerated:
@@ -206,7 +206,7 @@ def verify(
 
     problems = [*_file_problems(inspections), *_regeneration_problems(regenerated)]
     # A killed writer leaves files here that the store never got.
-    for scenario in list_unstored(tier, folder, [*hashes]):
+    for scenario in list_unstored(tier, data_root, [*hashes]):
         problem = f"scenario {scenario} is in the working copy alone, not in the store"
         problems.append(problem)
     problems += _hash_problems(tier, reports, verdict)
@@ -219,7 +219,7 @@ def verify(
     return VerificationResult(
         split=tier.split,
         size=tier.name,
-        folder=tier.folder(folder),
+        folder=tier.folder(data_root),
         subsets=reports,
         identity=identity,
         dataset_sha256=data_set_digest,
@@ -228,7 +228,7 @@ def verify(
         warnings=tuple(warnings),
         must_be_complete=complete,
         verdict=verdict,
-        fix=suggest_repair(tier, root=folder),
+        fix=suggest_repair(tier, root=data_root),
     )
 
 

@@ -318,9 +318,11 @@ def _has_two_thirds_only(size: Size) -> bool:
     return not _has_half(size) and coarser(size, TWO_THIRDS) is not None
 
 
-def _describe(
+def _make_predictor(
     name: str, times: int | Fraction, share: str, applies: Callable[[Size], bool]
 ) -> ReferencePredictor:
+    """Return the solver with ``times`` fewer cells along each axis, as a predictor."""
+
     def predict_scenario(given: Given) -> Prediction:
         return predict(given, times)
 
@@ -337,9 +339,9 @@ def _describe(
 
 
 PREDICTORS = (
-    _describe("coarse-solver", 2, "half", _has_half),
-    _describe("coarse-solver-4x", 4, "a quarter", _has_quarter),
-    _describe(
+    _make_predictor("coarse-solver", 2, "half", _has_half),
+    _make_predictor("coarse-solver-4x", 4, "a quarter", _has_quarter),
+    _make_predictor(
         "coarse-solver-two-thirds", TWO_THIRDS, "two thirds", _has_two_thirds_only
     ),
 )

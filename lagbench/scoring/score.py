@@ -136,14 +136,16 @@ def score(
     if split is not None:
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
     data_root = resolve_root(root)
-    splits = load_rooted_registry(data_root, registry)
+    rooted_registry = load_rooted_registry(data_root, registry)
     folder = scores_folder(Path(predictions))
     if output_dir is not None:
         folder = Path(output_dir)
 
     result = validated
     if result is None:
-        result = validate(path, root=data_root, require_truth=True, registry=splits)
+        result = validate(
+            path, root=data_root, require_truth=True, registry=rooted_registry
+        )
     _require_validation_of(path, result)
     require_split(result, expected_split)
     if examined is not None:
@@ -158,7 +160,7 @@ def score(
         check_writable(folder, option="--output")
         _check_overwriting(folder / JSON_NAME, header)
 
-    size = splits.size(header.split, header.size).scored_on(header.subset)
+    size = rooted_registry.size(header.split, header.size).scored_on(header.subset)
     # a validation that compares with the truth has hashed it
     is_hashed = validated is None and "discontinuous_start" not in result.skipped
     task = load_scored_task(size, data_root, is_hashed=is_hashed)

@@ -354,9 +354,12 @@ def receive(
 
 
 def _read_blocks(answer: Answer, rate: TransferRate) -> Iterator[bytes]:
-    """Yield what arrives, at last an empty block; any exception is a broken line."""
-    block = b"more"
-    while block:
+    """Yield the blocks of an answer; the last one is empty.
+
+    Raises:
+        BrokenError: the connection ended before the answer.
+    """
+    while True:
         started = time.monotonic()
         try:
             block = answer.read(BLOCK)
@@ -372,6 +375,8 @@ def _read_blocks(answer: Answer, rate: TransferRate) -> Iterator[bytes]:
             raise BrokenError(lost) from error
         rate.count(len(block), time.monotonic() - started)
         yield block
+        if not block:
+            return
 
 
 def accept(request: FetchRequest) -> None:

@@ -124,7 +124,7 @@ class TrainingProvenance(_Strict):
         return sentence
 
     def describe_changes(self) -> str:
-        """Return what differs from the recipe in words; empty where nothing does."""
+        """Return the differences from the recipe in words; empty if there are none."""
         changes = list(self.overrides)
         if self.start is not None:
             start = self.start

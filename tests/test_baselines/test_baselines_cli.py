@@ -68,10 +68,10 @@ class Mine(Drift):
 """
 
 
-def test_a_fault_of_a_package_is_told_as_one(
+def test_an_error_of_a_users_package_names_its_line(
     lagbench: Command, package: Callable[..., Path]
 ) -> None:
-    """What a user's own class raises is not to be reported to us: its line is named."""
+    """The message does not ask the user to report it to lagbench."""
     module = package("baselines", "my_model:Mine", BROKEN)
     result = lagbench("train", "--baseline", "mine", *TINY, "--set", "training.steps=2")
     assert result.exit_code == 5
@@ -155,9 +155,7 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
 def test_the_speed_up_needs_the_solver(
     lagbench: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where Taichi is missing, predict says that there is no speed-up to tell, and goes
-    on.
-    """
+    """Without Taichi, predict prints that it knows no speed-up, and goes on."""
     lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
     find = importlib.util.find_spec
     monkeypatch.setattr(
@@ -428,7 +426,7 @@ def test_the_second_process_says_nothing(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not of_this_turn([0], turns=2), reason="not in this turn")
-def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
+def test_two_processes_report_an_error_once(lagbench: Command) -> None:
     """A loss that overflows ends both processes, and one of them says so."""
     settings = [word for key in SHARED for word in ("--set", key)]
     settings += ["--set", "training.steps=9", "--set", "training.learning_rate=1e30"]

@@ -25,7 +25,7 @@ from lagbench.submission.budget import MOST_VALIDATIONS, Budget, parse_budget, t
         ("tiny", 0.1, 0.0, None),
     ],
 )
-def test_equal_compute(
+def test_equal_compute_limits_hours_and_excludes_gpus(
     size: str,
     minutes: float,
     gpu: float,
@@ -60,7 +60,7 @@ def test_equal_compute(
         ((), None),
     ],
 )
-def test_converged(
+def test_the_track_is_converged_when_the_last_doubling_gains_little(
     validations: tuple[tuple[int, float], ...], track: str | None
 ) -> None:
     """The best validation falls by less than 2 % over the last doubling of the
@@ -95,7 +95,7 @@ VALIDATIONS = [[i, 1.0] for i in range(MOST_VALIDATIONS + 1)]
         *('{"device": "\\n"}', json.dumps({"validations": VALIDATIONS})),
     ],
 )
-def test_texts_that_are_no_budget(text: str) -> None:
+def test_a_text_that_is_no_budget_gives_none(text: str) -> None:
     """A track is not stated, hours are not negative, names printable; validations as
     many as entries hold.
     """
@@ -103,7 +103,7 @@ def test_texts_that_are_no_budget(text: str) -> None:
     assert parse_budget(json.dumps({"validations": VALIDATIONS[1:]})) is not None
 
 
-def test_the_mean_over_seeds() -> None:
+def test_an_entry_has_the_mean_budget_of_its_seeds() -> None:
     """An entry has the mean of its seeds' budgets, and their track where it is one."""
     one: dict[str, Any] = {
         "windows": 100,

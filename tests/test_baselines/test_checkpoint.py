@@ -51,7 +51,7 @@ def example(**changes: Any) -> Checkpoint:
     return Checkpoint(**{**fields, **changes})
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_a_checkpoint_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     """Everything comes back as it was stored, the optimiser's state too."""
     weight = torch.nn.Parameter(torch.ones(2))
     optimizer = torch.optim.AdamW([weight])
@@ -76,7 +76,7 @@ def bits_of(tensor: torch.Tensor) -> NDArray[np.uint32]:
     return tensor.detach().numpy().view(np.uint32)
 
 
-def test_rounding() -> None:
+def test_parameters_are_rounded_and_buffers_keep_every_bit() -> None:
     """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every
     bit.
     """
@@ -140,7 +140,7 @@ def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
 
 
 def test_text_is_no_pickle(tmp_path: Path) -> None:
-    """Of any other file it is said that it is no checkpoint; of a folder, which file to
+    """The error says that another file is no checkpoint, and which file of a folder to
     name.
     """
     (tmp_path / "notes.md").write_text("# hello\n")
@@ -193,7 +193,7 @@ def plain_content(
     ],
 )
 def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
-    """What is no checkpoint of ours is said to be unreadable, with the file's name."""
+    """The error for a file that is no checkpoint of ours names the file."""
     file = tmp_path / "other.pt"
     if isinstance(content, bytes):
         file.write_bytes(content)
@@ -254,10 +254,8 @@ def test_strange_words_and_tensors_are_refused(
     assert caught.value.where.endswith("strange.pt")
 
 
-def test_missing_cut_and_never_written(tmp_path: Path) -> None:
-    """A missing file, one that was cut short, and a pipe, which would be waited for,
-    are unreadable.
-    """
+def test_missing_truncated_files_and_pipes_are_unreadable(tmp_path: Path) -> None:
+    """A pipe without a writer would otherwise block the reader."""
     os.mkfifo(tmp_path / "pipe.pt")
     save(tmp_path / "cut.pt", example())
     whole = (tmp_path / "cut.pt").read_bytes()
@@ -313,7 +311,7 @@ NO_CALLS = torch.tensor(0)
         ),
     ],
 )
-def test_unfit_weights(
+def test_weights_that_do_not_fit_the_model_are_refused(
     changes: dict[str, Any],
     message: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -324,7 +322,7 @@ def test_unfit_weights(
         restore(example(**changes))
 
 
-def test_unknown_baseline() -> None:
+def test_the_error_for_an_unknown_baseline_names_the_file() -> None:
     """A checkpoint of a baseline that is not installed says so, and which file it
     is.
     """
@@ -373,7 +371,7 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(
     assert peak < 10**7
 
 
-def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
+def test_a_flipped_byte_is_unreadable(tmp_path: Path) -> None:
     """Any byte of any member: its checksum is another. Bytes between members are
     padding.
     """

@@ -72,7 +72,7 @@ def test_the_last_known_forcing_stays(
 ) -> None:
     """Frames beyond the known ones have it."""
     forcing = torch.arange(frames).reshape(1, frames, 1)
-    later = skip_frames(forcing, count, least=least)
+    later = skip_frames(forcing, count, min_frames=least)
     assert later.flatten().tolist() == expected
 
 

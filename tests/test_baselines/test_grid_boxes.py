@@ -295,7 +295,7 @@ def test_a_shift_along_periodic_axes_shifts_the_prediction(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["square", "cube"])
-def test_the_seam_is_not_seen(name: str) -> None:
+def test_a_flow_through_the_periodic_ends_continues(name: str) -> None:
     """A uniform flow through it costs nothing, and goes on for ever."""
     dimension = BOXES[name].dimension
     velocity = (0.03, -0.02, 0.01)[:dimension]

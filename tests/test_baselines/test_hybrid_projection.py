@@ -236,7 +236,7 @@ def test_an_obstacle_outside_a_channel_moves_no_particle() -> None:
 
 
 def test_a_fit_finds_the_radius_of_a_flow_that_it_made_itself() -> None:
-    """The disc that the fluid feels is a third larger than the disc that is told."""
+    """The disc that the fluid feels is a third larger than the disc in the file."""
     true_model = channel_model()
     true_model.coefficients[3] = 0.33
     path, disc = stream_around_a_disc(channel().task.input_frames)

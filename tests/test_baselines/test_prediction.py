@@ -322,9 +322,8 @@ def test_frozen_frames_are_not_timed(
 def test_other_work_on_the_machine_does_not_count(
     run: Predict, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """The cost of a frame is the processor time of all threads, on any load.
-
-    Threads, load and the time on the wall are told beside it.
+    """The cost of a frame is the processor time of all threads, at any load. The result
+    also has threads, load and wall-clock time.
     """
     advance = Mock(side_effect=Drift.advance)
     clock = SimpleNamespace(
@@ -571,9 +570,8 @@ def test_at_its_own_size_the_radius_of_the_training_counts(
 
 
 def test_options_of_a_model_may_change(run: Predict) -> None:
-    """The prediction is that of a training with the option, and the file says so.
-
-    It tells the ``--set`` of the training from that of the prediction.
+    """The prediction is that of a training with the option. The file lists the
+    ``--set`` of the training and that of the prediction separately.
     """
     settings = ["training.steps=77"]
     recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=settings)
@@ -727,7 +725,9 @@ def test_predictions_are_not_replaced_in_silence(run: Predict, tmp_path: Path) -
     assert (tmp_path / "predictions.nc").read_bytes() == before
 
 
-def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_prediction_without_memory_is_a_work_error(
+    run: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
     error = torch.OutOfMemoryError("no memory left")
     monkeypatch.setattr(Drift, "advance", Mock(side_effect=error))
     with pytest.raises(WorkFailedError):
@@ -811,7 +811,7 @@ CORES = len(os.sched_getaffinity(0))
         (None, "", CORES + 1, 1),
     ],
 )
-def test_threads_are_those_asked_for(
+def test_the_option_for_threads_wins_over_the_environment(
     monkeypatch: pytest.MonkeyPatch,
     count: int | None,
     environment: str,

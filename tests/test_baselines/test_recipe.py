@@ -169,12 +169,12 @@ def test_weights_keep_their_meaning(name: str, option: str, value: str) -> None:
     assert change_options(baseline, {**stored, option: value}, [setting])
 
 
-def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
-    """Settings win over the recipe, and the recipe over the defaults of the file, which
-    may be one's own.
-
-    A star stands for every split. Of baselines that share a recipe, one has what is
-    said of it by name.
+def test_settings_win_over_the_recipe_and_it_over_defaults(
+    entry: CatalogueEntry, tmp_path: Path
+) -> None:
+    """The file of recipes may be the user's own. A star stands for every split. Where
+    baselines share a recipe, options under the name of one baseline are for that one
+    only.
     """
     plain = recipe_for(entry, "cavity", "tiny")
     assert plain.training.steps == 7
@@ -207,10 +207,8 @@ def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
     assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
 
 
-def test_trainings_of_before_an_option_go_on() -> None:
-    """A record says an option that came later only where it is not what was done
-    before.
-    """
+def test_records_name_a_new_option_only_where_it_is_set() -> None:
+    """So the record of a training from before the option equals the record of today."""
     entry = find("neuralmpm")
     before = recipe_for(entry, "fluid", "tiny").as_json()
     assert not {"strain", "mixture", "pushforward", "recovery", "average"} & set(
@@ -283,9 +281,9 @@ def keys_of(settings: Iterable[str]) -> set[str]:
     return {setting.partition("=")[0] for setting in settings}
 
 
-def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
-    """Strangers' records: no such recipe or baseline, options that do not fit, a path
-    for a name.
+def test_a_recipe_that_is_not_ours_has_no_settings(tmp_path: Path) -> None:
+    """Records of other people: no such recipe or baseline, options that do not fit, a
+    path for a name.
     """
     own = tmp_path / "own.yaml"
     own.write_text("format: 1\nrecipes: {cavity/mini: {training: {steps: 1}}}\n")
@@ -438,7 +436,7 @@ def test_no_such_recipe(entry: CatalogueEntry) -> None:
             recipe_for(asked, split, size, variant=variant)
 
 
-def test_a_split_of_the_users_own_is_told_its_recipe(tmp_path: Path) -> None:
+def test_a_split_without_a_recipe_gets_an_example_that_works(tmp_path: Path) -> None:
     """No recipe of another split is suggested; the example is one that works."""
     with pytest.raises(UsageError) as caught:
         recipe_for(find("gns"), "own", "full", variant="short")

@@ -127,7 +127,7 @@ def stored(
 
 
 @pytest.mark.parametrize("size", ["tiny", "mini"])
-def test_it_goes_on_where_the_weights_are(
+def test_a_training_starts_with_the_prediction_of_the_weights(
     run: Run,
     stored: Callable[..., Path],
     generated: GenerationResult,
@@ -167,7 +167,7 @@ def test_it_goes_on_where_the_weights_are(
 
 
 @pytest.mark.slow
-def test_it_learns_from_there(run: Run) -> None:
+def test_a_training_from_its_own_end_begins_at_its_last_loss(run: Run) -> None:
     """A training from its own end begins at the loss that it ended with; random weights
     do not.
     """
@@ -178,7 +178,7 @@ def test_it_learns_from_there(run: Run) -> None:
     assert further.loss["total"] < 0.95 * anew.loss["total"]
 
 
-def test_nothing_worse_takes_their_place(
+def test_the_start_weights_stay_best_where_every_step_is_worse(
     run: Run,
     stored: Callable[..., Path],
 ) -> None:
@@ -213,13 +213,13 @@ def test_nothing_worse_takes_their_place(
             )
 
 
-def test_what_came_before_is_told(
+def test_the_record_counts_the_hours_before_the_start(
     run: Run,
     stored: Callable[..., Path],
     tmp_path: Path,
 ) -> None:
-    """Hours are with those of the start, other figures are not; words and record name
-    the weights.
+    """Hours include those of the start, other figures do not. The record and the
+    sentence name the weights.
     """
     spent = {
         "cpu_hours": 2.0,
@@ -258,13 +258,13 @@ def test_what_came_before_is_told(
         {"cpu_hours": 9.9e11, "gpu_hours": 0.0},
     ],
 )
-def test_hours_that_nobody_knows(
+def test_unknown_hours_of_the_start_leave_the_sum_unknown(
     run: Run,
     stored: Callable[..., Path],
     spent: dict[str, float] | None,
 ) -> None:
-    """Weights without a budget that can be believed leave the sum unknown: it is of no
-    equal compute.
+    """So it is where the stated hours are not credible. Such weights belong to no track
+    of equal compute.
     """
     start = stored(budget=spent)
     result = run("any", *STILL, start=start)
@@ -283,7 +283,7 @@ def test_hours_that_nobody_knows(
         (100, None),
     ],
 )
-def test_what_came_before_counts_for_convergence(
+def test_steps_before_the_start_count_for_convergence(
     start_steps: int | None,
     track: str | None,
 ) -> None:
@@ -310,7 +310,7 @@ def test_a_long_training_without_progress_converges() -> None:
     assert track_of("mini", long) == "converged"
 
 
-def test_nothing_is_lost(
+def test_a_refused_start_leaves_the_folder_as_it_is(
     run: Run,
     stored: Callable[..., Path],
 ) -> None:
@@ -340,11 +340,11 @@ def test_nothing_is_lost(
         assert first.checkpoint.read_bytes() == checkpoint_before
 
 
-def test_facts_are_those_of_the_data(
+def test_box_and_cells_of_the_validation_are_those_of_the_data(
     run: Run,
     stored: Callable[..., Path],
 ) -> None:
-    """What a file says of frames, box and cells does not bound what is validated on."""
+    """Frames, box and cells in a file of weights do not change the validation."""
     plain_start = stored()
     plain = run("any", "steps=2", start=plain_start, to="plain")
     told = {
@@ -358,7 +358,7 @@ def test_facts_are_those_of_the_data(
     assert odd.best_value == plain.best_value
 
 
-def test_it_can_be_interrupted(
+def test_an_interrupted_training_goes_on_with_the_same_bits(
     run: Run,
     stored: Callable[..., Path],
 ) -> None:
@@ -416,7 +416,7 @@ STRANGE_START = {"sha256": "../x", "recipe": "x"}
         ),
     ],
 )
-def test_weights_that_do_not_fit(
+def test_weights_that_do_not_fit_are_refused(
     run: Run,
     stored: Callable[..., Path],
     baseline: str,

@@ -80,8 +80,8 @@ def test_a_box_adds_nothing_to_the_weights() -> None:
     assert not TensorBox(SOLID).state_dict()
 
 
-def test_the_author_of_a_model_is_told_how_to_state_that_it_knows_a_box() -> None:
-    """Users of our own models are not: they cannot change them."""
+def test_only_authors_of_a_model_read_how_to_allow_any_box() -> None:
+    """Users of the models in the package cannot change them."""
     periodic = replace(INFO, periodic=("x",))
     with pytest.raises(UsageError) as caught:
         Drift(Drift.Options(), periodic)

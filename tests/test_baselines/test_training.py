@@ -342,7 +342,7 @@ def test_options_that_a_model_cannot_use_are_refused(
     assert caught.value.where == setting.partition("=")[0]
 
 
-def test_folders_are_guarded(run: Run) -> None:
+def test_another_recipe_in_a_folder_is_refused(run: Run) -> None:
     """Another recipe in a folder is refused unless the user wants to train anew."""
     run("drift", "steps=2")
     with pytest.raises(UsageError) as caught:
@@ -626,7 +626,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
         ("var", "model.lags=1000000000", "lags"),
     ],
 )
-def test_out_of_memory(
+def test_a_training_without_memory_names_the_option_to_lower(
     run: Run,
     monkeypatch: pytest.MonkeyPatch,
     baseline: str,
@@ -737,7 +737,7 @@ def test_a_users_fit_gets_whole_scenarios_as_batches(
 
 
 def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
-    """A fit that measures rollouts takes minutes; each measurement is told."""
+    """A fit that measures rollouts takes minutes; each measurement is reported."""
     reports: list[Progress] = []
     evaluations = 4
     run(

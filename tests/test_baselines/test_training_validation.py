@@ -124,7 +124,7 @@ def test_digits_of_the_scorer_on_the_free_surface(
 
 def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None:
     """Every scenario of valid counts, the test subset is not needed, and a lost
-    scenario is told.
+    scenario is an error.
     """
     root = copied()
     dataset = root / "curl-noise/tiny/v2"
@@ -165,7 +165,9 @@ def validated_steps(
         (10, 1, 720, 1),
     ],
 )
-def test_how_often(steps: int, trained: int, rolled: int, expected: int) -> None:
+def test_validations_share_a_training_evenly(
+    steps: int, trained: int, rolled: int, expected: int
+) -> None:
     """Validations share a training evenly, the last step among them, and take at most
     15 % of it.
     """
@@ -179,7 +181,7 @@ def test_how_often(steps: int, trained: int, rolled: int, expected: int) -> None
         assert validated[count // 2 - 1] == steps // 2
 
 
-def test_a_recipe_may_say_how_often() -> None:
+def test_a_recipe_may_choose_the_validated_steps() -> None:
     """What it names in `validate_every` wins; 0 means never."""
     every_fourth = TrainingOptions(validate_every=4)
     never = TrainingOptions(validate_every=0)
@@ -187,8 +189,8 @@ def test_a_recipe_may_say_how_often() -> None:
     assert validated_steps(never, steps=10, validations=8) == []
 
 
-def test_what_a_training_says(run: Run) -> None:
-    """Record, weights and result tell windows, epochs, times, machine, and the best
+def test_a_training_records_windows_times_and_validations(run: Run) -> None:
+    """Record, weights and result hold windows, epochs, times, machine, and the best
     validation.
     """
     settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
@@ -222,7 +224,7 @@ def test_what_a_training_says(run: Run) -> None:
 
 
 def test_long_records_are_thinned(run: Run) -> None:
-    """Of 22 validations a budget tells at most 20, the last one among them."""
+    """Of 22 validations a budget keeps at most 20, the last one among them."""
     result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
     budget = read_training_log(result.folder)["budget"]
     told = budget["validations"]

@@ -257,7 +257,7 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
 
 @pytest.mark.slow
 def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:
-    """After three ends one picture is asked for per picture of the screen, not four."""
+    """After three ends, one picture is drawn per picture of the screen, not four."""
     slider = "document.querySelector('#hero input')"
     restored(page, board.tabs[0].id)
     run(
@@ -342,7 +342,7 @@ def test_variants_unfold_behind_their_method(
     close(page)
 
 
-def test_other_columns_come_when_they_are_asked_for(page: Page, board: Board) -> None:
+def test_all_columns_are_shown_on_request(page: Page, board: Board) -> None:
     """Every number of a row is in the table, in the order of the headings."""
     tab = board.tabs[0]
     restored(page, f"#tab={tab.id}&columns=all")
@@ -386,8 +386,8 @@ def test_the_table_needs_no_script(
 
 
 def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
-    """Each preset shows the values of its columns, floors where their score puts
-    them.
+    """Each preset shows the values of its columns, and reference predictors where their
+    score puts them.
     """
     tab = board.tabs[0]
     go(page, tab)
@@ -416,8 +416,8 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
     ["position_rmse", "vorticity_pearson", "energy_ratio", "speed_up", "parameters"],
 )
 def test_sorting(page: Page, board: Board, key: str) -> None:
-    """A click sorts best first, another worst first; gaps stay last, floors are sorted
-    with the others.
+    """A click sorts best first, another worst first; gaps stay last, and reference
+    predictors are sorted with the entries.
     """
     tab = board.tabs[0]
     go(page, tab)
@@ -457,7 +457,7 @@ def test_sorting(page: Page, board: Board, key: str) -> None:
 
 
 def test_filter_by_keyboard(page: Page, board: Board) -> None:
-    """A slash leads to the filter; every word must occur; the floors stay."""
+    """A slash leads to the filter; every word must occur; reference predictors stay."""
     go(page, board.tabs[0])
     press(page, "/")
     page.call("Input.insertText", text="examples GAT")

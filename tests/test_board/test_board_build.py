@@ -165,7 +165,7 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
     assert row.seed_means == pytest.approx(means)
 
 
-def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
+def test_an_entry_of_an_unknown_split_is_named(bench: BoardBench) -> None:
     """The entry is named: a package that describes its split is missing."""
     nothing_known = Registry({}, {})
     with pytest.raises(DataError) as caught:
@@ -233,10 +233,8 @@ def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) 
     assert_allclose(true_vorticity, expected, atol=fine.precision)
 
 
-def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
-    """Film and maps come back within half a step of their packing; energy is the
-    scorer's.
-    """
+def test_pictures_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
+    """Film and maps come back within half a step of their packing."""
     row = row_of(board, "noisy")
     film_error = np.abs(row.pictures.film - card.preview.film[1])
     assert film_error.max() <= 2.0 / 65534
@@ -392,7 +390,7 @@ def test_less_is_formed_to_the_same_numbers(bench: BoardBench, board: Board) -> 
         assert row.rank == whole.rank
 
 
-def test_names_tell_variants() -> None:
+def test_variants_follow_from_names() -> None:
     """A name that continues another one of the same authors with a comma or a word is
     that of a variant.
     """
@@ -433,8 +431,10 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
     assert caught.value.where.endswith("leaderboard/nothing")
 
 
-def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
-    """What was not asked for is not even read; what was is as in the whole board."""
+def test_only_the_chosen_data_sets_are_read(board: Board, own: BoardBench) -> None:
+    """The files of other data sets are not read; the chosen ones are as in the whole
+    board.
+    """
 
     def collect_only(*data_sets: tuple[str, str]) -> Board:
         return collect(own.folder, only=data_sets, registry=own.registry)
@@ -521,7 +521,9 @@ def test_boards_without_an_entry_are_named(
 def test_the_page_links_to_the_documentation_where_that_has_an_address(
     tmp_path: Path,
 ) -> None:
-    """Without an address only files that are there are linked, and nothing is told."""
+    """Without an address the page links only to files beside it, and the build prints
+    no message.
+    """
     (tmp_path / "submissions").mkdir()
     result = build(tmp_path, documentation="https://example.org/docs/")
     page = result.page.read_text("utf-8")

@@ -507,9 +507,7 @@ def test_all_checks_have_damage() -> None:
 def test_one_bad_file_hides_nothing(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error that nobody thought of, in one entry, leaves the findings on the
-    others.
-    """
+    """An unexpected error in one entry leaves the issues of the others."""
     original = folder_checks.load_plain
 
     def failing(path: Path) -> Any:

@@ -55,7 +55,9 @@ def toy(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("toy")
-def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
+def test_a_stranger_can_submit_check_and_show_an_entry(
+    run: Run, tmp_path: Path
+) -> None:
     """From an own model to a page, each command as documented, nothing asked on
     stdin.
     """
@@ -230,8 +232,8 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
 
 @pytest.mark.usefixtures("toy")
 def test_scores_of_earlier_tasks_alone(run: Run, tmp_path: Path) -> None:
-    """Scores that do not fit the task of today are no table, and are not taken for no
-    entries at all.
+    """Scores that do not fit the task of today give no table, but they count as
+    entries.
     """
     assert run(*SUBMIT, "--new-board").exit_code == 0
     board = tmp_path / "leaderboard"

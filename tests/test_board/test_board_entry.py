@@ -345,7 +345,7 @@ def test_large_files_and_pipes_are_not_read(
     assert time.perf_counter() - started < 1.0
 
 
-def test_mistakes_of_a_file_are_told_together(tmp_path: Path) -> None:
+def test_one_error_names_every_wrong_key_of_a_file(tmp_path: Path) -> None:
     """The error names every wrong key of the file."""
     path = tmp_path / "entry.yaml"
     path.write_text(
@@ -399,6 +399,6 @@ def test_options_win_over_the_file(tmp_path: Path) -> None:
 
 
 def test_every_key_of_a_submitter_is_one_of_the_entry() -> None:
-    """What is said of a method lands in the entry under the same name."""
+    """A description of a method lands in the entry under the same names."""
     assert set(About.model_fields) <= set(Entry.model_fields)
     assert set(About.model_fields) < set(Meta.model_fields)

@@ -141,7 +141,7 @@ def test_the_obstacle_of_a_film_arrives_at_the_script() -> None:
 
 
 def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:
-    """Every metric of every row, to nine digits; entries tell who scored them."""
+    """Every metric of every row, to nine digits, and who scored each entry."""
     tab = board.tabs[0]
     plain_tab = read_page_data(page).tabs[0]
     columns = columns_of(tab, board.metrics)
@@ -491,9 +491,9 @@ def run_again_on(*counts: int) -> Verification:
     )
 
 
-def test_the_page_tells_whole_reproductions_from_partial_ones(board: Board) -> None:
-    """The header counts both; the column says on how many scenarios; the notes say what
-    a part shows.
+def test_the_page_distinguishes_whole_and_partial_reproductions(board: Board) -> None:
+    """The header counts both. The column states the number of scenarios. The notes
+    explain how much a partial one shows.
     """
     whole = row_of(board, "Whole", "whole", verified=run_again_on(16, 16))
     partly = row_of(board, "Partly", "partly", verified=run_again_on(16, 4))
@@ -880,7 +880,7 @@ def test_budgets_are_marked_as_self_reported(page: str) -> None:
         (17.25, "faster"),
     ],
 )
-def test_speed_is_told_against_the_solver(
+def test_speed_is_compared_with_the_solver(
     board: Board, speed: float, word: str
 ) -> None:
     """The tile of the fastest entry says on which side of the simulator it is."""

@@ -247,7 +247,7 @@ def test_a_sample_is_the_same_in_every_run() -> None:
     assert sample_scenarios(scenarios, "1", None) == tuple(scenarios)
 
 
-def test_the_command_says_what_it_did(
+def test_contradictory_options_are_refused_before_any_work(
     own: ModelBoard, run: Callable[..., Result]
 ) -> None:
     """Options that contradict each other are refused before any work."""
@@ -264,10 +264,12 @@ def test_the_command_says_what_it_did(
     assert result.exit_code == 2
 
 
-def test_what_was_not_run_is_told_as_recorded(
+def test_a_recorded_result_is_shown_with_the_option_that_runs_it_again(
     own: ModelBoard, run: Callable[..., Result]
 ) -> None:
-    """The first and the third call run the model; the second one reads its line."""
+    """The first and the third call run the model; the second one reads the recorded
+    line.
+    """
     command = ["leaderboard", "reproduce", NAME, "--no-costs"]
     where = ["--board", own.folder, "--root", own.root]
     printed = []

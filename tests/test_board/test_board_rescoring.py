@@ -150,7 +150,7 @@ def test_scoring_again_finds_what_a_forger_hid(
     own: BoardBench, predictions: Path
 ) -> None:
     """Statistics halved, hashes and aggregates forged: only the predictions themselves
-    tell.
+    show it.
     """
     reform(own, scale("vorticity_mse", 0.5))
     assert findings_of(own) == []
@@ -166,11 +166,11 @@ def test_scoring_again_finds_what_a_forger_hid(
     assert finding.check == "rescored"
 
 
-def test_what_is_said_beside_the_numbers_is_compared(
+def test_flags_and_reference_scores_are_compared(
     own: BoardBench, predictions: Path
 ) -> None:
-    """Flags and frozen scenarios are those that the scorer tells; so are the scores of
-    floors.
+    """Flags, frozen scenarios and the scores of reference predictors are those of the
+    scorer.
     """
 
     def change_flags(entry: dict[str, Any]) -> None:
@@ -225,8 +225,8 @@ def test_broken_predictions_are_opened_in_the_child_only(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whatever is wrong with the file is found before this process opens it; other
-    findings remain.
+    """The child finds every fault of the file before this process opens it; other
+    issues remain.
     """
     cut = tmp_path / "cut.nc"
     content = predictions.read_bytes()

@@ -209,7 +209,7 @@ def test_a_repeated_season_has_the_same_bytes(
 
 
 def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
-    """Unless that is asked for; the scores are the same."""
+    """Only an option predicts them again; the scores are the same."""
     saved = run_again(master)
     assert saved.predicted == []
     assert saved.exit_code == 0

@@ -106,7 +106,7 @@ def test_an_onnx_file_predicts_shift(run_board: ModelBoard, tmp_path: Path) -> N
 
 
 def test_an_unreadable_entry_keeps_its_weights_and_its_line(own: ModelBoard) -> None:
-    """Only the entry is reported: nobody is told to remove what belongs to it."""
+    """Only the entry is reported: no message asks to remove its weights or its line."""
     own.edit(own.folder / PATH, lambda content: content.update(authors=[]))
     (finding,) = own.find().findings
     assert finding.check == "schema"
@@ -161,7 +161,7 @@ def test_the_board_shows_skill_on_shift(run_board: ModelBoard) -> None:
 
 
 def test_the_command_runs_no_model_twice(own: ModelBoard) -> None:
-    """What is recorded stays as it is, unless it is asked for again."""
+    """Recorded lines stay as they are, unless an option runs the model again."""
     before = (own.folder / "shift.yaml").read_bytes()
     result = score_on_shift(own.folder, root=own.root)
     assert result.predicted == []

@@ -145,7 +145,7 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
 
 @pytest.mark.usefixtures("unscored")
 def test_a_name_that_no_entry_can_hold(own: BoardBench) -> None:
-    """A path inside the folder that the schema refuses is told before anything is
+    """A path inside the folder that the schema refuses is an error before anything is
     scored.
     """
     inside = own.folder / ("p" * 150) / f"{'q' * 100}.nc"
@@ -168,7 +168,7 @@ def test_predictions_are_submitted_once(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of another entry or seed are refused under any label; one file twice is
-    told before the work.
+    refused before the work.
     """
     first = own.predict(nearer, "first")
     own.submit(first)
@@ -236,7 +236,7 @@ def test_refused_before_the_work(
 
 @pytest.mark.usefixtures("unscored")
 @pytest.mark.parametrize("line", ["parameters: many", "nmae: Mine", "- a list"])
-def test_a_description_that_does_not_fit_is_told(
+def test_a_wrong_description_is_named_by_its_file(
     line: str, own: BoardBench, predictions: Path, tmp_path: Path
 ) -> None:
     meta = tmp_path / "meta.yaml"
@@ -273,7 +273,7 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
 def test_a_cost_of_predictions_that_no_entry_can_hold(
     own: BoardBench, key: str, labels: Keys
 ) -> None:
-    """Valid predictions may tell a cost beyond what the board takes: the key is named
+    """Valid predictions may state a cost that no entry allows: the error names the key
     before the work.
     """
     good_labels = {
@@ -320,10 +320,10 @@ def test_a_training_that_cannot_be_is_refused_before_the_scoring(
     assert tree(own.folder) == before
 
 
-def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
-    """All that is wrong with an entry is in one error: whoever mends it all can
-    submit.
-    """
+def test_one_error_names_all_mistakes_of_an_entry(
+    own: BoardBench, predictions: Path
+) -> None:
+    """A user who corrects all of them can submit."""
     wrong = {
         "name": "NO\u0406SY",
         "urls": TWO_ADDRESSES,
@@ -431,9 +431,11 @@ def test_a_score_file_that_is_too_long_is_not_published(
     assert tree(own.folder) == before
 
 
-def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> None:
-    """Those that are missing, or of another data set, are written anew, the same bytes
-    whoever submits.
+def test_missing_reference_scores_are_added_when_an_entry_is_submitted(
+    own: BoardBench, predictions: Path
+) -> None:
+    """Scores that are missing, or of another data set, are written again, with the same
+    bytes for every submitter.
     """
     folder = own.folder / "floors/cavity/tiny"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -490,8 +492,8 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
 def test_no_board_is_begun_by_mistake(
     own: BoardBench, predictions: Path, tmp_path: Path
 ) -> None:
-    """It has to be asked for, and not among other files; what git and a README put
-    there is no obstacle.
+    """A new board needs its option, and a folder without other files. Files of git and
+    a README are allowed.
     """
     meta = Meta(authors=("A. Author",), command="make", date=DAY)
     board = tmp_path / "site"

@@ -368,8 +368,8 @@ def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None
 
 
 def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> None:
-    """A folder where a record was: told before anything moves. A link that leads
-    nowhere just goes.
+    """A folder in the place of a record is an error before any file moves. A broken
+    link is removed.
     """
     records = (own.folder / "weights").rglob("*.json")
     record = next(records)
@@ -428,8 +428,8 @@ def test_weights_are_those_of_the_predictions(
     parameters: int | None,
     fits: bool,
 ) -> None:
-    """Training in words and parameters are those of the weights; the number tells GNS
-    from SuperGAT.
+    """Training in words and parameters are those of the weights; the number
+    distinguishes GNS from SuperGAT.
     """
     run = trained(own, 0, training, parameters)
     if fits:
@@ -847,8 +847,8 @@ def test_what_is_no_record_is_not_copied(
 
 
 def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
-    """Scored again, predictions that tell another budget are found, though the entry is
-    sound by itself.
+    """Scoring again finds predictions that state another budget, though the entry is
+    consistent by itself.
     """
 
     def shorten(entry: dict[str, Any]) -> None:
@@ -941,9 +941,11 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     assert_sound(own)
 
 
-def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) -> None:
-    """Budget and parameters of meta.yaml too, where the files say none; what is said
-    anew wins.
+def test_the_description_of_a_method_stays_when_seeds_are_added(
+    own: BoardBench,
+) -> None:
+    """So do budget and parameters of meta.yaml, where the files have none. New values
+    replace old ones.
     """
     first = own.predict(nearer, "mine", seed=0)
     second = own.predict(still, "mine", seed=1)

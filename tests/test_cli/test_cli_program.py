@@ -52,7 +52,9 @@ def test_usage_errors_exit_2(line: str, culprit: str, run: Run, tmp_path: Path) 
 def test_a_broken_package_is_warned_of_once(
     package: Callable[..., Path], bench: ScoreBench, run: Run, tmp_path: Path
 ) -> None:
-    """Several parts of a command ask for the metrics; the line of the fault is told."""
+    """Several parts of a command ask for the metrics; the warning names the line of the
+    fault.
+    """
     module_file = package("metrics", "broken_metric:METRICS", "1 / 0\n")
     predictions = bench.submit(tmp_path / "still.nc", still)
     result = run("score", predictions, "--root", bench.root)
@@ -212,7 +214,7 @@ def test_a_full_stderr_leaves_the_exit_code(words: tuple[str, ...], code: int) -
         ("cite cavity fluid", ("fluid",)),
     ],
 )
-def test_mistakes_on_the_command_line_are_told_like_all_others(
+def test_mistakes_on_the_command_line_have_the_parts_of_all_messages(
     line: str, words: tuple[str, ...], run: Run
 ) -> None:
     """Where, got and fix; no box and no usage line."""
@@ -301,7 +303,7 @@ def test_a_name_that_is_too_long_is_no_fault_of_lagbench(
         "train cavity --baseline gns --size tiny",
     ],
 )
-def test_a_limit_of_memory_is_told_as_that(line: str, tmp_path: Path) -> None:
+def test_a_limit_of_memory_is_named_in_the_message(line: str, tmp_path: Path) -> None:
     """Taichi asks for a gigabyte of addresses; with less OpenBLAS tries for ever."""
     script = (
         "import resource, runpy, sys\n"

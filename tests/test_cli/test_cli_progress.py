@@ -46,7 +46,7 @@ def test_a_file_gets_lines_with_the_count_and_the_time_left(
     assert re.findall(pattern, output.err) == [("60", "3 min"), ("200", "40 s")]
 
 
-def test_work_without_scenarios_is_told_by_its_share(
+def test_progress_without_scenarios_is_shown_in_per_cent(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The line names the stage and the share, and no scenarios."""
@@ -87,7 +87,7 @@ def slow_scoring(done: int, seconds: float) -> Progress:
         (5, 4.0, "25%, 5/20 scenarios, 1.25/s, 12 s left"),
     ],
 )
-def test_slow_work_is_told_by_seconds(
+def test_slow_progress_is_shown_in_seconds_per_scenario(
     done: int, seconds: float, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Below one a second the time of one is shown; before the first there is none."""

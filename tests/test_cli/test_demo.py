@@ -70,7 +70,7 @@ def small_registry(
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.width=4"))
-    monkeypatch.setattr(demo, "bench_apart", lambda *_: SOLVER_BENCH)
+    monkeypatch.setattr(demo, "bench_in_own_process", lambda *_: SOLVER_BENCH)
     return load(path)
 
 
@@ -110,7 +110,7 @@ def test_a_solver_that_cannot_be_timed_gives_no_speed_up(
     def fail(*_: str) -> SolverBench:
         raise WorkFailedError("the solver could not be timed")
 
-    monkeypatch.setattr(demo, "bench_apart", fail)
+    monkeypatch.setattr(demo, "bench_in_own_process", fail)
     assert demo.bench_demo_solver() is None
 
 

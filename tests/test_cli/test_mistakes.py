@@ -305,7 +305,7 @@ def type_command(
 
 
 @pytest.mark.parametrize("command", HINTS)
-def test_a_mistake_is_told_with_what_mends_it(
+def test_the_message_of_a_mistake_holds_its_fix(
     command: str, type_command: Callable[[str], Result]
 ) -> None:
     result = type_command(command)
@@ -355,7 +355,7 @@ def has_all_parts(message: str) -> bool:
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_with_all_that_is_needed(
+def test_the_message_of_a_mistake_has_all_parts(
     mistake: str, type_command: Callable[[str], Result], bench: ScoreBench
 ) -> None:
     scenario = bench.size.path(bench.root, 3)
@@ -405,7 +405,7 @@ def test_an_empty_path_is_refused(
 
 
 @pytest.mark.parametrize("command", ["score", "validate", "compare", "submit"])
-def test_a_size_that_the_file_states_is_not_asked_for(
+def test_the_option_size_is_refused_where_the_file_states_it(
     command: str, run: Callable[..., Result]
 ) -> None:
     """These commands have no --size: no other option is suggested for it."""
@@ -448,7 +448,7 @@ def lose_permissions() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
-def test_a_true_scenario_without_permission_is_told(
+def test_a_scenario_without_permission_is_named_in_the_message(
     files: Path, bench: ScoreBench, tmp_path: Path
 ) -> None:
     """It is data that cannot be read, and nothing says that it is to be made again."""
@@ -473,7 +473,7 @@ def test_a_true_scenario_without_permission_is_told(
     not Path("/dev/full").exists(), reason="this system has no /dev/full"
 )
 @pytest.mark.parametrize("form", ["--workers=1", "--json"])
-def test_scores_that_a_full_disk_cannot_take_are_told(
+def test_a_full_standard_output_exits_5_and_leaves_the_scores(
     form: str, files: Path, bench: ScoreBench, tmp_path: Path
 ) -> None:
     """The exit code says that the output is not whole; the files of scores are."""
@@ -492,7 +492,7 @@ def test_scores_that_a_full_disk_cannot_take_are_told(
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="/proc refuses all, the root too")
-def test_a_folder_that_refuses_is_told(
+def test_a_folder_that_cannot_be_written_exits_5(
     run: Callable[..., Result], files: Path, bench: ScoreBench
 ) -> None:
     predictions = files / "good.nc"
@@ -501,7 +501,7 @@ def test_a_folder_that_refuses_is_told(
     assert has_all_parts(result.stderr), result.stderr
 
 
-def test_a_library_that_is_missing_is_told(
+def test_a_missing_library_is_named_with_its_command(
     run: Callable[..., Result], bench: ScoreBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fix is the command that installs it."""

@@ -264,7 +264,7 @@ def test_variables_can_arrive_side_by_side() -> None:
 
 
 def test_values_must_fit_what_was_declared() -> None:
-    """Too few, too many, another type: each is told with the variable's name."""
+    """Too few, too many, another type: each error names the variable."""
     hasher = VariableHasher("position", np.float32, ("frame",), (2,))
     with pytest.raises(DataError) as caught:
         hasher.update(np.zeros(1))

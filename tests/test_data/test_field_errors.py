@@ -95,7 +95,7 @@ class Inner(BaseModel):
         (UUID, "3", OTHER),
     ],
 )
-def test_an_error_is_told_in_our_words(
+def test_errors_of_pydantic_are_described_in_our_words(
     kind: object, value: object, expected: str
 ) -> None:
     with pytest.raises(ValidationError) as caught:
@@ -104,8 +104,8 @@ def test_an_error_is_told_in_our_words(
 
 
 @pytest.mark.parametrize("kind", get_args(ErrorType))
-def test_no_error_of_pydantic_is_told_in_its_words(kind: str) -> None:
-    """Types that the table did not have were told with the text of pydantic."""
+def test_no_description_has_the_words_of_pydantic(kind: str) -> None:
+    """The sentence for a type that the table does not have is ours too."""
     if kind in {"value_error", "assertion_error"}:  # these are sentences of ours
         return
     context = dict.fromkeys(CONTEXT, 3)
@@ -155,7 +155,7 @@ def test_the_value_of_a_missing_key_is_not_the_whole_file() -> None:
     assert describe_input(caught.value.errors()[0]) == "no such key"
 
 
-def test_a_value_with_thousands_of_digits_is_told() -> None:
+def test_a_value_with_thousands_of_digits_is_described_by_its_bits() -> None:
     """Python would raise an error over its digits."""
     with pytest.raises(ValidationError) as caught:
         TypeAdapter(str).validate_python(10**5000)

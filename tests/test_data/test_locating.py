@@ -105,7 +105,7 @@ def own(made: LocalSplit, tmp_path: Path) -> Path:
     return tmp_path / "root" / "own"
 
 
-def test_all_ways_to_name_it(
+def test_a_local_split_is_located_by_path_or_by_name(
     own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is
@@ -138,7 +138,7 @@ def test_all_ways_to_name_it(
     assert "--root" in str(caught.value.where)
 
 
-def test_ours_are_found_as_before(tmp_path: Path) -> None:
+def test_built_in_splits_are_located_in_the_root(tmp_path: Path) -> None:
     """A name of the registry means that split, whatever the root holds."""
     (tmp_path / "cavity").mkdir()
     (tmp_path / "cavity" / "split.yaml").write_text("format: 1")
@@ -232,8 +232,8 @@ def test_a_folder_may_be_moved_but_not_renamed(
 
 
 def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> None:
-    """It is told only when it is asked for; a generator in it, which would be imported,
-    is refused.
+    """An error in it appears only when that split is read; a generator in it, which
+    would be imported, is refused.
     """
     path = own / "split.yaml"
     text = path.read_text()

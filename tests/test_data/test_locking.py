@@ -41,11 +41,10 @@ def other(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         process.kill()
 
 
-def test_a_second_writer_is_told_who_holds_the_lock(
+def test_a_second_writer_learns_who_holds_the_lock(
     tmp_path: Path, other: subprocess.Popen[str]
 ) -> None:
     """With timeout 0 the error names process, host and time at once, exit code 5.
-
     Another size or MAJOR version of the split can be written meanwhile.
     """
     start = time.monotonic()
@@ -133,7 +132,7 @@ def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [".lock", ".lock.holder.json"])
-def test_a_folder_in_the_place_of_a_file_of_the_lock_is_told(
+def test_a_folder_in_the_place_of_a_lock_file_is_named(
     name: str, tmp_path: Path
 ) -> None:
     folder = dataset_folder(tmp_path, "cavity", "tiny", 1)

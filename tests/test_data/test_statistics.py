@@ -21,7 +21,7 @@ from lagbench.data.statistics import (
 from lagbench.errors import DataError
 
 
-def test_by_hand() -> None:
+def test_statistics_of_two_particles_by_hand() -> None:
     """Two particles, three frames, every number worked by hand.
 
     x: 0, 1, 4 and 0, 3, 4, so u: 1, 3 and 3, 1, so a: 2 and -2; y stays 0.5.
@@ -52,7 +52,7 @@ def test_by_hand() -> None:
     assert str(round_digits(-0.0)) == "0.0"
 
 
-def test_against_numpy() -> None:
+def test_statistics_agree_with_numpy() -> None:
     """Several scenarios of unequal length agree with NumPy on the concatenated
     arrays.
     """

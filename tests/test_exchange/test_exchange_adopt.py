@@ -161,8 +161,8 @@ def test_the_same_arrays_give_the_same_split(
 def test_a_local_split_is_verified_templated_and_scored(
     own: LocalSplit, tmp_path: Path
 ) -> None:
-    """Commands take its folder; straight flight is what the constant-velocity floor
-    predicts.
+    """Commands take its folder; the naive baseline constant-velocity predicts straight
+    flight.
     """
     path = str(own.folder)
     assert lagbench.verify(path).verdict == "equal to split.yaml"
@@ -254,7 +254,7 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["npy", "npz", "nc"])
 def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
-    """It is told as such, and not counted among too few."""
+    """The error says that it is empty, and does not say that there are too few."""
     save_runs(tmp_path, straight_runs(2))
     (tmp_path / f"run2.{ending}").touch()
     with pytest.raises(UnreadableFileError) as caught:
@@ -344,7 +344,7 @@ def test_a_lattice_that_flies_far_is_no_exchange(
     assert own_split.frames == 90
 
 
-def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
+def test_one_error_names_all_missing_options(tmp_path: Path) -> None:
     """Radius, frame interval, folder and trajectories."""
     paths = save_runs(tmp_path / "in", straight_runs(2))
     with pytest.raises(UsageError) as caught:
@@ -403,7 +403,9 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(
     assert_allclose(size.bounds, expected)
 
 
-def test_named_arrays(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
+def test_an_npz_file_may_hold_velocities_materials_and_walls(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
     wall_velocity = np.zeros((4, 2))
     wall_velocity[3, 0] = 0.5
@@ -442,7 +444,9 @@ def variable(
     return file.createVariable("position", kind, names)
 
 
-def test_netcdf(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
+def test_netcdf_files_are_adopted_frame_by_frame(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame,
     rounded once.
     """
@@ -467,8 +471,8 @@ def test_netcdf(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
 def test_packed_netcdf_is_refused(
     tmp_path: Path, runs: Runs, adopt_here: Adopt
 ) -> None:
-    """Values that stand for others by scale_factor would be taken for positions: the
-    file is named.
+    """With scale_factor, the stored values are not positions: the error names the
+    file.
     """
     paths = save_runs(tmp_path, runs[:2])
     packed = tmp_path / "packed.nc"
@@ -821,7 +825,9 @@ def test_what_a_user_says_is_checked(
     assert names == ["in"]
 
 
-def test_command(tmp_path: Path, run: Run) -> None:
+def test_the_adopt_command_makes_a_split_that_other_commands_take(
+    tmp_path: Path, run: Run
+) -> None:
     """`lagbench adopt` says what it made, and other commands take the folder it
     names.
     """
@@ -1191,7 +1197,7 @@ def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
         (["x", "z"], 6),
     ],
 )
-def test_a_periodic_axis_without_bounds_is_told_their_form(
+def test_the_fix_for_missing_bounds_shows_their_form(
     tmp_path: Path, axes: list[str], ends: int
 ) -> None:
     """The fix is an option that can be typed."""
@@ -1215,7 +1221,7 @@ def wrapped_run() -> NDArray[np.float32]:
     return (path % 1.0).astype(np.float32)
 
 
-def test_all_axes_along_which_particles_jump_are_told_at_once(
+def test_one_error_names_all_axes_along_which_particles_jump(
     tmp_path: Path, adopt_here: Adopt
 ) -> None:
     """The fix names both axes, also where one is crossed frames later."""
@@ -1231,7 +1237,9 @@ def test_all_axes_along_which_particles_jump_are_told_at_once(
     assert own_split.frames == 120
 
 
-def test_bounds_are_told_for_all_frames(tmp_path: Path, adopt_here: Adopt) -> None:
+def test_the_bounds_of_the_message_hold_all_frames(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
     """Bounds that hold one frame would be refused by a later one."""
     runs = straight_runs(3)
     low = float(runs[0].min())
@@ -1262,7 +1270,7 @@ def test_bounds_of_a_periodic_axis_are_its_period(
     assert str(outside.value.got).startswith("[0, 1] x [5")
 
 
-def test_all_that_a_description_states_wrongly_is_told_at_once(
+def test_one_error_names_all_wrong_values_of_a_description(
     tmp_path: Path,
 ) -> None:
     paths = save_runs(tmp_path / "in", straight_runs(3))
@@ -1308,7 +1316,7 @@ def test_a_periodic_axis_needs_a_name_and_bounds(
         ("licence", "\udcff", "UTF-8"),
     ],
 )
-def test_options_of_a_wrong_kind_are_told_before_any_work(
+def test_options_of_a_wrong_kind_are_refused(
     tmp_path: Path, option: str, value: object, expected: str
 ) -> None:
     """True is no number, a text no list, and a file in UTF-8 holds no other text."""

@@ -254,10 +254,8 @@ def test_an_empty_hdf5_file_of_many_particles_is_refused(
 
 
 @pytest.mark.parametrize("place", [5, 6, 7])
-def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
-    """Whatever HDF5 raises where its structures are overwritten, it becomes an error of
-    ours.
-    """
+def test_damaged_bytes_of_hdf5_raise_errors_of_ours(h5: Path, place: int) -> None:
+    """Any error of HDF5 for overwritten structures becomes one of lagbench."""
     whole = (h5 / "train.h5").read_bytes()
     start = 96 + 100 * place  # past the superblock: headers, heaps and trees
     (h5 / "train.h5").write_bytes(whole[:start] + b"\xad" * 100 + whole[start + 100 :])
@@ -387,7 +385,7 @@ def test_metadata_that_are_a_pipe(tmp_path: Path) -> None:
 def test_damaged_sources_leave_nothing(
     h5: Path, fault: str, error: type[LagbenchError], words: str
 ) -> None:
-    """Each fault is told by name, and no folder is made."""
+    """Each error names its fault, and no folder appears."""
     target = h5 / "test.h5"
     metadata = h5 / "metadata.json"
     changes = {
@@ -433,7 +431,7 @@ def test_damaged_sources_leave_nothing(
 @pytest.mark.parametrize(
     "arrays", [None, {"note": np.array("no trajectory")}, {"run": np.zeros((4, 3))}]
 )
-def test_a_damaged_npz_is_told(
+def test_a_damaged_npz_is_unreadable(
     gns: Path, tmp_path: Path, arrays: dict[str, Any] | None
 ) -> None:
     """Half an npz file, and a member that is no array or no trajectory, are unreadable
@@ -637,7 +635,7 @@ def test_a_header_that_claims_other_values(
 
 
 @pytest.mark.parametrize("fault", ["stream", "encrypted", "method", "version"])
-def test_a_damaged_npz_is_told_when_adopted(tmp_path: Path, fault: str) -> None:
+def test_a_damaged_zip_is_refused_when_adopted(tmp_path: Path, fault: str) -> None:
     """Zip files that are wrong in themselves."""
     bad = tmp_path / "bad.npz"
     with array_file(bad, (12, 40, 2)) as stream:
@@ -711,8 +709,8 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
 def test_odd_parts_of_a_pickled_trajectory(
     gns: Path, tmp_path: Path, parts: tuple[Any, Any]
 ) -> None:
-    """Kinds and a material property that are no numbers are told by the key they stand
-    at.
+    """The errors of kinds and a material property that are not numbers name their
+    key.
     """
     save_parts(gns, *parts)
     with refused(tmp_path, "simulation_0", DataError):

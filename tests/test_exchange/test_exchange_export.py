@@ -532,7 +532,7 @@ def test_a_program_beside_the_data_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["force.py"]
 
 
-def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
+def test_missing_and_exchanged_scenarios_stop_the_export(tmp_path: Path) -> None:
     """A scenario that is not there, and one put in another's place, stop the export
     with their ids.
     """
@@ -555,9 +555,11 @@ def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_command(mixed: LocalSplit, tmp_path: Path, run: Callable[..., Result]) -> None:
-    """`lagbench export` writes where it is told and says what; an unknown format names
-    the nearest.
+def test_the_export_command_counts_trajectories_by_subset(
+    mixed: LocalSplit, tmp_path: Path, run: Callable[..., Result]
+) -> None:
+    """`lagbench export` writes into the folder of its option and prints a summary; an
+    unknown format names the nearest.
     """
     done = run(
         "export",

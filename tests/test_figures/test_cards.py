@@ -370,7 +370,9 @@ def test_a_card_lists_the_variables_of_its_files(
 
 
 def test_the_twin_floor_is_the_mean_over_test(tmp_path: Path) -> None:
-    """Two twins that drift to 2e-3 and 4e-3 have a floor of 3e-3 at the last frame."""
+    """Two perturbed runs that drift to 2e-3 and 4e-3 have a limit of 3e-3 at the last
+    frame.
+    """
     size, manifest = make(tmp_path, scenarios=(3, 4))
     floors = ((1e-6, 2e-3), (3e-6, 4e-3))
     files = []

@@ -420,7 +420,7 @@ def test_reference_predictors_have_no_rank(home: Path, tmp_path: Path) -> None:
     assert set(ranks[2:]) == {""}
 
 
-def test_methods_of_one_name_are_told_apart(home: Path, tmp_path: Path) -> None:
+def test_methods_of_one_name_are_numbered(home: Path, tmp_path: Path) -> None:
     """Two files of one method get numbers, and so does a reference predictor's name."""
     bench = make_report_bench(home, "curl-noise")
     methods = (

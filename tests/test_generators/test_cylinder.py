@@ -108,7 +108,7 @@ def test_no_fluid_flows_through_the_disc_at_the_start() -> None:
 
 
 @pytest.mark.slow
-def test_the_disc_is_told_and_no_particle_enters_it(
+def test_windows_state_the_disc_and_no_particle_enters_it(
     tiny_split: Callable[..., GenerationResult],
 ) -> None:
     """Windows, `open_split` and the references get centre and radius; in all frames the

@@ -270,7 +270,7 @@ def list_sums(source: str) -> list[str]:
         "import builtins; total = builtins.sum(values)",
     ],
 )
-def test_other_names_of_sums_are_seen(source: str) -> None:
+def test_other_names_of_sums_are_detected(source: str) -> None:
     """A mean of the standard library adds up as its version of Python does."""
     assert list_sums(source)
     assert not list_sums("import functools; total = np.mean(values)")

@@ -189,7 +189,7 @@ def test_friction_decelerates_by_mu_g() -> None:
     assert braked == pytest.approx(0.3 * 2.5, rel=0.1)
 
 
-def test_walls_hold_and_health_tells() -> None:
+def test_walls_contain_particles_and_health_reports_extremes() -> None:
     """Nothing leaves the box; health reports the extremes of the last advance."""
     towards_corner = (-2.0, -2.0)
     centre = (0.25, 0.25)

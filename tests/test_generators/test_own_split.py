@@ -57,7 +57,7 @@ def line_of(module_file: Path, text: str) -> str:
         ("open('/no/such/file')", "FileNotFoundError"),
     ],
 )
-def test_an_exception_of_initial_state_is_told_with_file_and_line(
+def test_an_exception_of_initial_state_names_file_and_line(
     change: str, kind: str, package: Install
 ) -> None:
     """The line is the last one of the user's module, not one of NumPy or of ours."""
@@ -70,10 +70,10 @@ def test_an_exception_of_initial_state_is_told_with_file_and_line(
 
 
 @pytest.mark.parametrize("bound", ["float('nan')", "1e9"])
-def test_a_drawn_value_without_exact_form_is_told_with_file_and_line(
+def test_a_drawn_value_without_exact_form_names_file_and_line(
     bound: str, package: Install
 ) -> None:
-    """The message said "check the ranges in datasets.yaml", which is ours."""
+    """The fix names the user's file of ranges, not datasets.yaml of lagbench."""
     change = f"uniform(rng, 0.2, {bound})"
     size, module_file = own_size(package, WIDTH, change)
     with pytest.raises(WorkFailedError) as caught:
@@ -84,7 +84,7 @@ def test_a_drawn_value_without_exact_form_is_told_with_file_and_line(
     assert str(size.file) in str(caught.value.fix)
 
 
-def test_a_parameter_that_is_not_there_is_told_with_both_places(
+def test_a_missing_parameter_names_both_places(
     package: Install,
 ) -> None:
     """The file that lacks it, and the line that asks for it."""
@@ -97,7 +97,7 @@ def test_a_parameter_that_is_not_there_is_told_with_both_places(
     assert line_of(module_file, change) in where
 
 
-def test_an_exception_of_solver_parameters_is_told_with_file_and_line(
+def test_an_exception_of_solver_parameters_names_file_and_line(
     package: Install,
 ) -> None:
     size, module_file = own_size(package, CONSTANTS, "no_constants")
@@ -106,7 +106,7 @@ def test_an_exception_of_solver_parameters_is_told_with_file_and_line(
     assert caught.value.where == line_of(module_file, "no_constants")
 
 
-def test_a_module_that_fails_at_import_is_told_with_file_and_line(
+def test_a_module_that_fails_at_import_names_file_and_line(
     package: Install,
 ) -> None:
     size, module_file = own_size(package, "GAP = 0.01", "GAP = 0.01 / 0")

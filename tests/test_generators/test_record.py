@@ -107,7 +107,7 @@ def test_statistics_are_computed_anew(
 def test_recording_again_changes_no_byte(
     generated: GenerationResult, registry: Path
 ) -> None:
-    """The same data set gives the same text, here and by the command, which tells the
+    """The same data set gives the same text, here and by the command, which prints the
     hash.
     """
     run(generated.root, registry)
@@ -222,9 +222,8 @@ def test_incomplete_or_changed_data_are_not_recorded(
 
 def test_no_released_hash_has_changed() -> None:
     """Bits of a split, size and MAJOR never change; a measured size is whole.
-
     datasets.yaml and the list of released hashes agree; there is a hash of every
-    scenario and a floor for every predicted frame.
+    scenario and a predictability limit for every predicted frame.
     """
     registry = load(default_path())
     released = json.loads(RELEASED.read_text())

@@ -132,7 +132,7 @@ def test_grid_rates_of_rotation_and_expansion() -> None:
     assert math.isnan(at_rest.ratio)
 
 
-def test_energies() -> None:
+def test_energies_by_hand() -> None:
     """Two particles of mass 2 at speeds 3 and 4: E = 25; a displacement counts per
     frame.
     """

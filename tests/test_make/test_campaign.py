@@ -74,10 +74,10 @@ def test_all_hashes_are_compared(
         assert caught.value.exit_code == 4
 
 
-def test_equal_hashes_are_told(
+def test_equal_hashes_give_the_verdict_equal(
     copied: Copy, unmeasured: Registry, right: Measured
 ) -> None:
-    """All hashes hold: the verdict says so and nothing is simulated."""
+    """All hashes agree with datasets.yaml, and nothing is simulated."""
     result = generate(
         SPLIT,
         SIZE,
@@ -89,7 +89,7 @@ def test_equal_hashes_are_told(
 
 
 @pytest.mark.slow
-def test_a_forged_file_is_made_anew(
+def test_a_forged_file_is_simulated_again(
     copied: Copy, unmeasured: Registry, generated: GenerationResult
 ) -> None:
     """Without a recorded hash the manifest's counts: a file that agrees with itself is
@@ -109,7 +109,7 @@ def change_manifest(root: Path, **changes: object) -> None:
     write_manifest(root, manifest.model_copy(update=changes))
 
 
-def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
+def test_another_machine_has_tolerance_until_its_hashes_agree(
     copied: Copy, unmeasured: Registry, right: Measured
 ) -> None:
     """Without a recorded hash nothing shows that the bits are equal; the card says it
@@ -128,7 +128,7 @@ def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
     assert "same bits on every" in card_of(root)
 
 
-def test_other_bits_of_another_machine_are_kept_and_told(
+def test_other_bits_of_another_machine_stay_and_count_as_tolerance(
     tmp_path: Path,
     unmeasured: Registry,
     right: Measured,
@@ -204,8 +204,8 @@ def test_paths_of_a_manifest_are_not_published(
 def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bytes are read once, progress is told meanwhile, and cards that would be the same
-    stay.
+    """Bytes are read once, progress is reported meanwhile, and cards that would be the
+    same stay.
     """
     root = copied()
     read: Counter[str] = Counter()
@@ -264,7 +264,7 @@ def test_values_are_hashed_once(
 
 
 @pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
-def test_a_card_that_is_gone_or_changed_is_made_anew(
+def test_a_missing_or_changed_card_is_written_again(
     name: str, copied: Copy, unmeasured: Registry
 ) -> None:
     """Only cards that are there and the same are left alone."""

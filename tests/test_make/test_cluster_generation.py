@@ -209,8 +209,8 @@ def test_a_folder_that_workers_do_not_share(
 
 
 def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
-    """No folder at all is told as such; a mark that is seen late, its name before its
-    word, is waited for.
+    """The error says that there is no folder. A mark file that appears late, its name
+    before its content, is awaited.
     """
     with pytest.raises(WorkFailedError) as caught:
         FolderMark(tmp_path / "none" / "mark", "word", 0.0).check("w")

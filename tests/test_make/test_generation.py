@@ -199,7 +199,7 @@ def test_active_frames_stand_in_the_file_and_its_hash(
             check_scenario(path)
 
 
-def test_facts_of_the_manifest_follow_from_the_files(
+def test_diagnostics_of_the_manifest_follow_from_the_files(
     generated: GenerationResult, unmeasured: Registry
 ) -> None:
     """Energies are sums over the stored velocities; speed, CFL number and J stay in
@@ -256,7 +256,7 @@ def test_resuming_makes_what_is_missing_or_wrong(
     unmeasured: Registry,
     generated: GenerationResult,
 ) -> None:
-    """A removed and a damaged scenario are made anew by one worker; then all bytes are
+    """One worker simulates a removed and a damaged scenario again; then all bytes are
     as before.
     """
     root = copied()
@@ -336,14 +336,12 @@ def test_force_simulates_what_is_there(
     assert kernel_files
 
 
-def test_files_of_other_parameters_are_made_anew(
+def test_files_of_other_parameters_are_simulated_again(
     copied: Callable[[], Path],
     unmeasured_path: Path,
     tmp_path: Path,
 ) -> None:
-    """Whoever changes a parameter of an unreleased split does not keep files of the old
-    one.
-    """
+    """A changed parameter of an unreleased split keeps no file of the old one."""
     text = unmeasured_path.read_text()
     old = "velocity_relaxation: {value: 0.002"
     assert old in text
@@ -363,7 +361,7 @@ def test_files_of_other_parameters_are_made_anew(
 def test_a_dry_run_touches_nothing(
     tmp_path: Path, unmeasured: Registry, generated: GenerationResult
 ) -> None:
-    """It tells bytes (an upper bound, not by much), time and free disk, and makes no
+    """It prints bytes (an upper bound, not by much), time and free disk, and makes no
     folder.
     """
     result = generate(
@@ -618,7 +616,7 @@ def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> Non
 def test_a_split_that_hides_its_first_frame_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A late start without the function that tells of it would be planned too short."""
+    """Without the function for a late start, the plan would count too few frames."""
     (tmp_path / "late_cavity.py").write_text(
         "from lagbench.generators.cavity import initial_state, solver_parameters\n"
     )

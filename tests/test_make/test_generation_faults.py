@@ -71,7 +71,7 @@ def manifest_of(root: Path) -> Manifest:
         ({"workers": "2"}, "a whole number without quotes: workers=2"),
     ],
 )
-def test_bad_input(
+def test_wrong_requests_are_refused_before_any_work(
     options: dict[str, Any], message: str, tmp_path: Path, unmeasured: Registry
 ) -> None:
     """Wrong names, ids and numbers are usage errors that say what is known, before
@@ -105,7 +105,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_disk_too_small_is_refused_at_once(
     small_disk: Path, unmeasured: Registry
 ) -> None:
-    """The message tells bytes needed and free; nothing is written."""
+    """The message states bytes needed and free; nothing is written."""
     with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=small_disk, registry=unmeasured)
     assert caught.value.where.endswith("/disk")
@@ -155,7 +155,9 @@ def test_a_worker_on_a_full_disk_names_the_file(
 def test_two_generations_at_once(
     tmp_path: Path, unmeasured: Registry, generated: GenerationResult
 ) -> None:
-    """The second waits, is told for whom, and then finds everything there."""
+    """The second waits, names the process that it waits for, and then finds all
+    files.
+    """
     told: list[str] = []
     options: dict[str, Any] = {
         "root": tmp_path,
@@ -237,8 +239,8 @@ def children(process: int) -> list[int]:
 def test_kernels_that_cannot_be_kept_stop_nothing(
     tmp_path: Path, unmeasured_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where Taichi's cache cannot be made, as in a read-only home, the data are made in
-    silence.
+    """Without a writable cache of Taichi, as in a read-only home, the command makes the
+    data and prints no error.
     """
     (tmp_path / "file").touch()
     monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path / "file" / "cache"))

@@ -268,8 +268,8 @@ def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
 def test_a_cache_that_cannot_be_written_is_no_loss(
     cache: Path, tmp_path: Path, unmeasured: Registry
 ) -> None:
-    """The data set is made all the same, and another device's rate is not taken for
-    this one's.
+    """The data set is made all the same, and the rate of another device does not count
+    for this one.
     """
     cache.write_text("a file")
     result = generate(

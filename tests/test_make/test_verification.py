@@ -197,8 +197,8 @@ def test_harm_is_named(
 def test_a_forger_who_mends_the_file_is_caught(
     copied: Copy, measured: Registry, unmeasured: Registry
 ) -> None:
-    """A file that agrees with itself is held against datasets.yaml, where there is none
-    the manifest.
+    """A file that agrees with itself is compared with datasets.yaml or, where that has
+    no hash, with the manifest.
     """
     root = copied()
     path = file_of(root)
@@ -308,8 +308,8 @@ def test_other_bits_of_other_machines_are_warnings(
 def test_the_data_set_hash_is_compared_too(
     generated: GenerationResult, measured: Registry
 ) -> None:
-    """A registry whose scenario hashes hold but whose data set hash does not is
-    told.
+    """A registry with right hashes of scenarios and a wrong hash of the data set is an
+    error.
     """
     registry = told_otherwise(
         measured,
@@ -327,8 +327,8 @@ def test_the_data_set_hash_is_compared_too(
 def test_strangers_and_a_lying_manifest_are_warnings(
     copied: Copy, measured: Registry
 ) -> None:
-    """Files of no scenario, a manifest that says otherwise, and one marked tolerance
-    are told.
+    """Files of no scenario, a manifest of other hashes, and one marked tolerance have a
+    warning each.
     """
     root = copied()
     file_of(root, "test/0099").write_bytes(b"mine")
@@ -375,8 +375,8 @@ def test_simulating_anew_is_identical(
 def test_simulating_anew_needs_no_file_but_a_hash(
     tmp_path: Path, measured: Registry, unmeasured: Registry
 ) -> None:
-    """A missing scenario is held against datasets.yaml; without a hash there is nothing
-    to compare.
+    """A missing scenario is compared with datasets.yaml; without a hash there is
+    nothing to compare.
     """
     wrong = told_otherwise(measured, scenario_sha256={2: "0" * 16})
     for word, registry in (
@@ -396,7 +396,7 @@ SORTED_IDS = st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted)
 
 @given(SORTED_IDS, st.integers(0, 80))
 def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
-    """As many distinct ids as asked for (or all), ascending, first and last included,
+    """As many distinct ids as requested (or all), ascending, first and last included,
     gaps alike.
     """
     chosen = evenly_spaced(ids, count)

@@ -375,7 +375,9 @@ def cloud(seed: int, particles: int = 40) -> Floats:
 
 
 @given(st.integers(0, 99), SHIFT, SHIFT)
-def test_a_shift_is_told_by_its_length(seed: int, dx: float, dy: float) -> None:
+def test_the_distance_of_a_shift_follows_from_its_length(
+    seed: int, dx: float, dy: float
+) -> None:
     """Shifted by s: every projection moves by s.d, and the mean of its square is |s|^2
     / 2.
     """
@@ -521,9 +523,7 @@ def test_cloud_distance_asks_for_materials_not_for_particles() -> None:
 
 def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     """Entropic transport debiased by its own terms leaves |s|^2 for a shift by s, 0 for
-    none.
-
-    It is measured when asked for only, and without its package the error has the
+    none. It is measured on request only, and without its package the error has the
     command that installs it.
     """
     by_default = {metric.name for metric in select()}

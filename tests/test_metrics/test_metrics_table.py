@@ -236,9 +236,8 @@ def test_a_horizon_beyond_the_series_is_undefined() -> None:
 
 
 def test_tallies_add() -> None:
-    """A worker that was taken for lost and comes back adds weight, not error.
-
-    Other frames or statistics are refused, and so is a value without a place.
+    """A worker that counted as lost and comes back adds weight, not error. Other frames
+    or statistics are refused, and so is a value without a place.
     """
     twice = tallied() + tallied()
     once = tallied()
@@ -292,7 +291,7 @@ def scores(size: float) -> dict[str, Score]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_metric_is_told(name: str) -> None:
+def test_every_metric_has_a_full_description(name: str) -> None:
     """Name, family, unit, direction and source are well formed; the summary is one line
     without a stop.
     """
@@ -455,11 +454,9 @@ def test_our_metrics_are_registered_as_those_of_others_are(
 def test_a_bad_entry_point_is_left_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
 ) -> None:
-    """A taken name, no metric, or one of statistics that nothing measures: one warning
-    names the package, and the other metrics are there.
-
-    A module that would end the program, with exit code 0 and nothing done, is told
-    likewise.
+    """A name in use, no metric, or one of statistics that nothing measures: one warning
+    names the package, and the other metrics are there. So it is with a module that
+    would end the program, with exit code 0 and nothing done.
     """
     (tmp_path / "leaving.py").write_text("raise SystemExit")
     monkeypatch.syspath_prepend(tmp_path)
@@ -555,12 +552,10 @@ STRANGE: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize(("what", "function"), STRANGE)
-def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> None:
-    """A metric of another package that gives something else is named, and where it
-    comes from, with any note.
-
-    Whether it is defined must be true or false: a forgotten return would leave out
-    every frame.
+def test_a_value_that_is_no_number_names_its_metric(what: str, function: Any) -> None:
+    """The error for a metric of another package names the metric, its module, and any
+    note. Whether a value is defined must be true or false: a forgotten return would
+    leave out every frame.
     """
     bad = replace(OTHERS, **{what: function})
     with pytest.raises(WorkFailedError) as caught:
@@ -574,7 +569,9 @@ def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> 
 
 
 def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
-    """As a ufunc or a partial, whose name is told too; what is not defined is NaN."""
+    """Such as a ufunc or a partial, whose name is in the error too; undefined values
+    are NaN.
+    """
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
     without_module = replace(OTHERS, statistic=bare)
     with pytest.raises(WorkFailedError) as caught:
@@ -586,10 +583,10 @@ def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
 
 @pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
 @pytest.mark.parametrize("left", [SystemExit(0), KeyError("mine")])
-def test_all_that_a_metric_does_is_told_with_its_name(
+def test_an_error_in_any_function_of_a_metric_names_the_metric(
     what: str, left: BaseException
 ) -> None:
-    """Not its statistic alone; nothing of it ends the program."""
+    """No error of a metric ends the program, in its statistic or elsewhere."""
 
     def fail(*_: object) -> Any:
         raise left

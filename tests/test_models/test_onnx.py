@@ -121,9 +121,8 @@ def test_a_greedy_model_is_stopped(
     tmp_path: Path,
     generated: GenerationResult,
 ) -> None:
-    """Memory and processor time are bounded, whatever the graph computes.
-
-    However many frames it is asked for: the time of this process and its children.
+    """Memory and processor time are bounded, whatever the graph computes, for any
+    number of frames: the time of this process and its children.
     """
     model = opened(make(tmp_path / "model.onnx"), generated)
     started = processor_time()
@@ -288,7 +287,7 @@ def test_an_exported_step_sees_the_viscosity(
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
-def test_what_an_onnx_model_is_not_given_is_told(
+def test_the_error_names_the_inputs_of_an_onnx_model(
     tmp_path: Path, generated: GenerationResult
 ) -> None:
     def step(window: Batch) -> torch.Tensor:
@@ -319,7 +318,7 @@ def test_what_an_onnx_model_is_not_given_is_told(
         ({"modules": [3]}, "export_onnx, modules"),
     ],
 )
-def test_arguments_that_do_not_fit_an_export_are_told(
+def test_arguments_that_do_not_fit_an_export_are_refused(
     changes: dict[str, Any],
     where: str,
     tmp_path: Path,
@@ -343,7 +342,7 @@ def test_arguments_that_do_not_fit_an_export_are_told(
 @pytest.mark.parametrize(
     "device", ["", "gpu", "cuda:999", "meta", -1, 10**30, "a\0b", np.array(2)]
 )
-def test_a_device_that_is_not_there_is_told(
+def test_a_device_that_does_not_exist_is_a_usage_error(
     device: Any, generated: GenerationResult
 ) -> None:
     """Torch has several kinds of errors for that."""

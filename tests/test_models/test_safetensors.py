@@ -93,7 +93,7 @@ def test_the_checks_run_in_a_child(sound: Path) -> None:
     "options",
     [{"latent": None}, {"latent": 0}, {"lattent": 8}, {3: 8}, {"noise_std": "much"}],
 )
-def test_options_that_do_not_fit_are_told(
+def test_options_that_do_not_fit_have_an_error_of_all_parts(
     options: dict[Any, Any], generated: GenerationResult
 ) -> None:
     """With all parts of a message, as those of a recipe."""

@@ -552,7 +552,7 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
 
 @pytest.mark.slow
 def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
-    """It goes the way of a solver that is told each frame's walls, to the bit."""
+    """It has the bits of a solver that gets the walls of each frame."""
     size = load().size("cavity", "tiny")
     n = size.task.input_frames
     frame_count = n + size.task.horizon

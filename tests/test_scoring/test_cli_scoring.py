@@ -242,7 +242,7 @@ def test_compare_refuses_an_unknown_metric(run: Run, predictions: Path) -> None:
 def test_other_files_of_lagbench_are_no_predictions(
     run: Run, predictions: Path, generated: GenerationResult
 ) -> None:
-    """The validation says so in one finding."""
+    """The validation reports one issue for it."""
     run("score", predictions)
     scores = predictions.with_suffix("") / "scores.nc"
     scenario = next(generated.folder.glob("test/*.nc"))
@@ -454,7 +454,7 @@ def test_foreign_text_does_not_reach_the_terminal(
     assert "\a" not in result.output
 
 
-def test_a_template_whose_name_is_no_utf_8_is_told(
+def test_a_template_whose_name_is_not_utf_8_is_refused(
     generated: GenerationResult, tmp_path: Path
 ) -> None:
     """The library of netCDF writes no such file."""

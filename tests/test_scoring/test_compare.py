@@ -799,9 +799,7 @@ def row_name(row: Sequence[str]) -> str:
     return name
 
 
-def test_a_cost_is_told_as_the_predictions_state_it(
-    bench: ScoreBench, tmp_path: Path
-) -> None:
+def test_the_cost_is_that_of_the_predictions(bench: ScoreBench, tmp_path: Path) -> None:
     """The score measures no cost: the line names the machine, and who says so."""
     labels = {"seconds_per_frame": 0.25, "device": "a laptop, 2 threads"}
     path = bench.submit(tmp_path / "predictions.nc", still, **labels)
@@ -852,7 +850,7 @@ def test_the_whole_table_shows_all_metrics_and_references(
     assert len(whole.columns) == len(card.scores) + 1
 
 
-def test_lines_below_the_tables_tell_flags_and_undefined_frames(
+def test_lines_below_the_tables_state_flags_and_undefined_frames(
     half_right_card: ScoreCard,
 ) -> None:
     lines = flag_lines(half_right_card)
@@ -984,7 +982,7 @@ def test_a_file_that_is_too_long_is_refused_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["", ".json"])
-def test_a_name_that_is_too_long_is_told(tmp_path: Path, suffix: str) -> None:
+def test_a_name_that_is_too_long_is_a_usage_error(tmp_path: Path, suffix: str) -> None:
     """No disk has such a file, so it is a mistake of the call."""
     name = "x" * 300 + suffix
     with pytest.raises(UsageError) as caught:

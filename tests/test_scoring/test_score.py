@@ -400,7 +400,7 @@ def test_a_misspelt_extra_is_refused(bench: ScoreBench, predictions: Path) -> No
     assert caught.value.where == "--extras"
 
 
-def test_an_extra_that_is_not_installed_is_told_before_the_work(
+def test_an_extra_that_is_not_installed_is_refused_before_the_work(
     bench: ScoreBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is validated or measured first."""
@@ -557,7 +557,7 @@ def test_what_is_no_own_metric_is_refused(
     assert None not in (error.where, error.expected, error.got, error.fix)
 
 
-def test_an_own_metric_that_fails_is_told(bench: ScoreBench, tmp_path: Path) -> None:
+def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) -> None:
     """The error is raised from that of the function; no warning hides it."""
 
     def broken(pair: FramePair) -> float:

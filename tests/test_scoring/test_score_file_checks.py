@@ -136,7 +136,7 @@ def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> No
 def test_the_child_is_limited_and_started_anew(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It tells which file is damaged; a file that stops it costs that file only."""
+    """It names the damaged file; a file that stops it costs that file only."""
     good = own.folder / SCORES / "noisy.nc"
     bad = own.folder / SCORES / "flipping.nc"
     bad.write_bytes(bad.read_bytes()[:5000])
@@ -155,7 +155,7 @@ def test_the_child_is_limited_and_started_anew(
 def test_many_files_that_stop_the_child_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a few stops the rest is left unread, and every file has its finding."""
+    """After a few stops the rest is left unread, and every file has its issue."""
     use_child(
         monkeypatch, tmp_path, "open('starts', 'a').write('x'); import os; os.abort()"
     )

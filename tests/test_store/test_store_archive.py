@@ -230,7 +230,7 @@ def test_without_a_release_no_server_is_asked(
         "x" * 5000,
     ],
 )
-def test_an_address_of_releases_that_is_none_is_told(
+def test_an_invalid_address_of_releases_is_refused(
     releases: str, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message has all parts, no password, and no megabyte of what was set."""
@@ -402,7 +402,7 @@ def test_an_archive_is_read_through_fsspec(server: Mirror, here: Path) -> None:
 
 
 def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) -> None:
-    """A store that has files is not asked for an archive."""
+    """From a store that has files, no archive is requested."""
     with serving(original.folder.parent) as running:
         assert fetch_own(running.url, here).complete
         assert running.count(".tar") == 0
@@ -418,7 +418,7 @@ def requested_ranges(server: Mirror) -> list[str | None]:
 
 
 @pytest.mark.parametrize("fault", ["", "no ranges"])
-def test_only_missing_members_are_asked_for(
+def test_only_missing_members_are_requested(
     server: Mirror, here: Path, fault: str
 ) -> None:
     """The others are passed over, or read and dropped where there are no ranges."""

@@ -95,7 +95,7 @@ def test_all_files_come_and_are_right(
     assert download("own", root=here, mirror=store.url).kept == (0, 1, 2, 3)
 
 
-def test_what_is_there_is_kept(store: Store, here: Path) -> None:
+def test_existing_files_are_not_fetched_again(store: Store, here: Path) -> None:
     """A second download asks for what is missing or damaged, and for nothing else."""
     download("own", root=here, mirror=store.url, subset="train")
     train = here / "own/full/v1/train"
@@ -112,7 +112,9 @@ def test_what_is_there_is_kept(store: Store, here: Path) -> None:
 def test_half_a_file_is_completed(
     store: Store, here: Path, original: LocalSplit
 ) -> None:
-    """What an interrupted call left under its temporary name is not asked for again."""
+    """The part that an interrupted call left under its temporary name is not requested
+    again.
+    """
     whole = (original.folder / "full/v1" / FIRST).read_bytes()
     half = fetch.partial_name(here / "own/full/v1" / FIRST)
     half.parent.mkdir(parents=True)
@@ -170,9 +172,11 @@ def test_wrong_objects_are_refused(
     assert download("own", root=here, mirror=store.url).complete
 
 
-def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
-    """A store whose manifest has other content hashes, or is none, is refused before
-    files are asked for.
+def test_another_data_set_is_refused_before_files_are_fetched(
+    store: Store, here: Path
+) -> None:
+    """So it is with a store whose manifest has other content hashes, or is no
+    manifest.
     """
     np.save(
         here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9))
@@ -295,10 +299,8 @@ def test_an_interrupted_download_goes_on(
     name: str,
     fault: str,
 ) -> None:
-    """What came before the connection was lost, or given up, is not asked for again by
-    the next command.
-
-    A hundred bytes a second are below the least rate.
+    """The next command does not request the bytes again that came before the connection
+    ended. A hundred bytes a second are below the least rate.
     """
     monkeypatch.setattr(fetch, "RATE_SECONDS", 0.3)
     monkeypatch.setattr(fetch, "MOST_ATTEMPTS", 1)
@@ -379,7 +381,7 @@ def test_no_store_at_all(here: Path) -> None:
     ],
 )
 def test_what_is_no_address(here: Path, address: str) -> None:
-    """It is told at once, as the user's, and names what was typed."""
+    """The error comes at once, is a usage error, and shows the typed text."""
     with pytest.raises(UsageError) as caught:
         download("own", root=here, mirror=address, or_generate=False)
     assert str(caught.value.where).startswith(address)
@@ -397,7 +399,7 @@ def test_what_is_no_address(here: Path, address: str) -> None:
         "file://",
     ],
 )
-def test_what_is_no_address_is_told_where_no_file_is_missing(
+def test_an_invalid_address_is_refused_even_where_no_file_is_missing(
     address: str, generated: GenerationResult, tmp_path: Path
 ) -> None:
     """Neither data that are there nor a simulation hide the mistake."""
@@ -407,7 +409,7 @@ def test_what_is_no_address_is_told_where_no_file_is_missing(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_address_of_a_folder_is_told(
+def test_the_message_shows_the_address_of_a_folder(
     here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -418,9 +420,7 @@ def test_the_address_of_a_folder_is_told(
 
 
 def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
-    """A folder of any name can be asked for; what is encoded already is asked for as it
-    stands.
-    """
+    """A folder may have any name; an encoded address is requested as it is."""
     for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
         with pytest.raises(objects.NotInStoreError):
             download(
@@ -453,7 +453,9 @@ def test_simulated_splits_come_from_a_store_or_are_simulated(
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()
 
 
-def test_command(server: Mirror, here: Path) -> None:
+def test_the_download_command_counts_files_by_origin(
+    server: Mirror, here: Path
+) -> None:
     """`lagbench download` says what came from where; a lie is exit code 4."""
     arguments = ["download", "--split", str(here / "own"), "--from", server.url]
     done = CliRunner().invoke(app, arguments)

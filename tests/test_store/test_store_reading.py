@@ -238,7 +238,7 @@ def test_verify_mends_the_copy(store: Store, tiny: Registry) -> None:
 
 
 def test_verify_names_an_object_that_is_gone(store: Store, tiny: Registry) -> None:
-    """A server that lists nothing cannot tell."""
+    """A server that lists nothing cannot show it."""
     assert_verified(store.url, tiny)
     store.remove(f"{FOLDER}/valid/0002.nc")
     if not store.server:

@@ -84,9 +84,11 @@ REFUSALS: dict[
 
 
 @pytest.mark.parametrize("why", REFUSALS)
-def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
-    """No or wrong credentials, no answer, no library: what is missing, and where to put
-    it, is said.
+def test_every_refusal_of_a_store_has_its_error(
+    s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    """No or wrong credentials, no answer, no library: the error says what is missing,
+    and where to put it.
     """
     harm, error, words = REFUSALS[why]
     harm(monkeypatch)
@@ -104,7 +106,7 @@ def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
 
 
 @pytest.mark.parametrize("root", ["http://host/data", "nonsense://data/x"])
-def test_where_nothing_can_be_written_nothing_is_kept(
+def test_a_store_that_cannot_be_written_gets_no_working_copy(
     root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The address is judged before its working copy is made."""

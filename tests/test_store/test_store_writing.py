@@ -328,7 +328,7 @@ def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
     assert again.kept == (0, 1, 2, 3)
 
 
-def test_what_was_made_anew_is_not_fetched_back(
+def test_a_file_simulated_again_is_not_fetched_back(
     full: str, unmeasured: Registry, simulated_here: Fill
 ) -> None:
     """A file of other bytes replaces the object, and no old one comes over it."""

@@ -1021,7 +1021,7 @@ def test_a_scenario_of_another_hash_is_refused(
     assert caught.value.where == str(path)
 
 
-def test_a_changed_value_is_noticed_where_asked(tmp_path: Path, train: Open) -> None:
+def test_verify_refuses_a_changed_value(tmp_path: Path, train: Open) -> None:
     """The file states its old hash; without the check its values are read as they are.
 
     Files that were hashed are noted, and a change after that is noticed too.

@@ -181,7 +181,7 @@ def test_an_inactive_entry_takes_no_part(
 
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
-def test_an_entry_tells_what_its_record_tells(split: str, tmp_path: Path) -> None:
+def test_an_entry_states_what_its_record_states(split: str, tmp_path: Path) -> None:
     """Of our committed entries: hours, steps, epochs, recipe and validations are the
     same without records.
     """
@@ -233,8 +233,8 @@ def test_scores_of_other_data_are_left_out(runs: Path) -> None:
 def test_runs_of_another_recipe_are_a_variant(
     runs: Path, cavity: ScoreBench, tmp_path: Path
 ) -> None:
-    """What lies in tiny-short/ is gns-short beside the others, and gns where that
-    recipe is asked for.
+    """A run in tiny-short/ is gns-short beside the others, and gns with the option for
+    that recipe.
     """
     short = tmp_path / SPLIT / f"{SIZE}-short"
     gns = runs / SPLIT / SIZE / "gns-0"
@@ -267,7 +267,7 @@ def page_of(sources: Sources) -> str:
     return results.render(sources, (SIZE,))
 
 
-def test_the_page_tells_what_there_is(sources: Sources) -> None:
+def test_the_page_shows_models_skill_and_training(sources: Sources) -> None:
     """Models stand best first with their skill, the thesis's numbers and their training
     beside them.
     """
@@ -365,8 +365,8 @@ def test_the_page_works_without_entries(
     tmp_path: Path,
     floor: bool,
 ) -> None:
-    """Nothing on the board, or floors alone: a page without claims that names the
-    command for every size.
+    """Without entries, or with reference predictors alone: a page without claims that
+    names the command for every size.
     """
     if floor:
         run = plan.folder(SPLIT, "gns", 0)
@@ -582,7 +582,7 @@ def test_a_reader_that_leaves_stops_nothing() -> None:
     assert child.returncode == 0
 
 
-def test_what_fails_is_said_and_the_rest_is_made(
+def test_a_table_that_fails_is_named_and_others_are_written(
     plan: Plan, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without the data of another split its tables fail with exit code 4; others are
@@ -598,8 +598,8 @@ def test_what_fails_is_said_and_the_rest_is_made(
 def test_side_by_side_as_one_after_the_other(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two workers leave the weights that one leaves; what fails is told, and the others
-    are made.
+    """Two workers leave the weights that one leaves; an error names the run that
+    failed, and the others are made.
     """
     short = {
         "settings": ("training.steps=2", "training.validate_every=0"),
@@ -646,7 +646,7 @@ def test_an_interrupt_says_how_to_go_on(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not of_this_turn([0], turns=3, shift=1), reason="not in this turn")
-def test_everything_is_made_at_tiny(
+def test_all_tables_and_figures_are_written_at_tiny(
     tmp_path: Path,
     unmeasured: Registry,
     tiny_split: Callable[..., GenerationResult],

@@ -78,7 +78,7 @@ def label(file: Path, **labels: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_there_is_what_was_asked_for(
+def test_runs_of_another_recipe_or_other_data_are_not_reused(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A run with another recipe or on other data ends the command; scores of other data
@@ -117,16 +117,14 @@ def test_what_is_there_is_what_was_asked_for(
     assert reproduce(*ONLY, *steps) == 4
 
 
-def test_studies_are_what_was_asked_for(
+def test_studies_of_another_recipe_are_not_reused(
     generated: GenerationResult,
     unmeasured: Registry,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Errors of an MLP with another recipe are not taken for those that were asked for.
-
-    What a row came to lies in one file, which suffices for its table, unless it is of
-    other data.
+    """Errors of an MLP with another recipe are measured again. One file holds the
+    results of a row and suffices for its table, unless it is of other data.
     """
     monkeypatch.setitem(TABLES, "table_4_2", ("4.2", SPLIT))
     for module in (runs, tables):
@@ -234,11 +232,11 @@ def test_a_recipe_that_no_model_has_is_a_mistake(
     assert "left out" not in output
 
 
-def test_the_way_to_full_is_told_without_data(
+def test_plans_for_full_are_listed_without_data(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """For full, list and dry run name what is made, with the short recipes and with the
-    thesis's own.
+    """For full, list and dry run name each run, with the short recipes and with those
+    of the thesis.
     """
     places = (
         *("--size", "full"),

@@ -146,9 +146,7 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
 
 
 def test_a_sound_file_opens_the_truth_once(bench: Bench) -> None:
-    """Three scenarios whose first frames tell all that the checks ask: three
-    openings.
-    """
+    """The checks need only the first frames of three scenarios: three openings."""
     with mock.patch.object(
         Truth, "open", autospec=True, side_effect=Truth.open
     ) as opened:
@@ -157,7 +155,7 @@ def test_a_sound_file_opens_the_truth_once(bench: Bench) -> None:
     assert [scenario for (_, scenario), _ in opened.call_args_list] == [3, 4, 5]
 
 
-def test_all_findings_are_reported_together(bench: Bench) -> None:
+def test_all_issues_are_reported_together(bench: Bench) -> None:
     """No method, a missing scenario, a NaN and a stale hash in one run, in the order of
     the checks.
     """
@@ -232,7 +230,7 @@ def test_check_raises_the_error_of_the_exit_code(
     bench.validate(bench.valid).check()
 
 
-def test_findings_read_as_what_where_expected_got_fix(bench: Bench) -> None:
+def test_issues_read_as_what_where_expected_got_fix(bench: Bench) -> None:
     """Each part has a line of its own, after severity and name of the check."""
     path = rows(bench, "text", [3, 4, 5], [3, 5, 7, 9], np.s_[:, ::2])
     issue = bench.validate(path).errors[0]
@@ -279,7 +277,7 @@ def hashed() -> Iterator[mock.Mock]:
 @pytest.mark.parametrize(
     "damage", ["cut", "another scenario", "one value, all attributes kept"]
 )
-def test_a_damaged_data_set_is_told_from_a_bad_submission(
+def test_a_damaged_data_set_is_not_blamed_on_the_submission(
     own: Bench, damage: str
 ) -> None:
     """Exit code 4, naming the file and the command that mends it."""
@@ -307,8 +305,8 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(
     assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 
-def test_a_change_after_the_check_is_seen(own: Bench, hashed: mock.Mock) -> None:
-    """What was noted counts for the bytes that were hashed, also where the times were
+def test_a_change_after_the_check_is_refused(own: Bench, hashed: mock.Mock) -> None:
+    """The note of a check counts for the hashed bytes only, also where the times were
     put back.
     """
     assert own.validate(own.valid).valid

@@ -154,13 +154,12 @@ def test_one_process_answers_all_calls() -> None:
         assert child.call("process", None) == child.call("process", None)
 
 
-def test_what_stops_the_child_is_a_finding(
+def test_a_stopped_child_is_an_issue(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The check is `readable`, the exit code 3, and no other check counts as passed.
-
-    A terabyte that takes no room is not granted a day; waiting is granted far more than
-    computing.
+    """The check is `readable`, the exit code 3, and no other check counts as passed. A
+    sparse file of a terabyte gets far less than a day. A child may wait far longer than
+    it may compute.
     """
     assert validation.WALL_SECONDS >= 100.0 * validation.CPU_SECONDS
     monkeypatch.setattr(validation, "WALL_SECONDS", 0.0)

@@ -141,7 +141,7 @@ def test_the_template_is_the_last_given_frame_repeated(
 def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
     bench: Bench, tmp_path: Path
 ) -> None:
-    """The file would be told again after the split is spelt right."""
+    """The error about the file would only follow after a correct name."""
     output = tmp_path / "predictions.nc"
     output.write_bytes(b"mine")
     location: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
@@ -317,15 +317,13 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
 
 @pytest.mark.parametrize("size", [0, 5_000])
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_full_disk_is_said(
+def test_a_full_disk_is_named_and_leaves_no_file(
     bench: Bench,
     tmp_path: Path,
     size: int,
     whole: bool,
 ) -> None:
-    """Wherever the disk fills up, that is said and nothing is left, whatever the values
-    lack.
-    """
+    """So it is wherever the disk fills up, also where values are missing."""
     first = TESTS[0]
     values = RIGHT if whole else {first: RIGHT[first]}
     with largest_file(size), pytest.raises(WorkFailedError) as caught:
@@ -357,8 +355,8 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
 
 
 def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
-    """What an earlier try wrote is not taken for written; nothing is taken while no
-    file is open.
+    """Values of an earlier try do not count as written; without an open file no value
+    is accepted.
     """
     path = bench.folder / "again.nc"
     writer = PredictionsWriter(path, **options(bench))
@@ -388,9 +386,8 @@ ALL = list(range(GIVEN, FRAMES))
 
 def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
     """Scenario 4, three frames from frame 5 on; names, ids, frames, optional attributes
-    in the header.
-
-    No such scenario, before the first, beyond the last, fewer than none: that is told.
+    in the header. No such scenario, before the first, beyond the last, fewer than none:
+    each is an error.
     """
     with open_predictions(bench.valid) as predictions:
         three_frames = predictions.frames(4, 5, 3)

@@ -48,10 +48,8 @@ def test_an_error_keeps_the_old_file(
 
 
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
-    """A usable folder is made and left empty; an unusable one is told with the option
-    that names it.
-
-    So is one that is met by the work itself.
+    """A usable folder is made and left empty. The error for an unusable one names its
+    option, before the work and during it.
     """
     check_writable(tmp_path / "deep" / "folder")
     assert list((tmp_path / "deep" / "folder").iterdir()) == []

@@ -114,8 +114,8 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
 
 
 def test_systems_without_some_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are no limits none is asked for; macOS refuses that of the address
-    space.
+    """A limit that the system does not have is not set; macOS refuses that of the
+    address space.
     """
     wanted: list[int] = []
     monkeypatch.setattr(machine.sys, "platform", "darwin")
@@ -137,7 +137,7 @@ def test_a_crash_on_windows_is_named_by_its_code() -> None:
 
 
 def test_where_no_workers_start_jobs_run_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scores come all the same; who asks for workers by name is told."""
+    """Jobs run in this process; an explicit pool is an error."""
     monkeypatch.setattr(pool, "AVAILABLE", False)
     found = run_all(lambda job, _: (job, os.getpid()), {"a": 1, "b": 2}, workers=2)
     assert found == [(job, os.getpid()) for job in (1, 2)]

@@ -182,6 +182,6 @@ def test_a_killed_process_changes_nothing(
 
 @pytest.mark.slow
 def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
-    """A job's own time-out is told as what it is."""
+    """The time-out of a job itself arrives as it is."""
     with pytest.raises(WorkFailedError):
         run.run_all(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)

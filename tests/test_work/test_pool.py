@@ -78,8 +78,8 @@ def test_tasks_may_be_added_while_others_run() -> None:
 
 
 def test_a_killed_worker_costs_one_attempt(tmp_path: Path) -> None:
-    """The task of a worker killed by SIGKILL runs again in a fresh one; lost units are
-    told.
+    """The task of a worker killed by SIGKILL runs again in a fresh one; the lost units
+    are reported.
     """
     with Pool(1) as pool:
         pool.submit(
@@ -160,10 +160,8 @@ def test_errors_of_ours_arrive_whole() -> None:
 
 
 def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> None:
-    """Whatever else a task raises names the line that raised it.
-
-    Where the line belongs to a package that adds a split, it is the package that is
-    told of.
+    """Any other error of a task names the line that raised it. Where the line belongs
+    to a package that adds a split, the error names the package.
     """
     error = failure("a", pool_tasks.crash)
     assert type(error) is WorkFailedError

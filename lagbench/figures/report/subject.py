@@ -283,7 +283,7 @@ class ScenarioLabel:
 
     @property
     def details(self) -> list[str]:
-        """Mark and Reynolds number, those that there are."""
+        """The mark and the Reynolds number, if the scenario has them."""
         details = []
         if self.mark:
             details.append(self.mark)
