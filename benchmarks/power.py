@@ -197,9 +197,9 @@ python benchmarks/power.py --write
 
 ## Differences that the test finds
 
-**Model.** We draw random scores of two methods. In scenario i, with seed s, a method has
-the score m (1 + a_i + b_i + c_s + e_si). Here m is the mean of the method. The other
-four terms are random:
+**Model.** We draw random scores of two methods. In scenario i, with seed s, a method
+has the score m (1 + a_i + b_i + c_s + e_si). Here m is the mean of the method. The
+other four terms are random:
 
 - a_i belongs to the scenario. It is the same for both methods.
 - b_i belongs to the method in this scenario (column "method in scenario").
@@ -210,13 +210,15 @@ The table shows the standard deviations of b_i, c_s and e_si.
 
 **Rows.** The first three rows use assumed standard deviations. The other rows have the
 names of splits. They use standard deviations that we measured from the score files of
-size mini in leaderboard/scores. The measurement needs two methods whose means differ by
-less than a factor of two. At least one of these methods must have several seeds. With
-only two methods of two seeds each, the measured standard deviations are inaccurate.
+size mini in leaderboard/scores.
+
+The measurement needs two methods whose means differ by less than a factor of two. At
+least one of these methods must have several seeds. With only two methods of two seeds
+each, the measured standard deviations are inaccurate.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
-20 %. Each method has {seeds} seeds.
+20 %, as the head of the column states. Each method has {seeds} seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
@@ -229,14 +231,14 @@ small differences ranks by chance.
 ## Differences between equal methods
 
 In this table both sides are seeds of the same method. So the test should find a
-difference in at most 5 % of the draws. The shares have a statistical error: 5 % means
-5 % plus or minus 1.4 percentage points (95 % interval).
+difference in at most 5 % of the draws. A share of 5 % has a statistical error of 1.4
+percentage points (95 % interval).
 
 With one seed on each side the test is the sign-flip test over scenarios. For the two
 trained models its answer is correct. For the two methods its answer is often wrong, as
 the column "1 seed each" shows. Therefore the leaderboard speaks of "these weights", not
-of methods, if one side has only one seed. More seeds on the other side do not change
-this rule, because the scatter between seeds is then known for one side only.
+of methods, if one side has only one seed. It does so even if the other side has several
+seeds, because the scatter between the seeds of the first side is still unknown.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|

@@ -112,7 +112,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     if does_not_pay:
         sentences.append(
             f"Learning does not pay on {_join(does_not_pay)}. There a classical solver"
-            " that costs no more is more accurate than the best learned or hybrid model."
+            " that costs no more is more accurate than the best learned or hybrid"
+            " model."
         )
     return " ".join([*sentences, *unmatched])
 

@@ -93,9 +93,9 @@ HOW_TO_READ = """\
 - **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
   perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
 - **Cells** have the mean over the test scenarios, with a 95 % bootstrap interval over
-  scenarios. If a model has several seeds, the   number after ± is the standard deviation
-  over the seeds. The leaderboard resamples the seeds too, so its intervals are wider
-  for a model with few seeds.
+  scenarios. If a model has several seeds, the number after ± is the standard
+  deviation over the seeds. The leaderboard resamples the seeds too, so its intervals
+  are wider for a model with few seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
   and seeds. Two models may use the same weights, for example with and without mirror
