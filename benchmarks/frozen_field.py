@@ -42,8 +42,8 @@ KINDS = {
     "multimaterial-3d": "pair",
 }
 HEAD = (
-    "| data set | frozen field below 0.8 | median correlation | largest | median error "
-    "| accepted |\n|---|---:|---:|---:|---:|---|"
+    "| data set | test scenarios below 0.8 | median correlation | largest correlation "
+    "| median error | accepted |\n|---|---:|---:|---:|---:|---|"
 )
 
 

@@ -182,16 +182,24 @@ def count_pairs_of_seeds() -> tuple[int, int]:
 PAGE = """\
 # Power: which differences can the test find?
 
-`lagbench compare` and the leaderboard use a statistical test,
-`lagbench.metrics.differ`. This page answers two questions about it. How often does
-the test find a difference that exists? How often does it find a difference between
-two seeds of the same method? `python benchmarks/power.py --write` writes this page.
+After this page you know how many seeds and scenarios a comparison needs.
+`lagbench compare` and the leaderboard use the statistical test
+`lagbench.metrics.differ`. This page answers two questions about the test:
+
+- How often does the test find a difference that exists?
+- How often does the test find a difference between two seeds of the same method?
+
+This command writes the page:
+
+```bash
+python benchmarks/power.py --write
+```
 
 ## Differences that the test finds
 
-**Model.** We draw random scores of two methods. A method has the score
-m (1 + a_i + b_i + c_s + e_si) with seed s in scenario i. Here m is the mean of the
-method. The other four terms are random:
+**Model.** We draw random scores of two methods. In scenario i, with seed s, a method
+has the score m (1 + a_i + b_i + c_s + e_si). Here m is the mean of the method. The
+other four terms are random:
 
 - a_i belongs to the scenario. It is the same for both methods.
 - b_i belongs to the method in this scenario (column "method in scenario").
@@ -200,36 +208,37 @@ method. The other four terms are random:
 
 The table shows the standard deviations of b_i, c_s and e_si.
 
-**Rows.** The first rows use assumed standard deviations. Each row with the name of a
-split uses standard deviations that we measured, from the score files of size mini in
-leaderboard/scores. The measurement needs two methods whose means differ by less than a
-factor of two. At least one of these methods must have several seeds. If there are only
-two methods with two seeds each, the measured standard deviations are inaccurate.
+**Rows.** The first three rows use assumed standard deviations. The other rows have the
+names of splits. They use standard deviations that we measured from the score files of
+size mini in leaderboard/scores.
+
+The measurement needs two methods whose means differ by less than a factor of two. At
+least one of these methods must have several seeds. With only two methods of two seeds
+each, the measured standard deviations are inaccurate.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
-20 %. Each method has {seeds} seeds.
+20 %, as the head of the column states. Each method has {seeds} seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
 {rows}
 
-If a difference is small compared with the scatter between seeds, more seeds help to
-find it, but more scenarios do not. A leaderboard that ranks by such small differences
-ranks by chance.
+A difference may be small compared with the scatter between seeds. More seeds help to
+find such a difference. More scenarios do not help. A leaderboard that ranks by such
+small differences ranks by chance.
 
 ## Differences between equal methods
 
 In this table both sides are seeds of the same method. So the test should find a
-difference in at most 5 % of the draws. The shares have a statistical error: 5 % means
-5 % plus or minus 1.4 percentage points (95 % interval).
+difference in at most 5 % of the draws. A share of 5 % has a statistical error of 1.4
+percentage points (95 % interval).
 
-With one seed on each side the test is the sign-flip test over scenarios. Its answer
-is correct for the two trained models, that is, for these weights. But it is often
-wrong for the methods, as the column "1 seed each" shows. Therefore the leaderboard
-speaks of "these weights" if a side has only one seed. It does so even if the other
-side has several seeds. In this case the scatter between seeds is known for one side
-only.
+With one seed on each side the test is the sign-flip test over scenarios. For the two
+trained models its answer is correct. For the two methods its answer is often wrong, as
+the column "1 seed each" shows. Therefore the leaderboard speaks of "these weights", not
+of methods, if one side has only one seed. It does so even if the other side has several
+seeds, because the scatter between the seeds of the first side is still unknown.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|

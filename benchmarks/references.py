@@ -79,7 +79,7 @@ def main() -> int:
     for size, references in measured:
         _print_references(size, references)
     print(
-        "\n| data set | frozen field below 0.8 | median correlation | median error "
+        "\n| data set | test scenarios below 0.8 | median correlation | median error "
         "|\n|---|---:|---:|---:|"
     )
     are_hard_enough = []
@@ -87,7 +87,7 @@ def main() -> int:
         is_hard_enough = _is_hard_enough(size, references, each=options.each)
         are_hard_enough.append(is_hard_enough)
     print(
-        "\n| data set | active frames, median | least | greatest | of "
+        "\n| data set | active frames, median | least | greatest | predicted frames "
         "|\n|---|---:|---:|---:|---:|"
     )
     for size, references in measured:

@@ -96,9 +96,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     sentences = []
     if pays:
         sentences.append(
-            f"Learning pays on {_join(pays)}: the best learned or hybrid model is more"
-            " accurate than every classical solver of lagbench that costs no more per"
-            " frame."
+            f"Learning pays on {_join(pays)}. There the best learned or hybrid model is"
+            " more accurate than every classical solver of lagbench that costs no more"
+            " per frame."
         )
     if open_sets:
         sentences.append(
@@ -111,8 +111,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         )
     if does_not_pay:
         sentences.append(
-            f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"
-            " costs no more is more accurate than the best learned or hybrid model."
+            f"Learning does not pay on {_join(does_not_pay)}. There a classical solver"
+            " that costs no more is more accurate than the best learned or hybrid"
+            " model."
         )
     return " ".join([*sentences, *unmatched])
 

@@ -74,13 +74,15 @@ is better.
 - The time in brackets after a score is the processor time of one frame on one core, on
   the machine of the reference predictors. Learned models were measured on another
   machine. Therefore their times are multiplied by a ratio: the time of our solver on
-  the machine of the reference predictors, divided by its time on the other machine.
-- `skill` is 1 - score / score of the best naive baseline.
-- `against_classical` is score / score of the best classical solver that costs no more
-  per frame. If it is below 1, [learning pays](glossary.md). The brackets contain the
-  95 % interval. The name of the solver follows.
-- The costs for `against_classical` come from one run on one machine, if there is such a
-  run (`leaderboard/verified.yaml`). The leaderboard uses the same costs."""
+  the machine of the reference predictors, divided by the time of our solver on the
+  other machine.
+- `skill` is 1 - (score of the model) / (score of the best naive baseline).
+- `against_classical` is (score of the model) / (score of the best classical solver that
+  costs no more per frame). The brackets contain the 95 % interval. The name of the
+  solver follows. If the whole interval is below 1, [learning pays](glossary.md).
+- Some runs timed the model and the solvers together (`leaderboard/verified.yaml`). If
+  there is such a run, `against_classical` uses its times. The leaderboard uses the same
+  times."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -88,12 +90,12 @@ HOW_TO_READ = """\
 - **Reference predictors** are not trained. A naive baseline learns nothing and knows no
   equation. A classical solver integrates the equations
   ([references](references.md)).
-- **Skill** is 1 - score / score of the best naive baseline. Skill 1 is perfect. Skill 0
-  is as good as this baseline. Below 0 the model is worse.
+- **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
+  perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
 - **Cells** have the mean over the test scenarios, with a 95 % bootstrap interval over
-  scenarios. If a model has several seeds, the number after ± is the standard deviation
-  over the seeds. The leaderboard resamples the seeds too, so its intervals are wider
-  for a model with few seeds.
+  scenarios. If a model has several seeds, the number after ± is the standard
+  deviation over the seeds. The leaderboard resamples the seeds too, so its intervals
+  are wider for a model with few seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
   and seeds. Two models may use the same weights, for example with and without mirror
@@ -123,14 +125,14 @@ ranking metric over the horizon:
 - "Ahead of 3 of 5" means that the mean is better than the means of three of five
   models.
 - "These weights" means that a model has fewer than three trainings. Then the answer is
-  about these weights, not about the methods. (If a fit uses no random numbers, one
-  training is enough.)
+  about these weights, not about the methods. For a fit without random numbers one
+  training is enough.
 - A dash means that an entry is missing.
 
-Two models are compared over the seeds that both have. If there are no such seeds, they
-are compared over all seeds. Models that fail a [gate](baselines.md#gates) are not
-compared. Superseded and withdrawn entries are not compared either. For an operator the
-entry with the recipe `pushforward` is compared, if there is one."""
+The answers compare two models over the seeds that both have, or else over all seeds.
+They leave out models that fail a [gate](baselines.md#gates), and superseded and
+withdrawn entries. If an operator has an entry with the recipe `pushforward`, the
+answers use this entry."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer
