@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from filelock import FileLock
 from numpy.typing import NDArray
+from registry_text import described_splits
 
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
@@ -25,9 +26,9 @@ from lagbench.board.ranking import combine, summarise
 from lagbench.board.submit import submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.layout import scenario_path
-from lagbench.data.registry import Registry, Size, default_path, load
+from lagbench.data.registry import Registry, Size, load
 from lagbench.data.writer import ScenarioWriter
-from lagbench.data.yamlfile import format_yaml, read_yaml
+from lagbench.data.yamlfile import format_yaml
 from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
@@ -273,9 +274,8 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
         "statistics": statistics,
         "twin_floor": predictability_limit,
     }
-    content = read_yaml(default_path())
-    content["measured"] = {size.split: {size.name: measured}}
-    return format_yaml(content)
+    block = format_yaml({"measured": {size.split: {size.name: measured}}})
+    return described_splits() + block
 
 
 def still(truth: Floats, n: int, h: int) -> Floats:

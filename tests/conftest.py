@@ -23,13 +23,14 @@ from click.testing import CliRunner, Result
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
+from registry_text import described_splits
 from score_bench import ScoreBench, bench_of
 from typer.main import get_command
 
 from lagbench.__main__ import app
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import PICTURES
-from lagbench.data.registry import Registry, Size, default_path, load
+from lagbench.data.registry import Registry, Size, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make import cards
@@ -307,8 +308,7 @@ def unmeasured_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Tests that use it hold before and after hashes are recorded.
     """
     path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
-    described, _, _ = default_path().read_text().partition("\nmeasured:")
-    path.write_text(f"{described}\n")
+    path.write_text(described_splits())
     return path
 
 

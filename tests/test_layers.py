@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import graphlib
+import json
 import os
 import re
 import subprocess
 import sys
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -223,62 +225,87 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
     assert done.stdout.strip() == "cavity"
 
 
-@pytest.mark.parametrize(
-    ("code", "forbidden"),
-    [
-        ("import lagbench", HEAVY | {"h5py", "pydantic"}),
-        ("--help; leaderboard --help; --version", HEAVY),
-        ("import lagbench; lagbench.generate; lagbench.windows", HEAVY - {"numpy"}),
-        (
-            "generate --help; train --help; demo --help; cite cavity; list;"
-            " info cavity; generate fluid --size tiny --dry-run",
-            HEAVY - {"numpy"},
-        ),
-        (
-            "import lagbench.data.writer",
-            {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"},
-        ),
-        (
-            "import lagbench.metrics",
-            {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"},
-        ),
-        (
-            "import lagbench.figures.report.report",
-            {"matplotlib", "PIL", "taichi", "torch"},
-        ),
-        (
-            "import lagbench.figures.plot, lagbench.figures.animate\n"
-            "import lagbench.make.cards",
-            DRAWN,
-        ),
-        ("import lagbench.figures.colours", HEAVY - {"numpy"}),
-    ],
+WRITING = ("import lagbench.data.writer",)
+READING = (
+    "import lagbench",
+    "--help; leaderboard --help; --version",
+    "import lagbench.figures.colours",
+    "import lagbench; lagbench.generate; lagbench.windows",
+    "generate --help; train --help; demo --help; cite cavity; list;"
+    " info cavity; generate fluid --size tiny --dry-run",
+    "import lagbench.metrics",
+    "import lagbench.figures.plot, lagbench.figures.animate, lagbench.make.cards",
+    "import lagbench.figures.report.report",
 )
-def test_light_things_stay_light(code: str, forbidden: set[str]) -> None:
-    """Importing and asking for help load no numerical library, planning NumPy only, and
-    so on.
+"""What one process does step by step: a later step may load what an earlier one may."""
 
-    Code that does not import is commands, run one after the other.
+DO_STEPS = """
+import json, sys
+loaded = []
+for step in json.loads(sys.argv[1]):
+    if step.startswith("import"):
+        exec(step)
+    else:
+        from typer.testing import CliRunner
+        from lagbench.__main__ import app
+        for line in step.split("; "):
+            assert CliRunner().invoke(app, line.split()).exit_code == 0, line
+    loaded.append(sorted(sys.modules))
+print(json.dumps(loaded))
+"""
+"""A step that does not import is commands, run one after the other."""
+
+
+@pytest.fixture(scope="module")
+def loaded_after() -> Callable[[str], set[str]]:
+    """A function that returns the modules loaded after a step and those before it.
+
+    A process does all steps that may follow each other: most of its time is the start.
     """
-    if not code.startswith("import"):
-        calls = [
-            f"assert CliRunner().invoke(app, {line.split()}).exit_code == 0"
-            for line in code.split("; ")
-        ]
-        code = "\n".join(
-            [
-                "from typer.testing import CliRunner",
-                "from lagbench.__main__ import app",
-                *calls,
-            ]
-        )
-    command = [sys.executable, "-c", code + "\nimport sys\nprint(*sys.modules)"]
     # files that are there would be read
     empty = {
         **os.environ,
         "LAGBENCH_ROOT": str(PACKAGE / "none"),
     }
-    done = subprocess.run(
-        command, env=empty, capture_output=True, text=True, check=True
-    )
-    assert not set(done.stdout.splitlines()[-1].split()) & forbidden
+
+    @functools.cache
+    def do_steps(steps: tuple[str, ...]) -> dict[str, set[str]]:
+        command = [sys.executable, "-c", DO_STEPS, json.dumps(steps)]
+        done = subprocess.run(
+            command, env=empty, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        module_lists = json.loads(done.stdout.splitlines()[-1])
+        loaded = {}
+        for step, modules in zip(steps, module_lists, strict=True):
+            loaded[step] = set(modules)
+        return loaded
+
+    def find_loaded(step: str) -> set[str]:
+        steps = WRITING if step in WRITING else READING
+        return do_steps(steps)[step]
+
+    return find_loaded
+
+
+@pytest.mark.parametrize(
+    ("step", "forbidden"),
+    [
+        (READING[0], HEAVY | {"h5py", "pydantic"}),
+        (READING[1], HEAVY),
+        (READING[2], HEAVY - {"numpy"}),
+        (READING[3], HEAVY - {"numpy"}),
+        (READING[4], HEAVY - {"numpy"}),
+        (READING[5], {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"}),
+        (READING[6], DRAWN),
+        (READING[7], {"matplotlib", "PIL", "taichi", "torch"}),
+        (WRITING[0], {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"}),
+    ],
+)
+def test_light_things_stay_light(
+    step: str, forbidden: set[str], loaded_after: Callable[[str], set[str]]
+) -> None:
+    """Importing and asking for help load no numerical library, planning NumPy only, and
+    so on.
+    """
+    assert loaded_after(step) & forbidden == set()
