@@ -86,6 +86,8 @@ class LocalSplit:
     particles: tuple[int, int]  # the fewest and the most particles of a scenario
     input_frames: int  # frames given to a model
     horizon: int  # frames to predict
+    # the walls, or one period [length]: lowest and highest position along each axis
+    bounds: Bounds
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
@@ -233,11 +235,22 @@ def _summarise(
         particles=(min(particle_counts), max(particle_counts)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
+        bounds=size.bounds,
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
         notes=tuple(_describe_motion(manifest.statistics)),
     )
+
+
+def format_bounds(bounds: Bounds) -> str:
+    """Return the bounds of a split for a message.
+
+    >>> format_bounds(((0.0, 1.0), (0.25, 2.0)))
+    '[0, 1] x [0.25, 2]'
+    """
+    low, high = np.array(bounds).T
+    return format_box(low, high)
 
 
 def _describe_motion(statistics: Mapping[str, Sequence[float]]) -> Iterator[str]:

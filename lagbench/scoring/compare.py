@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lagbench.arguments import check_arguments
 from lagbench.data.layout import format_ids
@@ -50,6 +50,9 @@ from .score_file_checks import (
     read_published_scores,
 )
 from .score_layout import SUBMISSION
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""
@@ -174,6 +177,36 @@ class ComparisonResult:
                 f"{first} and {second} seeds: of one seed its weights, not the method"
             )
         return f"{first} and {second} seeds"
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the comparison as a table with a line for each metric.
+
+        Columns: ``metric``, ``unit``, ``side`` (``better``, ``worse``, ``same`` or
+        ``unknown``: the first method against the second), ``first`` and ``second``
+        (means of the methods), ``difference`` (of the losses, below 0 if the first is
+        better), ``low`` and ``high`` (its 95 % interval), ``p``, ``significant``.
+        Undefined values are NaN. The ranking metric comes first.
+        """
+        import pandas as pd
+
+        lines = []
+        for name, comparison in self.metrics.items():
+            test = comparison.test
+            low, high = test.interval
+            line = {
+                "metric": name,
+                "unit": comparison.metric.unit,
+                "side": comparison.side,
+                "first": comparison.first,
+                "second": comparison.second,
+                "difference": test.difference,
+                "low": low,
+                "high": high,
+                "p": test.p,
+                "significant": test.significant,
+            }
+            lines.append(line)
+        return pd.DataFrame(lines)
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as plain values; undefined ones are None."""

@@ -119,6 +119,14 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     assert compare(b, a).verdict == result.verdict
     assert result.verdict in repr(result)
 
+    table = result.to_dataframe().set_index("metric")
+    row = table.loc["mse_avg"]
+    assert row["side"] == "better"
+    assert row["p"] == pytest.approx(2 / 64)
+    assert row["difference"] == pytest.approx(row["first"] - row["second"])
+    assert row["low"] < row["difference"] < row["high"]
+    assert row["significant"]
+
 
 def test_five_wins_of_six_are_not_significant(tmp_path: Path) -> None:
     """With one loss as large as the wins 14 of 64 patterns are as extreme.
