@@ -159,8 +159,8 @@ def adopt(
         walls = format_bounds(local_split.bounds)
         notes.append(
             f"no bounds are stated, so the walls are {walls}, the smallest box around "
-            "all positions. Models and scores use these walls; --bounds states the true "
-            "ones"
+            "all positions. Models and scores use these walls; --bounds states the "
+            "true ones"
         )
     return replace(local_split, notes=tuple(notes))
 
