@@ -329,13 +329,18 @@ def compare(
         examine=require_second,
     )
     one = _load_contestant(first, scoring)
+
+    def require_same(split: str, size: str) -> None:
+        other = {**one.identity, "split": split, "size": size}
+        _check_same(f"{one.name} and {second}", one.identity, other)
+
     is_reference = is_bare and str(second) in one.references
     if is_reference:
         two = _reference_beside(one, str(second))
     elif is_bare:
         two = _load_entry(str(second), one, first, entries=entries, scoring=scoring)
     else:
-        two = _load_contestant(second, scoring)
+        two = _load_contestant(second, replace(scoring, examine=require_same))
 
     between = f"{one.name} and {two.name}"
     _check_same(between, one.identity, two.identity)

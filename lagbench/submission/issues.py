@@ -124,7 +124,10 @@ class ValidationResult:
         for check, reason in self.skipped.items():
             skipped_checks.setdefault(reason, []).append(check)
         for reason, checks in skipped_checks.items():
-            lines.append(f"not made, since {reason}: {', '.join(checks)}")
+            names = ", ".join(checks)
+            if len(checks) == len(CHECKS) - 1:
+                names = "all other checks"
+            lines.append(f"not made, since {reason}: {names}")
 
         error_count = format_count(len(self.errors), "error")
         warning_count = format_count(len(self.warnings), "warning")

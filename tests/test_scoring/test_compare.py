@@ -256,6 +256,16 @@ def test_other_data_are_not_compared(
         compare(a, b)
 
 
+def test_predictions_of_another_split_are_refused_before_they_are_scored(
+    tmp_path: Path, bench: ScoreBench, scored: Folders
+) -> None:
+    """Without the data set they cannot be scored; the split is named all the same."""
+    a = publish(tmp_path, ONES, method="a", split="fluid")
+    predictions = scored["still"] / "predictions.nc"
+    with pytest.raises(UsageError, match="differ in split"):
+        compare(a, predictions, root=tmp_path / "empty", registry=bench.registry)
+
+
 def test_folders_files_and_predictions_give_the_same_result(
     bench: ScoreBench, scored: Folders
 ) -> None:
