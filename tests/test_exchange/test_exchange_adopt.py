@@ -465,6 +465,28 @@ def variable(
     return file.createVariable("position", kind, names)
 
 
+def test_a_file_without_positions_is_told_by_its_arrays(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
+    path = tmp_path / "run.npz"
+    np.savez(path, pos=runs[0], vel=runs[0])
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt_here([path])
+    assert caught.value.got == "'pos', 'vel'"
+    assert "'position'" in str(caught.value.expected)
+
+
+def test_the_particle_without_a_position_is_named(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
+    broken = runs[0].copy()
+    broken[3, 7, 1] = np.nan
+    paths = save_runs(tmp_path / "in", [broken, *runs[1:3]])
+    with pytest.raises(DataError) as caught:
+        adopt_here(paths)
+    assert str(caught.value.where).endswith("frame 3, particle 7")
+
+
 def test_netcdf(tmp_path: Path, runs: Runs, adopt_here: Adopt) -> None:
     """NetCDF files of double precision in subset folders are read frame by frame,
     rounded once.

@@ -320,6 +320,18 @@ def test_public_modules_need_no_import_of_their_own() -> None:
     assert run.stdout.split() == ["export", "differ"]
 
 
+def test_without_pytorch_the_message_says_what_to_install() -> None:
+    program = (
+        "import sys; sys.modules['torch'] = None; import lagbench\n"
+        "try: lagbench.torch\n"
+        "except lagbench.errors.UsageError as error: print(error.fix)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == "pip install 'lagbench[baselines]'"
+
+
 def test_completion_offers_public_names_only() -> None:
     names = [name for name in dir(lagbench) if not name.startswith("__")]
     assert {"score", "exchange", "torch"} <= set(names)
