@@ -471,7 +471,7 @@ def test_a_file_without_positions_is_told_by_its_arrays(
     path = tmp_path / "run.npz"
     np.savez(path, pos=runs[0], vel=runs[0])
     with pytest.raises(UnreadableFileError) as caught:
-        adopt_here([path])
+        adopt_here([path, *save_runs(tmp_path / "in", runs[:2])])
     assert caught.value.got == "'pos', 'vel'"
     assert "'position'" in str(caught.value.expected)
 
