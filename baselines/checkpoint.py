@@ -30,6 +30,7 @@ from torch import Tensor, nn
 
 from lagbench.atomic import atomic_path
 from lagbench.data.field_errors import describe_expectation, describe_input
+from lagbench.data.hdf5 import SIGNATURE as HDF5_SIGNATURE
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     DataError,
@@ -236,9 +237,11 @@ def _check_archive(file: Path) -> None:
     try:
         if not zipfile.is_zipfile(file):
             with file.open("rb") as stream:
-                head = stream.read(2)
-            if head in _PICKLE_HEADS:
+                head = stream.read(len(HDF5_SIGNATURE))
+            if head[:2] in _PICKLE_HEADS:
                 raise _unsafe(file, "a pickle of something else")
+            if head == HDF5_SIGNATURE:
+                raise _unreadable(file, EXPECTED, "an HDF5 file, as predictions are")
             raise _unreadable(file, EXPECTED, "something else")
         with zipfile.ZipFile(file) as archive:
             unpacked_bytes = sum(member.file_size for member in archive.infolist())

@@ -61,6 +61,9 @@ _MODULES = {
     "adopt": "exchange.adoption",
 }
 
+_PACKAGES = ("errors", "exchange", "metrics", "submission", "torch")
+"""Public modules; ``import lagbench`` is enough to use them."""
+
 __version__: str
 
 
@@ -71,7 +74,7 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         value = version("lagbench")
-    elif name in ("errors", "submission"):
+    elif name in _PACKAGES:
         value = importlib.import_module(f".{name}", __name__)
     elif name in _MODULES:
         module = importlib.import_module(f".{_MODULES[name]}", __name__)
@@ -85,5 +88,6 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """List all public names, also those that are not loaded yet."""
-    return sorted({*globals(), *__all__})
+    """List the public names, also those that are not loaded yet, and no others."""
+    special_names = [name for name in globals() if name.startswith("__")]
+    return sorted({*special_names, *__all__, *_PACKAGES})

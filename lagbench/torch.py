@@ -21,8 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+
+try:
+    import torch
+except ModuleNotFoundError:
+    from lagbench.errors import require
+
+    require("torch", extra="baselines")  # raises, with the command that installs it
+    raise
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 

@@ -81,6 +81,7 @@ def _with_byte(data: bytes, place: int, value: int) -> bytes:
 
 _bytes("empty_file", lambda _: b"", "empty")
 _bytes("text_renamed", lambda _: b"scenario,frame,x,y\n3,6,0.1,0.2\n", "text")
+_bytes("short_lines_renamed", lambda _: b"---\nsplit: cavity\n", "text")
 _bytes("zip_renamed", lambda _: b"PK\x03\x04" + bytes(100), "npz")
 _bytes("numpy_renamed", lambda _: b"\x93NUMPY\x01\x00" + bytes(100), ".npy")
 _bytes("pickle_renamed", lambda _: pickle.dumps([1.0] * 100), "pickle")

@@ -415,13 +415,17 @@ def test_size_is_the_second_argument_behind_split() -> None:
     assert {"generate", "open_split", "windows", "WindowDataset"} <= set(names)
 
 
-def test_the_result_of_a_validation_is_short_in_a_notebook(tmp_path: Path) -> None:
-    """Its repr has the verdict and counts, not all issues."""
+def test_the_result_of_a_validation_is_short_until_printed(tmp_path: Path) -> None:
+    """Its repr has the verdict and counts; print shows all issues too."""
     path = tmp_path / "p.nc"
     path.write_text("no predictions")
     result = lagbench.validate(path, isolated=False)
     assert (
         repr(result) == f"<ValidationResult of {path}: not valid, 1 error, 0 warnings>"
+    )
+    assert str(result.errors[0]) in str(result)
+    assert str(result).endswith(
+        f"{path}: not valid, 1 error, 0 warnings, 0 checks passed"
     )
 
 

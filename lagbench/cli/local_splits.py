@@ -12,7 +12,7 @@ import typer
 from lagbench.data.layout import parse_ids
 from lagbench.errors import UsageError
 from lagbench.exchange.adoption import adopt, import_split
-from lagbench.exchange.local_split import LocalSplit
+from lagbench.exchange.local_split import LocalSplit, format_bounds
 from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
@@ -273,6 +273,7 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
         f"{particles} particles",
         f"  task    {local_split.input_frames} frames given, "
         f"{local_split.horizon} to predict",
+        f"  box     {format_bounds(local_split.bounds)}",
         f"  hash    {local_split.dataset_sha256}",
         *_next_steps(local_split),
     ]

@@ -268,9 +268,10 @@ def _describe_budget(result: TrainingResult) -> str:
     windows = ""
     if result.windows_seen:
         windows = f"{result.windows_seen:,} windows, "
+    epochs = "1 epoch" if result.epochs == 1 else f"{result.epochs:.3g} epochs"
     validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     return (
-        f"{windows}{result.epochs:.3g} epochs; "
+        f"{windows}{epochs}; "
         f"{validation_share:.0%} of the processor time for validations; "
         f"{result.device}, {format_count(result.threads, 'thread')}; "
         f"{_describe_track(result)}"

@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 
 from lagbench.data.local import locate_split
-from lagbench.errors import format_count
-from lagbench.submission.issues import ValidationResult
 from lagbench.submission.validation import require_split, validate
 
 from .options import JsonFlag, QuietFlag, RootOption, option
@@ -39,22 +37,5 @@ def validate_command(
         expected_split, root, _ = locate_split(split, root=root)
     result = validate(predictions, root=root)
     require_split(result, expected_split)
-    print_result(result, _describe(result), as_json=as_json, quiet=quiet)
+    print_result(result, [str(result)], as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
-
-
-def _describe(result: ValidationResult) -> list[str]:
-    lines = [str(issue) for issue in result.findings]
-
-    skipped_checks: dict[str, list[str]] = {}
-    for check, reason in result.skipped.items():
-        skipped_checks.setdefault(reason, []).append(check)
-    for reason, checks in skipped_checks.items():
-        lines.append(f"not made, since {reason}: {', '.join(checks)}")
-
-    error_count = format_count(len(result.errors), "error")
-    warning_count = format_count(len(result.warnings), "warning")
-    check_count = format_count(len(result.passed), "check")
-    counts = f"{error_count}, {warning_count}, {check_count} passed"
-    lines.append(f"{result.path}: {result.verdict}, {counts}")
-    return lines

@@ -105,8 +105,10 @@ def _guess_format(first_bytes: bytes) -> str:
             return format_name
     if not first_bytes:
         return "an empty file"
-    if first_bytes.isascii() and first_bytes.decode("ascii").isprintable():
-        return "text"
+    if first_bytes.isascii():
+        words = first_bytes.decode("ascii").split()
+        if "".join(words).isprintable():
+            return "text"
     return "bytes of another format"
 
 

@@ -32,6 +32,7 @@ from .local_split import (
     LocalSplit,
     check_output,
     find_bounds,
+    format_bounds,
     make_local_split,
     output_name,
 )
@@ -153,8 +154,15 @@ def adopt(
         counts=counts,
         progress=progress,
     )
-    notes = (*local_split.notes, *_notes_of_counts(counts))
-    return replace(local_split, notes=notes)
+    notes = [*local_split.notes, *_notes_of_counts(counts)]
+    if "bounds" not in options:
+        walls = format_bounds(local_split.bounds)
+        notes.append(
+            f"no bounds are stated, so the walls are {walls}, the smallest box around "
+            "all positions. Models and scores use these walls; --bounds states the "
+            "true ones"
+        )
+    return replace(local_split, notes=tuple(notes))
 
 
 def _require_option(options: DataOptions, name: str, meaning: str) -> None:

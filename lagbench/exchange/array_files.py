@@ -48,6 +48,12 @@ NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
 Chunks by default span many frames, so that more of them stay unpacked.
 """
 
+MOST_NAMES = 5
+"""Most names of arrays that a message lists."""
+
+MAX_NAME = 80
+"""Longest name of an array in a message [characters]."""
+
 INTEGER_KINDS = "iu"
 NUMBER_KINDS = "iuf"
 
@@ -149,6 +155,22 @@ def open_trajectory(row: Row, order: tuple[str, ...] | None = None) -> Trajector
         return _parse_trajectory(path, name, arrays, order)
 
 
+def _require_positions(path: Path, names: Sequence[str]) -> None:
+    """Refuse a file without positions, by the names of its arrays."""
+    if POSITION in names:
+        return
+    present = [ascii(name)[:MAX_NAME] for name in names[:MOST_NAMES]]
+    if len(names) > MOST_NAMES:
+        present.append(f"{len(names) - MOST_NAMES} more")
+    raise UnreadableFileError(
+        "there are no positions",
+        where=str(path),
+        expected=f"an array {POSITION!r}",
+        got=", ".join(present) or "no array",
+        fix=f"save them as {POSITION!r}, shape [frame, particle, axis]",
+    )
+
+
 def _parse_trajectory(
     path: Path,
     name: str,
@@ -156,14 +178,6 @@ def _parse_trajectory(
     order: tuple[str, ...] | None,
 ) -> Trajectory:
     """Return the trajectory of named arrays."""
-    if POSITION not in arrays:
-        raise UnreadableFileError(
-            "there are no positions",
-            where=name,
-            expected=f"an array {POSITION!r}",
-            got=", ".join(arrays) or f"none of {', '.join(ARRAYS)}",
-            fix=f"save them as {POSITION!r}, shape [frame, particle, axis]",
-        )
     position = OrderedArray(arrays[POSITION], order or ORDER)
     shape = position.shape
     check_array(name, shape, position.dtype)
@@ -340,6 +354,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 with archive.open(member) as stream:
                     _check_header(name, stream, member.file_size)
     with np.load(path, allow_pickle=False) as file:
+        _require_positions(path, file.files)
         arrays = {}
         for name in ARRAYS:
             if name in file:
@@ -356,6 +371,7 @@ def _read_netcdf(path: Path) -> dict[str, Any]:
 
     file = open_netcdf(path)
     file.set_auto_maskandscale(False)
+    _require_positions(path, list(file.variables))
     arrays = {}
     for name in ARRAYS:
         if name not in file.variables:

@@ -86,6 +86,8 @@ class LocalSplit:
     particles: tuple[int, int]  # the fewest and the most particles of a scenario
     input_frames: int  # frames given to a model
     horizon: int  # frames to predict
+    # the walls, or one period [length]: lowest and highest position along each axis
+    bounds: Bounds
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
@@ -146,13 +148,7 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
             frame_low = position.min(axis=0).astype(np.float64)
             frame_high = position.max(axis=0).astype(np.float64)
             if not (np.isfinite(frame_low).all() and np.isfinite(frame_high).all()):
-                raise DataError(
-                    "a position is not finite",
-                    where=f"{trajectory.name}, frame {number}",
-                    expected="numbers",
-                    got="NaN or infinity",
-                    fix="end the trajectory before this frame",
-                )
+                raise _not_finite(position, f"{trajectory.name}, frame {number}")
             if low is None or high is None or len(low) != len(frame_low):
                 low = frame_low
                 high = frame_high
@@ -161,6 +157,19 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
     if low is None or high is None:
         return ()
     return tuple(zip(low.tolist(), high.tolist(), strict=True))
+
+
+def _not_finite(position: NDArray[np.floating], where: str) -> DataError:
+    """Return the error for a frame in which a position is not finite."""
+    is_finite = np.isfinite(position).all(axis=1)
+    particle = int(np.argmin(is_finite))
+    return DataError(
+        "a position is not finite",
+        where=f"{where}, particle {particle}",
+        expected="numbers",
+        got=position[particle].tolist(),
+        fix="end the trajectory before this frame",
+    )
 
 
 def make_local_split(
@@ -233,11 +242,22 @@ def _summarise(
         particles=(min(particle_counts), max(particle_counts)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
+        bounds=size.bounds,
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
         notes=tuple(_describe_motion(manifest.statistics)),
     )
+
+
+def format_bounds(bounds: Bounds) -> str:
+    """Return the bounds of a split for a message.
+
+    >>> format_bounds(((0.0, 1.0), (0.25, 2.0)))
+    '[0, 1] x [0.25, 2]'
+    """
+    low, high = np.array(bounds).T
+    return format_box(low, high)
 
 
 def _describe_motion(statistics: Mapping[str, Sequence[float]]) -> Iterator[str]:
@@ -527,13 +547,7 @@ class SplitBuilder:
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise DataError(
-                "a position is not finite",
-                where=where,
-                expected="numbers",
-                got="NaN or infinity",
-                fix="end the trajectory before this frame",
-            )
+            raise _not_finite(position, where)
         if (low < 0.0).any() or (high > 1.0).any():
             raise DataError(
                 "particles lie outside the unit box",

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lagbench.arguments import check_arguments
 from lagbench.data.layout import format_ids
@@ -50,6 +50,9 @@ from .score_file_checks import (
     read_published_scores,
 )
 from .score_layout import SUBMISSION
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""
@@ -175,6 +178,36 @@ class ComparisonResult:
             )
         return f"{first} and {second} seeds"
 
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the comparison as a table with a line for each metric.
+
+        Columns: ``metric``, ``unit``, ``side`` (``better``, ``worse``, ``same`` or
+        ``unknown``: the first method against the second), ``first`` and ``second``
+        (means of the methods), ``difference`` (of the losses, below 0 if the first is
+        better), ``low`` and ``high`` (its 95 % interval), ``p``, ``significant``.
+        Undefined values are NaN. The ranking metric comes first.
+        """
+        import pandas as pd
+
+        lines = []
+        for name, comparison in self.metrics.items():
+            test = comparison.test
+            low, high = test.interval
+            line = {
+                "metric": name,
+                "unit": comparison.metric.unit,
+                "side": comparison.side,
+                "first": comparison.first,
+                "second": comparison.second,
+                "difference": test.difference,
+                "low": low,
+                "high": high,
+                "p": test.p,
+                "significant": test.significant,
+            }
+            lines.append(line)
+        return pd.DataFrame(lines)
+
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as plain values; undefined ones are None."""
         metrics = {}
@@ -296,13 +329,18 @@ def compare(
         examine=require_second,
     )
     one = _load_contestant(first, scoring)
+
+    def require_same(split: str, size: str) -> None:
+        other = {**one.identity, "split": split, "size": size}
+        _check_same(f"{one.name} and {second}", one.identity, other)
+
     is_reference = is_bare and str(second) in one.references
     if is_reference:
         two = _reference_beside(one, str(second))
     elif is_bare:
         two = _load_entry(str(second), one, first, entries=entries, scoring=scoring)
     else:
-        two = _load_contestant(second, scoring)
+        two = _load_contestant(second, replace(scoring, examine=require_same))
 
     between = f"{one.name} and {two.name}"
     _check_same(between, one.identity, two.identity)

@@ -116,6 +116,26 @@ class ValidationResult:
         ]
         return f"<ValidationResult of {self.path}: {self.verdict}, {', '.join(counts)}>"
 
+    def __str__(self) -> str:
+        """Return all issues, the checks that were not made, and the verdict."""
+        lines = [str(issue) for issue in self.findings]
+
+        skipped_checks: dict[str, list[str]] = {}
+        for check, reason in self.skipped.items():
+            skipped_checks.setdefault(reason, []).append(check)
+        for reason, checks in skipped_checks.items():
+            names = ", ".join(checks)
+            if len(checks) == len(CHECKS) - 1:
+                names = "all other checks"
+            lines.append(f"not made, since {reason}: {names}")
+
+        error_count = format_count(len(self.errors), "error")
+        warning_count = format_count(len(self.warnings), "warning")
+        check_count = format_count(len(self.passed), "check")
+        counts = f"{error_count}, {warning_count}, {check_count} passed"
+        lines.append(f"{self.path}: {self.verdict}, {counts}")
+        return "\n".join(lines)
+
     @property
     def errors(self) -> tuple[ValidationIssue, ...]:
         """Issues that reject the file."""

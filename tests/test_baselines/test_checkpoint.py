@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import numpy as np
 import pytest
 import torch
@@ -153,6 +154,15 @@ def test_text_is_no_pickle(tmp_path: Path) -> None:
     (tmp_path / "weights.pt").touch()
     with pytest.raises(UnreadableFileError):
         load(tmp_path)
+
+
+def test_predictions_in_the_place_of_weights_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.nc"
+    with netCDF4.Dataset(path, "w"):
+        pass
+    with pytest.raises(UnreadableFileError) as caught:
+        load(path)
+    assert "HDF5" in str(caught.value.got)
 
 
 def test_scripts_are_refused(tmp_path: Path) -> None:

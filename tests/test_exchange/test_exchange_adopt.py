@@ -369,7 +369,7 @@ def test_test_has_enough_trajectories_for_a_p_value(
     path = tmp_path / "runs.npy"
     np.save(path, np.stack(straight_runs(count)))
     own_split = adopt_here(path)
-    has_note = bool(own_split.notes)
+    has_note = any("trajectories for test" in note for note in own_split.notes)
     assert own_split.scenarios["test"] == test_count
     assert has_note == (test_count < 6)
 
@@ -386,6 +386,30 @@ def test_a_set_in_which_nothing_moves_has_a_note(
     own_split = adopt_here(path)
     has_note = any("no particle of train moves" in note for note in own_split.notes)
     assert has_note != moves
+
+
+def test_a_note_states_the_walls_that_nobody_stated(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """The highest particle of all frames would else become a ceiling unnoticed."""
+    runs = np.stack(straight_runs(20))
+    path = tmp_path / "runs.npy"
+    np.save(path, runs)
+    own_split = adopt_here(path)
+    low = runs.min(axis=(0, 1, 2))
+    high = runs.max(axis=(0, 1, 2))
+    assert own_split.bounds == pytest.approx(np.stack([low, high], 1))
+    (note,) = own_split.notes
+    assert f"{high[1]:.6g}]" in note
+    assert "--bounds" in note
+
+
+def test_stated_walls_need_no_note(tmp_path: Path, adopt_here: Adopt) -> None:
+    path = tmp_path / "runs.npy"
+    np.save(path, np.stack(straight_runs(20)))
+    own_split = adopt_here(path, bounds=((0.0, 1.0), (0.0, 1.0)))
+    assert own_split.bounds == ((0.0, 1.0), (0.0, 1.0))
+    assert own_split.notes == ()
 
 
 def test_without_bounds_the_extent_of_all_positions_is_fitted(
@@ -442,6 +466,28 @@ def variable(
     for name, length in zip(names, shape, strict=True):
         file.createDimension(name, length)
     return file.createVariable("position", kind, names)
+
+
+def test_the_message_names_the_arrays_of_a_file_without_positions(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
+    path = tmp_path / "run.npz"
+    np.savez(path, pos=runs[0], vel=runs[0])
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt_here([path, *save_runs(tmp_path / "in", runs[:2])])
+    assert caught.value.got == "'pos', 'vel'"
+    assert "'position'" in str(caught.value.expected)
+
+
+def test_the_particle_without_a_position_is_named(
+    tmp_path: Path, runs: Runs, adopt_here: Adopt
+) -> None:
+    broken = runs[0].copy()
+    broken[3, 7, 1] = np.nan
+    paths = save_runs(tmp_path / "in", [broken, *runs[1:3]])
+    with pytest.raises(DataError) as caught:
+        adopt_here(paths)
+    assert str(caught.value.where).endswith("frame 3, particle 7")
 
 
 def test_netcdf_files_are_adopted_frame_by_frame(

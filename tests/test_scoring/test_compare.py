@@ -119,6 +119,14 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     assert compare(b, a).verdict == result.verdict
     assert result.verdict in repr(result)
 
+    table = result.to_dataframe().set_index("metric")
+    row = table.loc["mse_avg"]
+    assert row["side"] == "better"
+    assert row["p"] == pytest.approx(2 / 64)
+    assert row["difference"] == pytest.approx(row["first"] - row["second"])
+    assert row["low"] < row["difference"] < row["high"]
+    assert row["significant"]
+
 
 def test_five_wins_of_six_are_not_significant(tmp_path: Path) -> None:
     """With one loss as large as the wins 14 of 64 patterns are as extreme.
@@ -246,6 +254,16 @@ def test_other_data_are_not_compared(
     b = publish(tmp_path, ONES, method="b", **changes)
     with pytest.raises(error, match=f"differ in {word}"):
         compare(a, b)
+
+
+def test_predictions_of_another_split_are_refused_before_they_are_scored(
+    tmp_path: Path, bench: ScoreBench, scored: Folders
+) -> None:
+    """Without the data set they cannot be scored; the split is named all the same."""
+    a = publish(tmp_path, ONES, method="a", split="fluid")
+    predictions = scored["still"] / "predictions.nc"
+    with pytest.raises(UsageError, match="differ in split"):
+        compare(a, predictions, root=tmp_path / "empty", registry=bench.registry)
 
 
 def test_folders_files_and_predictions_give_the_same_result(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -304,3 +306,33 @@ def test_public_names_load_on_first_use() -> None:
     # of these two Python forms "Did you mean: 'open_split'?"
     assert caught.value.name == "opensplit"
     assert caught.value.obj is lagbench
+
+
+def test_public_modules_need_no_import_of_their_own() -> None:
+    """The docs write ``lagbench.exchange.export`` and ``lagbench.metrics.differ``."""
+    program = (
+        "import lagbench; "
+        "print(lagbench.exchange.export.__name__, lagbench.metrics.differ.__name__)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == ["export", "differ"]
+
+
+def test_without_pytorch_the_message_says_what_to_install() -> None:
+    program = (
+        "import sys; sys.modules['torch'] = None; import lagbench\n"
+        "try: lagbench.torch\n"
+        "except lagbench.errors.UsageError as error: print(error.fix)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.strip() == "pip install 'lagbench[baselines]'"
+
+
+def test_completion_offers_public_names_only() -> None:
+    names = [name for name in dir(lagbench) if not name.startswith("__")]
+    assert {"score", "exchange", "torch"} <= set(names)
+    assert not {"importlib", "sys", "annotations", "TYPE_CHECKING"} & set(names)
