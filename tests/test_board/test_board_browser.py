@@ -386,8 +386,8 @@ def test_the_table_needs_no_script(
 
 
 def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
-    """Each preset shows the values of its columns, floors where their score puts
-    them.
+    """Each preset shows the values of its columns, reference predictors where their
+    score puts them.
     """
     tab = board.tabs[0]
     go(page, tab)
@@ -416,8 +416,8 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
     ["position_rmse", "vorticity_pearson", "energy_ratio", "speed_up", "parameters"],
 )
 def test_sorting(page: Page, board: Board, key: str) -> None:
-    """A click sorts best first, another worst first; gaps stay last, floors are sorted
-    with the others.
+    """A click sorts best first, another worst first; gaps stay last, reference
+    predictors are sorted with the others.
     """
     tab = board.tabs[0]
     go(page, tab)
@@ -457,7 +457,7 @@ def test_sorting(page: Page, board: Board, key: str) -> None:
 
 
 def test_filter_by_keyboard(page: Page, board: Board) -> None:
-    """A slash leads to the filter; every word must occur; the floors stay."""
+    """A slash leads to the filter; every word must occur; reference predictors stay."""
     go(page, board.tabs[0])
     press(page, "/")
     page.call("Input.insertText", text="examples GAT")

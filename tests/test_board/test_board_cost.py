@@ -233,7 +233,7 @@ def test_axes_end_past_their_values() -> None:
 
 
 def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
-    """Without any entry the floors stand there, and what the simulator takes."""
+    """Without any entry there are the reference predictors and the simulator's time."""
     board = tmp_path / "board"
     (board / "submissions").mkdir(parents=True)
     target = tmp_path / "cost.svg"

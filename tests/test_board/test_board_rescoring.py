@@ -170,7 +170,7 @@ def test_what_is_said_beside_the_numbers_is_compared(
     own: BoardBench, predictions: Path
 ) -> None:
     """Flags and frozen scenarios are those that the scorer tells; so are the scores of
-    floors.
+    reference predictors.
     """
 
     def change_flags(entry: dict[str, Any]) -> None:
@@ -397,7 +397,7 @@ CHANGES: dict[str, tuple[Change, str, str]] = {
         LISTED,
         "changed",
     ),
-    "floors changed": (
+    "reference scores changed": (
         removed(PREDICTOR),
         PREDICTOR,
         "removed",

@@ -397,16 +397,18 @@ def test_a_score_file_that_is_too_long_is_not_published(
     assert tree(own.folder) == before
 
 
-def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> None:
+def test_scores_of_reference_predictors_are_added_by_themselves(
+    own: BoardBench, predictions: Path
+) -> None:
     """Those that are missing, or of another data set, are written anew, the same bytes
     whoever submits.
     """
     folder = own.folder / "floors/cavity/tiny"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {
-        f"{floor.name}.nc"
-        for floor in references_of(own.data.size)
-        if floor.counts and not floor.reads_train
+        f"{reference.name}.nc"
+        for reference in references_of(own.data.size)
+        if reference.counts and not reference.reads_train
     }
     first = min(before)
     (folder / first).unlink()

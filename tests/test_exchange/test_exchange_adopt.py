@@ -160,9 +160,7 @@ def test_the_same_arrays_give_the_same_split(
 def test_a_local_split_is_verified_templated_and_scored(
     own: LocalSplit, tmp_path: Path
 ) -> None:
-    """Commands take its folder; straight flight is what the constant-velocity floor
-    predicts.
-    """
+    """Commands take its folder; straight flight is what constant-velocity predicts."""
     path = str(own.folder)
     assert lagbench.verify(path).verdict == "equal to split.yaml"
     target = tmp_path / "predictions.nc"
