@@ -598,7 +598,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def count_start_steps(record: Mapping[str, Any]) -> int:
     """Return the steps of the earlier trainings from whose weights a training began."""
     budget = record.get("budget", record)
-    return budget.get("start_steps") or 0
+    return int(budget.get("start_steps") or 0)
 
 
 def format_budget(record: Mapping[str, Any]) -> str:
