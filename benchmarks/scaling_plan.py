@@ -6,9 +6,10 @@ million particles.
 writes scaling_plan.md and prints it. Row q has the particles, grid and substeps of the
 thesis's Table 3.1; a body of liquid, four particles per cell, falls (split fluid,
 scenario 0). Costs are processor times, so that other processes do not count: of parts
-(solver, file, hash), and of whole generations with their checks, twin and cards, at two
-numbers of frames. Peak memory is that of the largest process; its growth between the
-two numbers of frames says what of it depends on the length of a scenario.
+(solver, file, hash), and of whole generations with their checks, perturbed run and
+cards, at two numbers of frames. Peak memory is that of the largest process; its growth
+between the two numbers of frames says what of it depends on the length of a
+scenario.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ PLANNED = 600
 
 TESTS = 0.1
 HORIZON = 298
-"""Share of test scenarios, and frames that their twins take."""
+"""Share of test scenarios, and frames that their perturbed runs take."""
 
 _AREA = 0.25
 _COURANT = 0.4
@@ -68,7 +69,7 @@ class Parts:
 
 @dataclass(frozen=True, kw_only=True)
 class Whole:
-    """One generation of a scenario and one of a test scenario with its twin."""
+    """Generations of a scenario, and of a test scenario with its perturbed run."""
 
     frames: int  # frames of each
     seconds: float  # processor time of all processes [s]
@@ -179,7 +180,7 @@ def measure_parts(row: ThesisRow, frames: int, root: Path) -> Parts:
 
 
 def measure_whole(row: ThesisRow, frames: int, root: Path) -> Whole:
-    """Generate one scenario and one with a twin, one after the other, by one worker."""
+    """Generate a scenario and one with a perturbed run, one after the other."""
     start = time.process_time()
     generate(
         "fluid",
@@ -270,7 +271,7 @@ def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
 
 
 def expected(row: ThesisRow, p: Parts, frames: int) -> float:
-    """Return what two scenarios and a twin should take by the parts [s]."""
+    """Return what two scenarios and a perturbed run should take by the parts [s]."""
     substeps = (frames - 1) * row.substeps
     simulation = p.draw + substeps * p.substep
     writing = frames * p.write
@@ -292,7 +293,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     frame_seconds = row.substeps * p.substep  # to simulate a frame, per particle
     simulating = hours * (p.draw + (frames - 1) * frame_seconds)
     writing = frame_hours * p.write
-    twins = TESTS * hours * (p.draw + HORIZON * frame_seconds)
+    perturbed_hours = TESTS * hours * (p.draw + HORIZON * frame_seconds)
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
     perturbed_runs = (
@@ -304,7 +305,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
         "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB each)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{writing:,.0f} core hours",
-        perturbed_runs: f"{twins:,.0f} core hours",
+        perturbed_runs: f"{perturbed_hours:,.0f} core hours",
         train_statistics: f"{statistics:,.0f} core hours",
         "one `lagbench verify`": f"{checking:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",

@@ -1,6 +1,7 @@
 """Gates: what the weights of a graph network must do before they support a claim.
 
     python -m studies.gates --root FOLDER [-o leaderboard] [--weights FILE ...]
+    python -m studies.gates --recorded
 
 A graph network that fails them was trained too little or with settings that do not fit:
 comparing it with another method says nothing about the method. On ``valid``:
@@ -12,7 +13,10 @@ comparing it with another method says nothing about the method. On ``valid``:
 - *densest cell*: particles in the fullest cell of the score grid in rollouts, over
   those in the truth. A large number is a collapse.
 
-Free flight and rest have no meaning in full boxes without gravity.
+Free flight and rest have no meaning in full boxes without gravity. On a free surface
+they are not measured where no window of ``valid`` falls freely or is at rest.
+``--recorded`` measures nothing: it prints the table of the active entries from the
+leaderboard's gates.json.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +43,7 @@ from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
 from lagbench.baselines.simulator import GraphNetwork
 from lagbench.board.entry import Status
 from lagbench.board.entry_file import read_entry
-from lagbench.board.folder import Folder
+from lagbench.board.folder import GATES, Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
@@ -65,7 +69,10 @@ REST_LIMIT = 0.05  # of a settled window: root-mean-square acceleration, in g
 
 @dataclass(frozen=True, kw_only=True)
 class Gates:
-    """The measures of one file of weights; None where a gate has no meaning."""
+    """The measures of one file of weights.
+
+    They are None where a gate has no meaning or was not measured.
+    """
 
     split: str
     size: str
@@ -266,8 +273,28 @@ def read_recorded(path: Path) -> list[dict[str, Any]]:
     return lines
 
 
+def active_rows(folder: Folder) -> list[Gates]:
+    """Return the recorded measures of the weights of active entries."""
+    active_hashes = set()
+    for entry_path in folder.entries():
+        entry = read_entry(folder.path / entry_path)
+        if entry.status is Status.ACTIVE:
+            for prediction in entry.predictions:
+                if prediction.weights is not None:
+                    active_hashes.add(prediction.weights.sha256)
+    rows = []
+    for line in read_recorded(folder.path / GATES):
+        if line["weights_sha256"] in active_hashes:
+            measures = {field.name: line[field.name] for field in fields(Gates)}
+            rows.append(Gates(**measures))
+    return rows
+
+
 def to_markdown(rows: Iterable[Gates]) -> str:
-    """Return the table of all measures."""
+    """Return the table of all measures.
+
+    A dash stands for a gate that has no meaning in a full box.
+    """
     lines = [
         "| data set | weights | one step | free flight [g] | settled [g] "
         "| densest cell | verdict |",
@@ -278,17 +305,21 @@ def to_markdown(rows: Iterable[Gates]) -> str:
         cells = [
             f"{row.split} {row.size} {row.dataset_version}",
             row.method.replace("_", "\\_"),
-            *(_format(getattr(row, name)) for name in LIMITS),
+            *_format_measures(row),
             verdict,
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _format(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}"
+def _format_measures(row: Gates) -> list[str]:
+    gravity = load_registry().size(row.split, row.size).parameters.get("gravity")
+    missing = "not measured" if gravity is not None and gravity.value else "-"
+    cells = []
+    for name in LIMITS:
+        value = getattr(row, name)
+        cells.append(missing if value is None else f"{value:.3g}")
+    return cells
 
 
 def board_weights(folder: Folder, splits: Sequence[str], size: str) -> list[Path]:
@@ -342,7 +373,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenarios", type=int, default=8)
     parser.add_argument("--rollouts", type=int, default=4)
     parser.add_argument("--output", "-o", type=Path, help="folder of gates.json")
+    parser.add_argument(
+        "--recorded", action="store_true", help="print recorded measures only"
+    )
     options = parser.parse_args(arguments)
+    if options.recorded:
+        sys.stdout.write(to_markdown(active_rows(Folder(BOARD))))
+        return 0
     if options.root is None:
         parser.error("name the folder of all data sets: --root FOLDER")
 

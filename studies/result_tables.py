@@ -26,6 +26,7 @@ from .thesis.roster import label
 from .thesis.split_results import (
     Method,
     SplitResults,
+    count_start_steps,
     format_budget,
     format_hardware,
 )
@@ -69,9 +70,11 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     """Return in one sentence each where models beat a solver of their cost.
 
     The model is the best learned or hybrid one of a data set of known cost, as on the
-    page of the leaderboard.
+    page of the leaderboard. A sentence says on how many data sets it is slower than the
+    simulator.
     """
     pays = []
+    time_ratios = []  # time of a frame over the simulator's, where learning pays
     open_sets = []
     without_interval = []
     does_not_pay = []
@@ -87,6 +90,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         verdict = verdict_of_interval(*against.interval)
         if verdict is LearningVerdict.PAYS:
             pays.append(results.where)
+            time_ratios.append(time_over_simulator(results, model))
         elif verdict is LearningVerdict.DOES_NOT_PAY:
             does_not_pay.append(results.where)
         elif math.isnan(sum(against.interval)):
@@ -100,6 +104,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             " more accurate than every classical solver of lagbench that costs no more"
             " per frame."
         )
+        sentences += slower_than_simulator(time_ratios)
     if open_sets:
         sentences.append(
             f"On {_join(open_sets)} the interval contains 1: the question is open."
@@ -125,6 +130,46 @@ def deciding_model(results: SplitResults) -> str | None:
         if is_model and results.seconds_per_frame(name) is not None:
             return name
     return None
+
+
+def time_over_simulator(results: SplitResults, model: str) -> float | None:
+    """Return the time of a frame of a model over that of the solver of the data.
+
+    Both were measured on one machine, in one run if there is such a run. None where a
+    time is not known.
+    """
+    method = results.methods[model]
+    for cost in (method.measured, method.cost):
+        if cost is not None and cost.speed_up is not None:
+            return 1.0 / cost.speed_up
+    return None
+
+
+def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
+    """Return a sentence on how often models take longer than the simulator.
+
+    There is no sentence if no model does.
+
+    Args:
+        ratios: time of a frame over the simulator's, one per data set; None where it is
+            not known.
+    """
+    slower = sorted(ratio for ratio in ratios if ratio is not None and ratio > 1.0)
+    if not slower:
+        return []
+    least = number(slower[0], 2)
+    most = number(slower[-1], 2)
+    times = f"{least} to {most} times as much"
+    if least == most:
+        times = f"{most} times as much"
+    place = ""
+    if len(ratios) > 1:
+        place = f"On {len(slower)} of these {len(ratios)} data sets "
+    sentence = (
+        f"{place}this model takes more time per frame than the simulator that made the"
+        f" data ({times})."
+    )
+    return [sentence[0].upper() + sentence[1:]]
 
 
 def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
@@ -231,13 +276,17 @@ def _training_row(results: SplitResults, name: str) -> list[str]:
     method = results.models[name]
     record = method.trainings[0].record
 
+    # hours and steps are those of the whole chain of trainings
+    start_steps = count_start_steps(record)
+    all_steps = start_steps + record.get("step", 0)
+
     validated_metric = "-"
     values_by_step = []
     for entry in record.get("validation", ()):
         # beside the step an entry holds one number, the metric that was validated
         for metric, value in entry.items():
             if metric != "step":
-                values_by_step.append((entry["step"], value))
+                values_by_step.append((start_steps + entry["step"], value))
                 if validated_metric == "-":
                     validated_metric = metric
 
@@ -245,7 +294,7 @@ def _training_row(results: SplitResults, name: str) -> list[str]:
     for share in (0.25, 0.5, 1.0):
         least = None
         for step, value in values_by_step:
-            if step <= share * record["step"]:
+            if step <= share * all_steps:
                 least = value if least is None else min(least, value)
         least_values.append(least)
     _, half, whole = least_values
@@ -255,7 +304,7 @@ def _training_row(results: SplitResults, name: str) -> list[str]:
 
     epochs = None
     if "windows" in record:
-        windows_seen = record["step"] * record["recipe"]["training"]["batch"]
+        windows_seen = all_steps * record["recipe"]["training"]["batch"]
         if windows_seen:
             epochs = windows_seen / record["windows"]
     return [

@@ -45,7 +45,6 @@ from .thesis.roster import (
 )
 from .thesis.split_results import (
     BOARD,
-    COMMITTED_STUDIES,
     WEIGHTS,
     Sources,
     SplitResults,
@@ -144,7 +143,8 @@ The three validation columns show the first seed. They have the lowest validatio
 in the first quarter, the first half and all of the steps. `validated` is the metric of
 this error. The last column shows how much the error decreased in the second half of the
 steps. If it decreased by more than 2 %, the training has not converged. Hours do not
-include validations. (The first trainings of NeuralMPM are an exception.)"""
+include validations. (The first trainings of NeuralMPM are an exception.) If a training
+started from the weights of earlier trainings, steps, epochs and hours include these."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
@@ -169,10 +169,11 @@ lagbench submit predictions.nc --from meta.yaml
 and figures of a size. If you interrupt it, the same command continues.
 `lagbench submit` makes entries from its runs.
 
-Results without an entry come from two files in `docs/studies/<split>/<size>/`.
-`mlp_studies.json` is a copy of the file with this name in the folder of runs
-(`--runs`). `var_protocol.json` is the output of
-`python -m studies.thesis.var_protocol --size mini --json`.
+Results without an entry come from two files in `<split>/<size>/` of a folder.
+`--studies` or `--runs` names this folder. `python -m studies.thesis` writes
+`mlp_studies.json` into the folder of runs. `var_protocol.json` is the output of
+`python -m studies.thesis.var_protocol --size mini --json`. None of these files is
+committed, so this page does not show such results.
 
 A variant is a model with other options, with another recipe, or with another way of
 prediction:"""
@@ -309,7 +310,7 @@ def _vorticity_note(results: SplitResults) -> str:
 
 
 def _protocols(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
-    """Yield the results of VAR by the thesis's protocol, committed ones first."""
+    """Yield the results of VAR by the thesis's protocol, those of --studies first."""
     for size in sizes:
         for home in (sources.studies, sources.runs):
             if home is None:
@@ -395,8 +396,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--studies",
         type=Path,
-        default=COMMITTED_STUDIES,
-        help="folder of committed results without an entry",
+        help="folder of results without an entry, beside those of --runs",
     )
     parser.add_argument("--root", type=Path, help="not needed: no data set is read")
     parser.add_argument(

@@ -18,7 +18,9 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.board.build import Scope, collect
+from lagbench.board.folder import Folder
 from lagbench.board.model import OnShift, ReferenceRow, Tab
+from lagbench.data.registry import load
 from lagbench.figures.chart import AxisScale, Plot, Spot, Tick, close_logarithmic
 from lagbench.figures.html import Markup, words
 from lagbench.figures.tables import markdown
@@ -26,6 +28,7 @@ from lagbench.figures.tables import markdown
 from .panels import join_charts
 
 KINDS = ("naive", "classical", "learned", "hybrid")
+SHIFT = "shift"  # the subset
 HEIGHT = 420
 SIDES = AxisScale(-0.2, 2.2, False, 0, (Tick(0.0, "test"), Tick(1.0, "shift")))
 """Test and shift side by side; the names of the methods stand to the right."""
@@ -41,6 +44,23 @@ class ShiftedRow:
     shift: float
     skill: float | None  # on test; None for a reference predictor
     skill_on_shift: float | None
+
+
+def collect_shifted(board: Path, size: str) -> list[tuple[Tab, list[ShiftedRow]]]:
+    """Return the data sets of a size with methods that were scored on shift."""
+    registry = load()
+    places = set()
+    for path in Folder(board).entries():
+        split = path.parts[1]
+        if path.parts[2] == size and SHIFT in registry.size(split, size).subsets:
+            places.add((split, size))
+    scope = Scope(metrics=(), intervals=(), has_pictures=False)
+    chosen = []
+    for tab in collect(board, only=places, scope=scope).tabs:
+        rows = rows_of(tab)
+        if rows:
+            chosen.append((tab, rows))
+    return chosen
 
 
 def rows_of(tab: Tab) -> list[ShiftedRow]:
@@ -186,12 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output", "-o", type=Path, default=Path("docs/figures/shift.svg")
     )
     options = parser.parse_args(arguments)
-    scope = Scope(metrics=(), intervals=(), has_pictures=False)
-    chosen = []
-    for tab in collect(options.board, scope=scope).tabs:
-        rows = rows_of(tab)
-        if tab.size.name == options.size and rows:
-            chosen.append((tab, rows))
+    chosen = collect_shifted(options.board, options.size)
     charts = [draw(tab, rows) for tab, rows in chosen]
     svg = join_charts(charts, height=HEIGHT)
     write_atomically(options.output, svg.encode(), option="--output")

@@ -6,8 +6,10 @@ PyTorch's counter (``torch.utils.flop_counter``) counts the matrix products and
 convolutions of one training window, a multiplication and an addition as two
 operations. Other operations do not count, so this is an estimate from below. Backward
 costs about twice as much as forward: a training costs three times forward per window,
-times the windows that it saw. Beside it stand the operations of one predicted frame,
-the mean over the first eight.
+times the windows that it saw. A training with pushforward draws for each window how
+many steps come before the loss; the operations are the mean over all these numbers.
+Beside it stand the operations of one predicted frame, the mean over the first eight.
+The first scenario of ``valid`` is read, and no other.
 """
 
 from __future__ import annotations
@@ -15,22 +17,24 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.baseline import Baseline, Batch
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.rollout import scenario_batch, scenario_paths
+from lagbench.baselines.rollout import scenario_batch
 from lagbench.board.entry import Entry, Prediction, Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load as load_registry
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.tables import markdown
 
 FORWARD_SHARE = 3  # forward and backward cost so many times forward
@@ -53,8 +57,66 @@ CUSTOM = {torch.ops.mkldnn._linear_pointwise: count_linear}
 class Operations:
     """Counted operations of a model."""
 
-    window: int  # of the loss of one training window, forward only
+    window: float  # of the loss of one training window, forward only
     frame: float  # of one predicted frame
+
+
+class FixedLength(TorchFunctionMode):
+    """Answer the draw of a single integer with a number that is given.
+
+    The length of a pushforward is the only single integer that our models draw.
+    """
+
+    def __init__(self, length: int) -> None:
+        super().__init__()
+        self.length = length
+        self.draws = 0  # answered so far
+
+    def __torch_function__(
+        self,
+        function: Callable[..., object],
+        types: Sequence[type],
+        arguments: Sequence[object] = (),
+        options: Mapping[str, object] | None = None,
+    ) -> object:
+        """Call a function of torch, and replace a single integer that it draws."""
+        value = function(*arguments, **(options or {}))
+        if function is torch.randint and isinstance(value, Tensor) and not value.dim():
+            self.draws += 1
+            return torch.full_like(value, self.length)
+        return value
+
+
+def count_window(model: Baseline, window: Batch) -> float:
+    """Return the expected operations of the loss of a training window, forward only.
+
+    The number of steps before the loss is uniform from 0 to the option
+    ``pushforward``. Each possible number is counted once.
+
+    Raises:
+        UsageError: the model draws its number of steps in another way.
+    """
+    longest = getattr(model.options, "pushforward", 0)
+    model.train()
+    total = 0
+    for length in range(longest + 1):
+        generator = torch.Generator().manual_seed(0)
+        with (
+            torch.no_grad(),
+            FixedLength(length) as fixed,
+            FlopCounterMode(display=False, custom_mapping=CUSTOM) as counter,
+        ):
+            model(window, generator)
+        if longest and fixed.draws != 1:
+            raise UsageError(
+                "the number of steps before the loss cannot be set",
+                where=f"{type(model).__name__}.forward",
+                expected="one draw of a single integer by torch.randint",
+                got=f"{fixed.draws} draws",
+                fix="adapt FixedLength in studies/training_flops.py",
+            )
+        total += counter.get_total_flops()
+    return total / (longest + 1)
 
 
 def count(model: Baseline, path: Path, viscosity: float | None) -> Operations:
@@ -63,14 +125,7 @@ def count(model: Baseline, path: Path, viscosity: float | None) -> Operations:
     window = scenario_batch(path, slice(START, START + length), viscosity=viscosity)
     if model.origin:
         window = scenario_batch(path, slice(length), viscosity=viscosity)
-    generator = torch.Generator().manual_seed(0)
-    model.train()
-    with (
-        torch.no_grad(),
-        FlopCounterMode(display=False, custom_mapping=CUSTOM) as counter,
-    ):
-        model(window, generator)
-    window_operations = counter.get_total_flops()
+    window_operations = count_window(model, window)
 
     model.eval()
     with (
@@ -95,10 +150,8 @@ def count_entry(folder: Folder, entry: Entry, root: Path) -> Operations | None:
         path = folder.path / weights.path
         model = restore(load(path), where=str(path))
         size = load_registry().size(entry.split, entry.size)
-        scenarios = scenario_paths(
-            entry.split, subset="valid", size=entry.size, root=root
-        )
-        return count(model, next(iter(scenarios.values())), size.viscosity())
+        scenario = size.path(root, size.subsets["valid"][0])
+        return count(model, scenario, size.viscosity())
     return None
 
 
@@ -167,8 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     heads = (
         "data set",
         "model",
-        "windows",
-        "forward per window [GFLOP]",
+        "windows seen",
+        "forward pass of a window [GFLOP]",
         "training [TFLOP]",
         "predicted frame [MFLOP]",
     )

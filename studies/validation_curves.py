@@ -4,9 +4,10 @@
         [--board leaderboard]
 
 One chart per data set; a line per training: the validation error over the windows that
-the training had seen. The values stand in the budgets of the entries, or in the record
-beside the weights. A training that was validated once is a dot. Fits in one step, and
-trainings that were validated by another metric than the ranking one, are left out.
+the training had seen. Windows of earlier trainings, from whose weights it started,
+count too. The values stand in the budgets of the entries, or in the record beside the
+weights. A training that was validated once is a dot. Fits in one step, and trainings
+that were validated by another metric than the ranking one, are left out.
 """
 
 from __future__ import annotations
@@ -93,9 +94,13 @@ def _curves_of_entry(folder: Folder, entry: Entry) -> Iterator[ValidationCurve]:
             continue
         windows = []
         errors = []
+        start_steps = 0
+        if prediction.budget is not None:
+            start_steps = prediction.budget.start_steps or 0
         for step, error in validations:
-            if step > 0 and error > 0.0:
-                windows.append(step * windows_per_step)
+            all_steps = start_steps + step
+            if all_steps > 0 and error > 0.0:
+                windows.append(all_steps * windows_per_step)
                 errors.append(error)
         if windows:
             yield ValidationCurve(

@@ -20,7 +20,7 @@ cube
     Lid-driven cube at Re 100 against the staggered grid of the reference predictors.
 cube-1000
     Lid-driven cube at Re 1000 on a grid of 32 cells beside Albensoeder and Kuhlmann
-    (2005). The data have Reynolds numbers up to 50, so the bound is wide.
+    (2005). The data have Reynolds numbers up to 100, so the bound is wide.
 strouhal
     Frequency of the vortices behind a disc at Re 100, f D / U, against Williamson
     (1989). The disc has 8 cells across and blocks 1/12 of a channel, which raises the

@@ -55,7 +55,7 @@ class CheckResult:
     reproduced_wholly: int = 0  # on all test scenarios
     reproduced_partly: int = 0  # on a part of them
     # reference predictors that were measured again, by data set, as in "cavity mini"
-    floors: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    references: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -75,7 +75,7 @@ def check_board(
     isolated: bool = True,
     predictions: Sequence[str | Path] = (),
     recording: bool = False,
-    floors: Collection[Size] = (),
+    measured_sizes: Collection[Size] = (),
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
@@ -91,7 +91,8 @@ def check_board(
             shared weights.
         predictions: files of predictions of entries, which are scored again.
         recording: whether to note confirmed entries in verified.yaml.
-        floors: sizes whose shipped scores of reference predictors are measured again.
+        measured_sizes: sizes whose shipped scores of reference predictors are measured
+            again.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         progress: called as the work advances.
 
@@ -130,8 +131,10 @@ def check_board(
     )
     for path in predictions:
         issues += rescoring.rescore(path)
-    measured, issues_of_floors = _measure_floors(floors, root, progress)
-    issues += issues_of_floors
+    references, issues_of_references = _measure_references(
+        measured_sizes, root, progress
+    )
+    issues += issues_of_references
 
     confirmed, partly = _group_confirmed(checks.entries, rescoring.confirmations)
     recorded: list[Entry] = []
@@ -153,7 +156,7 @@ def check_board(
         partly=partly,
         reproduced_wholly=reproduced_wholly,
         reproduced_partly=reproduced_partly,
-        floors=measured,
+        references=references,
     )
 
 
@@ -166,8 +169,8 @@ def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
     return find_unreadable(whole_paths)
 
 
-def _measure_floors(
-    floors: Collection[Size],
+def _measure_references(
+    sizes: Collection[Size],
     root: str | Path | None,
     progress: Callable[[Progress], None] | None,
 ) -> tuple[dict[str, tuple[str, ...]], list[ValidationIssue]]:
@@ -178,7 +181,7 @@ def _measure_floors(
     """
     measured = {}
     issues = []
-    for size in floors:
+    for size in sizes:
         names, differing = remeasure(size, resolve_root(root), progress=progress)
         measured[f"{size.split} {size.name}"] = names
         issues += _issues_of_measured(size, differing)

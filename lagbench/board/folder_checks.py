@@ -98,7 +98,7 @@ class FolderChecks:
             isolated=self.isolated,
         )
         self._check_successors()
-        self._check_twins()
+        self._check_duplicates()
         self._check_names()
         self._check_stray_score_files(unreadable_places)
         self._check_verified(unreadable_places)
@@ -371,15 +371,15 @@ class FolderChecks:
             size = self.registry.size(*path.parts[1:3])
             if path.stem not in REFERENCES or file in self.unreadable:
                 got = self.unreadable.get(file, "an unknown name")
-                self._add("floor", path, got, expected=", ".join(REFERENCES))
+                self._add("reference", path, got, expected=", ".join(REFERENCES))
                 return
             identity = read_score_file(file, size).scores.identity
         except LagbenchError as error:
-            self.issues.append(issue_from_error("floor", error, path))
+            self.issues.append(issue_from_error("reference", error, path))
             return
         if not is_current(dataset_of(identity), size):
             self._add(
-                "floor",
+                "reference",
                 path,
                 identity["dataset_sha256"],
                 what="scores on another data set",
@@ -415,7 +415,7 @@ class FolderChecks:
                 got = " -> ".join(method for _, _, method in line)
                 self._add("lifecycle", entry_path(place), got)
 
-    def _check_twins(self) -> None:
+    def _check_duplicates(self) -> None:
         """Check that the same predictions stand under one name and seed only."""
         reported = set()
         for scored_entries in self._scored.values():
@@ -429,7 +429,7 @@ class FolderChecks:
                 is_same_data_set = path.parts[1:3] == paths[0].parts[1:3]
                 if is_same_data_set and path not in reported:
                     reported.add(path)
-                    self._add("twin", path, f"those of {paths[0]}")
+                    self._add("duplicate", path, f"those of {paths[0]}")
 
     def _check_names(self) -> None:
         """Check that no two names of active entries look alike."""

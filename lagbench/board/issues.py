@@ -142,7 +142,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "submit with the weights again: lagbench submit --weights; or remove what no "
         "entry names",
     ),
-    "twin": BoardCheck(
+    "duplicate": BoardCheck(
         "the same predictions submitted twice, under two names or two seeds",
         "the same predictions stand here twice",
         "predictions of its own",
@@ -155,7 +155,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "an entry that names these predictions",
         "add its entry, or remove it",
     ),
-    "floor": BoardCheck(
+    "reference": BoardCheck(
         "a score file of a reference predictor that is unknown, cannot be read, or is "
         "of another data set",
         "no reference predictor of the scorer",

@@ -170,7 +170,7 @@ def check_command(
             own=own or (),
             predictions=predictions or (),
             recording=recording,
-            floors=sizes,
+            measured_sizes=sizes,
             root=root,
             progress=progress,
         )
@@ -211,7 +211,7 @@ def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
             f"{confirmation.predictions}: confirms {confirmation.score_file} of "
             f"{confirmation.entry} {precision}"
         )
-    for data_set, predictors in result.floors.items():
+    for data_set, predictors in result.references.items():
         yield f"{data_set}: measured again {', '.join(predictors)}"
     for entry in result.recorded:
         yield f"recorded as verified: {entry}"

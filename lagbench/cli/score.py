@@ -150,7 +150,7 @@ def _print_cards(
 ) -> None:
     for card in cards:
         if every or all_references:
-            print_tables(card_tables(card, every=every, floors=all_references))
+            print_tables(card_tables(card, every=every, all_references=all_references))
             lines = flag_lines(card)
         else:
             print_tables([brief_table(card)])

@@ -6,7 +6,7 @@ Node velocity is ``sum_p(w u) / sum_p(w)``. The weight w is the product over the
     b(s) = 3/4 - s^2             for |s| <= 1/2,
     b(s) = (3/2 - |s|)^2 / 2     for 1/2 <= |s| <= 3/2, else 0.
 
-The scorer, the plots and the differentiable twin in the training loss share this one
+The scorer, the plots and the differentiable fields in the training loss share this one
 definition. A box has two or three axes, between walls or periodic. Arrays of particles
 have shape [..., particle, axis]. Fields have one axis of nodes for each axis of the
 box: [..., x node, y node] in two dimensions, written [..., *node] below. Leading axes

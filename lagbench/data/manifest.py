@@ -137,7 +137,7 @@ class Manifest(_ManifestModel):
         return self.model_copy(update={"files": files})
 
     def mean_twin_floor(self) -> tuple[float, ...]:
-        """Return the mean twin floor over test at each frame that all have [length].
+        """Return the mean predictability limit over test at frames of all [length].
 
         Nine digits; empty where a test scenario has no perturbed run.
         """

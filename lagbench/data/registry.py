@@ -2,8 +2,8 @@
 
 A split is a family of simulated scenarios, a size one tier of it. Everything that
 decides bits (parameters, scenario ids, frame counts) is written by hand. Everything
-that follows from them (hashes, statistics, twin floor) stands under ``measured`` and is
-written by ``python -m lagbench.generators.record``.
+that follows from them (hashes, statistics, predictability limit) stands under
+``measured`` and is written by ``python -m lagbench.generators.record``.
 
 Other packages may add splits. None of them can harm ours.
 """
@@ -185,7 +185,7 @@ class Task(_RegistryModel):
 
 
 class Measured(_RegistryModel):
-    """Hashes, statistics of train and twin floor; they follow from the parameters."""
+    """Hashes, statistics of train, predictability limit: results of the parameters."""
 
     dataset_sha256: Hash  # data set hash over train, valid and test
     subset_sha256: dict[str, Hash]  # hash of each subset

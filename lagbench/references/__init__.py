@@ -1,4 +1,4 @@
-"""Floors: predictions that cost no learning, and their scores on our data sets.
+"""Reference predictors, which learn nothing, and their scores on our data sets.
 
 Rows of every table, report and board, none of which is ranked. :data:`REFERENCES` names
 them, :func:`references_of` says which of them a split and size has,

@@ -119,7 +119,8 @@ class ComparisonResult:
     ranking: str  # name of the metric that ranks
     scenarios: int  # number of scenarios that both have in that metric
     seeds: tuple[int, int]  # of each method
-    floor: bool  # whether the second is a reference, which has no seeds
+    # whether the second is a reference predictor, which has no seeds
+    is_against_reference: bool
     # the ranking one first; observables are left out
     metrics: Mapping[str, MetricComparison]
 
@@ -166,9 +167,9 @@ class ComparisonResult:
     @property
     def _seeds_in_words(self) -> str:
         first, second = self.seeds
-        if self.floor and first == 1:
+        if self.is_against_reference and first == 1:
             return "one seed: these weights, not the method"
-        if self.floor:
+        if self.is_against_reference:
             return f"{first} seeds"
         if first == second == 1:
             return "one seed each: these weights, not the methods"
@@ -391,7 +392,7 @@ def _describe(
         ranking=one.ranking,
         scenarios=len(comparisons[one.ranking].test.scenarios),
         seeds=(len(one.predictions), len(two.predictions)),
-        floor=is_reference,
+        is_against_reference=is_reference,
         metrics=comparisons,
     )
 

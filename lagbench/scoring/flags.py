@@ -51,7 +51,7 @@ ENERGY = (0.1, 10.0)
 OCCUPANCY = (0.5, 1.5)
 """Range of filled area over the truth's outside of which ``physics`` is raised."""
 
-TWIN_REGULAR = 0.1
+REGULAR_SHARE = 0.1
 """The predictability limit counts below this share of the RMSE of persistence."""
 
 ROUNDING = 2.0**-20
@@ -268,14 +268,17 @@ def judge_predictability(
     name = "below_twin_floor"
     if len(limit) != len(error):
         return Flag(
-            name=name, raised=None, reasons=("no twin floor is recorded",), evidence={}
+            name=name,
+            raised=None,
+            reasons=("no predictability limit is recorded",),
+            evidence={},
         )
 
     perturbed = np.asarray(limit, np.float64)
-    is_compared = perturbed < TWIN_REGULAR * persistence
+    is_compared = perturbed < REGULAR_SHARE * persistence
     is_below = is_compared & (error < perturbed)
     count = int(np.count_nonzero(is_below))
-    reason = f"{count} frames are closer to the truth than the solver's twin"
+    reason = f"{count} frames are closer to the truth than the perturbed run"
     evidence = {
         "frames_below": float(count),
         "frames_compared": float(np.count_nonzero(is_compared)),

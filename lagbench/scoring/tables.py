@@ -54,15 +54,15 @@ FLAG_STATES = {True: "raised", False: "not raised", None: "unknown"}
 
 
 def card_tables(
-    card: ScoreCard, *, every: bool = False, floors: bool = False
+    card: ScoreCard, *, every: bool = False, all_references: bool = False
 ) -> Iterator[Table]:
     """Yield tables over the horizon, at frames of interest and per scenario.
 
     Args:
         card: the score card.
         every: whether every metric is shown, not only the chosen ones.
-        floors: whether all references are shown beside the submission, not only the
-            best one.
+        all_references: whether all references are shown beside the submission, not
+            only the best one.
     """
     names = card.chosen_metrics
     if every:
@@ -78,7 +78,7 @@ def card_tables(
                 frame_names.append(name)
 
     references = _best_reference(card)
-    if floors:
+    if all_references:
         references = [row for row in card.scores if row != SUBMISSION]
 
     yield _over_horizon(card, names, references)

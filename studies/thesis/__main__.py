@@ -6,8 +6,8 @@ Complete runs are kept, so an interrupted command can be repeated. It writes Mar
 CSV and PNG to ``RUNS/reproduce/<size>/`` and prints the Markdown.
 
 ``--list`` lists tables and figures, ``--dry-run`` says what would be trained.
-``--no-training`` shows complete runs, committed studies and committed weights, whose
-predictions it makes.
+``--no-training`` shows complete runs, results in the folder ``--studies`` and
+committed weights, whose predictions it makes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .runs import (
     note,
     score_committed,
 )
-from .split_results import COMMITTED_STUDIES, WEIGHTS, format_budget
+from .split_results import WEIGHTS, format_budget
 
 
 def main(
@@ -104,8 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--studies",
         type=Path,
-        default=COMMITTED_STUDIES,
-        help="folder of committed results without an entry",
+        help="folder of results without an entry, beside those of --runs",
     )
     add("--seeds", default="0", help="seeds of every training, as in 0,1")
     add("--recipe", metavar="NAME", help="variant of the recipes, as in short")

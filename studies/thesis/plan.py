@@ -17,7 +17,6 @@ from lagbench.scoring.task import ScoredTask, load_scored_task
 from .published import MLP_STUDIES, MLPStudy
 from .roster import RosterModel
 from .split_results import (
-    COMMITTED_STUDIES,
     WEIGHTS,
     Sources,
     SplitResults,
@@ -37,7 +36,7 @@ TABLES: Mapping[str, tuple[str, str]] = {
 SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
 """Share of the thesis's epochs, and divisor of its batch, by size."""
 
-# results of the rows of these tables, in a folder of runs or of committed studies
+# results of the rows of these tables, in a folder of runs or of other results
 STUDY_FILE = "mlp_studies.json"
 
 
@@ -50,7 +49,7 @@ class Plan:
     runs: Path  # folder of runs; complete runs there are kept
     output: Path  # folder of tables and pictures
     weights: Path = WEIGHTS  # folder of committed weights
-    studies: Path = COMMITTED_STUDIES  # folder of committed results without an entry
+    studies: Path | None = None  # folder of results without an entry
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
     recipe: str | None = None  # variant of the recipes: short; None for the size's own
     settings: tuple[str, ...] = ()  # changes to every recipe: training.steps=100

@@ -54,9 +54,6 @@ BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
 """Folder of committed weights and of the records of their trainings."""
 
-COMMITTED_STUDIES = Path("docs/studies")
-"""Folder of committed results that are no entries of the board."""
-
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
 
@@ -199,7 +196,7 @@ class Sources:
     board: Path | None = BOARD  # the leaderboard's folder; None to use runs alone
     weights: Path = WEIGHTS  # folder of committed weights and training records
     runs: Path | None = None  # folder of runs; None to use committed files alone
-    studies: Path = COMMITTED_STUDIES  # folder of committed results without an entry
+    studies: Path | None = None  # folder of results without an entry
     recipe: str | None = None  # variant of the recipes; None for the size's own
     registry: Registry | None = None  # descriptions of the splits; ours when None
     excluded_runs: frozenset[Path] = frozenset()  # folders of runs to leave out
@@ -548,6 +545,7 @@ def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
     threads = 1 if budget.threads is None else budget.threads
     record: dict[str, Any] = {
         "step": budget.steps,
+        "start_steps": budget.start_steps,
         "cpu_seconds": 3600.0 * budget.cpu_hours,
         "validation": validations,
         "recipe": {
@@ -597,10 +595,20 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
+def count_start_steps(record: Mapping[str, Any]) -> int:
+    """Return the steps of the earlier trainings from whose weights a training began."""
+    budget = record.get("budget", record)
+    return int(budget.get("start_steps") or 0)
+
+
 def format_budget(record: Mapping[str, Any]) -> str:
-    """Return steps and windows per step, as in "5,000 x 2"; a dash where unknown."""
+    """Return steps and windows per step, as in "5,000 x 2"; a dash where unknown.
+
+    Steps of earlier trainings, from whose weights it started, count too.
+    """
     if "windows" in record:
-        return f"{record['step']:,} x {record['recipe']['training']['batch']}"
+        steps = count_start_steps(record) + record["step"]
+        return f"{steps:,} x {record['recipe']['training']['batch']}"
     if record.get("step") == 1:
         return "closed form"
     return "-"

@@ -315,11 +315,13 @@ def vorticity_bars(plan: Plan, item: ThesisItem) -> Sheet:
 def _study_results(plan: Plan, item: ThesisItem) -> dict[str, Any]:
     """Return the results of an item's rows with the plan's first seed.
 
-    Committed results are by plain recipes, so a changed recipe does not use them.
+    Results in the folder ``studies`` are by plain recipes, so a changed recipe does not
+    use them.
     """
     _, split = TABLES[item.studies]
     homes = [plan.home(split)]
-    if not plan.settings and plan.recipe is None:
+    is_plain = not plan.settings and plan.recipe is None
+    if plan.studies is not None and is_plain:
         homes.insert(0, plan.studies / split / plan.size)
     studies = read_study_results(homes, plan.hash(split))
     return {name: row for name, row in studies.items() if row["seed"] == plan.seeds[0]}

@@ -40,7 +40,7 @@ from .published import SECTION_4_8_3
 TRAIN = 0.70  # share of the frames that are fitted
 VALID = 0.15  # share of the frames that are forecast
 
-# output of ``--json``, in a folder of runs or of committed studies
+# output of ``--json``, in a folder of runs or of other results
 FILE_NAME = "var_protocol.json"
 
 REPORTED_FRAMES = (1, 10, 100, 1000)

@@ -486,8 +486,8 @@ def test_json_has_the_numbers_of_the_board(board: Board) -> None:
     assert metric["mean"] == digits(value.mean)
     assert damped["cost"]["speed_up"] == 4.0
     names = sorted(reference.name for reference in board.tabs[0].references)
-    floors = sorted(floor["id"] for floor in plain["floors"])
-    assert floors == names
+    references = sorted(reference["id"] for reference in plain["floors"])
+    assert references == names
     assert damped["shared_with"] == []
 
 

@@ -331,13 +331,13 @@ def add_folder(bench: BoardBench) -> None:
     (folder / "a.yaml").touch()
 
 
-def copy_floor(bench: BoardBench) -> None:
+def copy_reference(bench: BoardBench) -> None:
     """Add scores of a reference predictor that nobody knows."""
     unknown = bench.folder / "floors/cavity/tiny/ceiling.nc"
     shutil.copyfile(bench.folder / PREDICTOR, unknown)
 
 
-def copy_floor_to_another_split(bench: BoardBench) -> None:
+def copy_reference_to_another_split(bench: BoardBench) -> None:
     """Put the scores of a reference predictor under another split."""
     folder = bench.folder / "floors/fluid/tiny"
     folder.mkdir(parents=True)
@@ -365,7 +365,7 @@ DAMAGE: dict[str, Damage] = {
     "schema: number in base 60": text(f"parameters: {':'.join(['59'] * 300)}:1.5\n"),
     "date: date to come": put(date="2999-01-01"),
     "name: look-alike of an entry": put(name="D\u0430MPED"),
-    "name: look-alike of a floor": put(name="Persistence"),
+    "name: look-alike of a reference predictor": put(name="Persistence"),
     "split: unknown split": move_to_unknown_split,
     "version score_file score: old data set": put("dataset", sha256="0" * 64),
     "lifecycle: superseded by nothing": lambda b: superseded(b, "noisy", "none"),
@@ -430,7 +430,7 @@ DAMAGE: dict[str, Damage] = {
     # what may happen to files
     "score_file: edited score file": lambda b: halve(b.folder / NOISY),
     "score: edited score file, hash forged": halve_and_rehash,
-    "score_file score twin: score file of another method": take_scores_of_another,
+    "score_file score duplicate: score file of another method": take_scores_of_another,
     "score_file: score file cut short": cut_scores_short,
     "missing: missing score file": lambda b: scores_of(b, "damped_3").unlink(),
     "stray: stray score file": copy_scores,
@@ -442,10 +442,10 @@ DAMAGE: dict[str, Damage] = {
     "values: negative square": scaled("position_mse", -1.0, whole=False),
     "values: correlation above one": scaled("vorticity_pearson", 2.0),
     "values: no error where there is one": scaled("vorticity_mse", 0.0),
-    "twin: the same predictions again": lambda b: copy_of(
+    "duplicate: the same predictions again": lambda b: copy_of(
         b, "noisy", "other", name="Something else"
     ),
-    "twin: the same errors again": disguised,
+    "duplicate: the same errors again": disguised,
     "folder: entry that is a link": lambda b: link(
         b.entry("noisy"), Path("/etc/passwd")
     ),
@@ -461,9 +461,9 @@ DAMAGE: dict[str, Damage] = {
     "readable: entry of 100 MB": lambda b: os.truncate(b.entry("noisy"), 100_000_000),
     "readable: YAML with aliases": text("a: &a [x]\nb: *a\n"),
     "place: place": move_entry(f"{PLACE}/other.yaml"),
-    "floor: unknown floor": copy_floor,
-    "floor: broken floor": text("CDF", PREDICTOR),
-    "floor: floor of another split": copy_floor_to_another_split,
+    "reference: unknown predictor": copy_reference,
+    "reference: broken score file": text("CDF", PREDICTOR),
+    "reference: scores of another split": copy_reference_to_another_split,
 }
 """What somebody may write into an entry, then what may happen to files: the checks that
 find it, its name.
@@ -589,12 +589,12 @@ def test_each_record_of_an_entry_is_compared_with_the_score_file_of_its_seed(
     assert str(entry.score_paths[1]) in got
 
 
-def test_later_entries_may_supersede_twins(own: BoardBench) -> None:
+def test_later_entries_may_supersede_the_same_predictions(own: BoardBench) -> None:
     """The same predictions under a new name, and a name of old, are well where the old
     entry steps back.
     """
     copy_of(own, "noisy", "new-name")
-    assert set(found(own)) == {"twin", "name"}
+    assert set(found(own)) == {"duplicate", "name"}
     superseded(own, "noisy", "new-name")
     assert found(own) == []
 
@@ -623,12 +623,12 @@ def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
     newer_text = re.sub(r"version: 2\.\d+\.0", "version: 9.0.0", registry_text)
     newer_file.write_text(newer_text)
     newer = load(newer_file)
-    floors = own.folder / "floors"
-    floor_count = len(list(floors.rglob("*.nc")))
+    references = own.folder / "floors"
+    reference_count = len(list(references.rglob("*.nc")))
     result = check_board(own.folder, registry=newer, isolated=False)
     checks = {finding.check for finding in result.findings}
-    assert checks == {"version", "floor"}
-    assert len(result.findings) == 2 + floor_count
+    assert checks == {"version", "reference"}
+    assert len(result.findings) == 2 + reference_count
 
     def withdraw(entry: Entry) -> None:
         entry["status"] = "withdrawn"
@@ -636,7 +636,7 @@ def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
 
     own.edit("noisy", withdraw)
     own.edit("damped", withdraw)
-    shutil.rmtree(floors)
+    shutil.rmtree(references)
     result = check_board(own.folder, registry=newer, isolated=False)
     assert result.findings == ()
 

@@ -397,7 +397,7 @@ CHANGES: dict[str, tuple[Change, str, str]] = {
         LISTED,
         "changed",
     ),
-    "floors changed": (
+    "reference scores changed": (
         removed(PREDICTOR),
         PREDICTOR,
         "removed",

@@ -440,9 +440,9 @@ def test_missing_reference_scores_are_added_when_an_entry_is_submitted(
     folder = own.folder / "floors/cavity/tiny"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {
-        f"{floor.name}.nc"
-        for floor in references_of(own.data.size)
-        if floor.counts and not floor.reads_train
+        f"{reference.name}.nc"
+        for reference in references_of(own.data.size)
+        if reference.counts and not reference.reads_train
     }
     first = min(before)
     (folder / first).unlink()

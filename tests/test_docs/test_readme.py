@@ -231,7 +231,7 @@ def test_thresholds_of_the_flags() -> None:
     assert f"outside {low:g} to {high:g} times" in TEXT
     low, high = flags.OCCUPANCY
     assert f"outside {low:g} to {high:g} times" in TEXT
-    assert flags.TWIN_REGULAR == 0.1
+    assert flags.REGULAR_SHARE == 0.1
     assert "more than a tenth of the RMSE of `persistence`" in TEXT
 
 

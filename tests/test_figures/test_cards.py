@@ -369,15 +369,13 @@ def test_a_card_lists_the_variables_of_its_files(
     assert f"|  | {columns} |" in text
 
 
-def test_the_twin_floor_is_the_mean_over_test(tmp_path: Path) -> None:
-    """Two perturbed runs that drift to 2e-3 and 4e-3 have a limit of 3e-3 at the last
-    frame.
-    """
+def test_the_predictability_limit_is_the_mean_over_test(tmp_path: Path) -> None:
+    """Two perturbed runs drift to 2e-3 and 4e-3, so the limit is 3e-3 at the end."""
     size, manifest = make(tmp_path, scenarios=(3, 4))
-    floors = ((1e-6, 2e-3), (3e-6, 4e-3))
+    limits = ((1e-6, 2e-3), (3e-6, 4e-3))
     files = []
-    for entry, floor in zip(manifest.files, floors, strict=True):
-        files.append(entry.model_copy(update={"twin_floor": floor}))
+    for entry, limit in zip(manifest.files, limits, strict=True):
+        files.append(entry.model_copy(update={"twin_floor": limit}))
     text = card(size, manifest, files=tuple(files))
     assert "2e-06 at the first predicted frame, 0.003 at the last" in text
 

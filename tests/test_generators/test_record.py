@@ -78,10 +78,10 @@ def test_what_is_recorded_is_what_was_measured(
         e.scenario: e.content_sha256[:16] for e in manifest.files
     }
     assert measured.statistics == manifest.statistics
-    twins = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
+    limits = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
     assert len(measured.twin_floor) == 20
     assert measured.twin_floor[7] == pytest.approx(
-        (twins[0][7] + twins[1][7]) / 2, rel=1e-8
+        (limits[0][7] + limits[1][7]) / 2, rel=1e-8
     )
     assert registry.read_text().startswith(unmeasured_path.read_text().rstrip("\n"))
 
@@ -209,12 +209,12 @@ def test_incomplete_or_changed_data_are_not_recorded(
     (folder / "manifest.json").unlink()
     assert run(root, registry) == 4
     assert "no manifest" in capsys.readouterr().err
-    # Statistics and floors need every scenario, and every test scenario its twin.
+    # Statistics need every scenario, the predictability limit every perturbed run.
     manifest = manifest_of(generated.root)
-    without_twin = [
+    without_perturbed_run = [
         entry.model_copy(update={"twin_floor": ()}) for entry in manifest.files
     ]
-    for part in ({"complete": False}, {"files": tuple(without_twin)}):
+    for part in ({"complete": False}, {"files": tuple(without_perturbed_run)}):
         with pytest.raises(DataError) as caught:
             measured_values(manifest.model_copy(update=part))
         assert caught.value.where == "curl-noise tiny"

@@ -862,7 +862,7 @@ def test_the_whole_table_shows_all_metrics_and_references(
     half_right_card: ScoreCard,
 ) -> None:
     card = half_right_card
-    whole, *_ = card_tables(card, every=True, floors=True)
+    whole, *_ = card_tables(card, every=True, all_references=True)
     names = [row_name(row) for row in whole.rows]
     assert names == ["skill", *card.submission]
     assert len(whole.columns) == len(card.scores) + 1

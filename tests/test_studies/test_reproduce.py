@@ -276,7 +276,7 @@ def test_the_page_shows_models_skill_and_training(sources: Sources) -> None:
     rows = markdown_rows(section, "seeds")
     first_models = [row["model"] for row in rows[:3]]
     assert first_models == ["SuperGAT", "GAT", "GNS"]
-    assert rows[0]["skill"] == "-"  # no floor was scored
+    assert rows[0]["skill"] == "-"  # no naive baseline was scored
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
     trainings = {}
     for row in markdown_rows(page, "last doubling"):
@@ -358,17 +358,17 @@ def test_what_is_missing_is_listed_with_its_command(
         assert len(commands) == 1
 
 
-@pytest.mark.parametrize("floor", [False, True])
+@pytest.mark.parametrize("has_reference", [False, True])
 def test_the_page_works_without_entries(
     plan: Plan,
     sources: Sources,
     tmp_path: Path,
-    floor: bool,
+    has_reference: bool,
 ) -> None:
     """Without entries, or with reference predictors alone: a page without claims that
     names the command for every size.
     """
-    if floor:
+    if has_reference:
         run = plan.folder(SPLIT, "gns", 0)
         shutil.copytree(run, tmp_path / SPLIT / SIZE / "persistence-0")
     page = page_of(replace(sources, runs=tmp_path))
@@ -376,7 +376,7 @@ def test_the_page_works_without_entries(
         assert f"--size {SIZE} --split {split}" in page
     assert "the first is" not in page
     has_section = f"## {SPLIT} {SIZE}" in page
-    assert has_section is floor
+    assert has_section is has_reference
 
 
 @pytest.mark.slow

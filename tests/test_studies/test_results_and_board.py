@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from reproduce_bench import markdown_rows
 
 from lagbench.board.build import collect
+from lagbench.board.folder import Folder
 from lagbench.board.model import Tab
 from lagbench.board.overview import LearningVerdict, judge, verdict_of_interval
+from lagbench.data.yamlfile import read_yaml
 from lagbench.references.predictor import Kind
-from studies.result_tables import deciding_model, verdict_on_learning
-from studies.thesis.split_results import BOARD, Sources, SplitResults
+from studies.result_tables import (
+    deciding_model,
+    slower_than_simulator,
+    training_table,
+    verdict_on_learning,
+)
+from studies.thesis.split_results import BOARD, WEIGHTS, Sources, SplitResults
+from studies.validation_curves import curves_of
 
 
 @pytest.mark.slow
@@ -86,6 +97,42 @@ def test_the_interval_of_a_ratio_decides(
     assert verdict_of_interval(low, high) is verdict
 
 
+@pytest.mark.parametrize(
+    ("ratios", "words"),
+    [
+        ([2.0, 0.5, 8.12, None], r"On 2 of these 4 data sets this .* \(2 to 8.1 "),
+        ([2.0, 0.5], r"On 1 of these 2 data sets this model .* \(2 times as much\)"),
+        ([2.44], r"This model takes more time .* \(2.4 times as much\)"),
+    ],
+)
+def test_data_sets_with_a_model_slower_than_the_simulator_are_counted(
+    ratios: list[float | None], words: str
+) -> None:
+    """The range is that of the slower ones; a time that is not known is not counted."""
+    (sentence,) = slower_than_simulator(ratios)
+    assert re.match(words, sentence)
+
+
+def test_nothing_is_said_where_no_model_is_slower_than_the_simulator() -> None:
+    assert slower_than_simulator([0.5, 1.0, None]) == []
+
+
+def test_the_verdict_compares_times_of_one_run_with_the_simulator() -> None:
+    """On cavity mini the hybrid takes 2.4 times as long as the solver, by the times of
+    leaderboard/verified.yaml.
+    """
+    results = SplitResults(Sources(), "cavity", "mini")
+    path = BOARD / "verified.yaml"
+    lines = read_yaml(path)
+    cost = lines["submissions/cavity/mini/hybrid-projection.yaml"]["cost"]
+    ratio = cost["seconds_per_frame"] / cost["solver"]
+    assert ratio > 1.0
+    assert deciding_model(results) == "hybrid-projection"
+    assert f"simulator that made the data ({ratio:.2g} times" in verdict_on_learning(
+        [results]
+    )
+
+
 def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats() -> (
     None
 ):
@@ -111,3 +158,32 @@ def test_a_model_that_is_cheaper_than_every_solver_stands_beside_those_it_beats(
     less, greater = verdict.split("less than")[1].split("greater than")
     assert " and ".join(beaten) in less
     assert " and ".join(ahead) in greater
+
+
+@pytest.mark.parametrize("has_records", [True, False])
+def test_a_chain_of_trainings_counts_as_a_whole(
+    has_records: bool, tmp_path: Path
+) -> None:
+    """The five trainings of GNS on fluid mini took 5,000, 7,500, 1,500, 1,500 and 1,500
+    windows, as their commands in docs/baselines.md say; train has 7,056. Only the last
+    training was validated at the end, so no earlier half can be compared.
+    """
+    weights = WEIGHTS if has_records else tmp_path
+    results = SplitResults(Sources(weights=weights), "fluid", "mini")
+    rows = {}
+    for row in markdown_rows(training_table([results]), "last doubling"):
+        rows[row["model"]] = row
+    row = rows["GNS, free flight"]
+    assert row["steps x windows"] == "17,000 x 1"
+    assert float(row["epochs"]) == pytest.approx(17_000 / 7_056, rel=2e-3)
+    assert row["validation at 1/4"] == row["1/2"] == "-"
+    assert float(row["1"]) == pytest.approx(0.0634, rel=1e-2)
+    assert row["last doubling"] == "-"
+
+
+def test_a_curve_begins_after_the_windows_of_earlier_trainings() -> None:
+    """GNS on fluid mini was validated after 15,500 and after 17,000 windows."""
+    curves = curves_of(Folder(BOARD))["fluid", "mini"]
+    (curve,) = (curve for curve in curves if curve.name == "GNS, free flight")
+    assert curve.windows == (15_500, 17_000)
+    assert curve.gain is None
