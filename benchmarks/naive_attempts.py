@@ -461,14 +461,13 @@ class Predictors:
             paths.append(path)
         first_path, *other_paths = paths
         first_weight, *other_weights = weights
-        material = case.material
 
         def follow(frames_on: int) -> Floats:
             first = first_path(frames_on)
             total = first_weight * first
             for weight, path in zip(other_weights, other_paths, strict=True):
                 other = path(frames_on)
-                matched = _matched(first, other, material)
+                matched = _matched(first, other, case)
                 total = total + weight * matched
             return np.asarray(total)
 
@@ -604,7 +603,7 @@ class Predictors:
         for frame in case.frames:
             share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
-            target = _matched(cloud, pool, case.material)
+            target = _matched(cloud, pool, case)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
@@ -622,7 +621,7 @@ class Predictors:
             climate = self._mean_cloud(case, frame, images)
             share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
-            target = _matched(cloud, climate, case.material)
+            target = _matched(cloud, climate, case)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
@@ -681,10 +680,15 @@ def _weights(distances: Sequence[float], sharpness: float) -> Floats:
     return np.asarray(weights / total)
 
 
-def _matched(here: Floats, there: Floats, material: Materials) -> Floats:
+def _matched(here: Floats, there: Floats, case: AnalogCase) -> Floats:
     """Return the other cloud in the order in which it lies nearest to this one."""
     partner = assign_particles(
-        here, there, material, material, most_together=MATCHED_TOGETHER
+        here,
+        there,
+        case.material,
+        case.material,
+        case.given.box,
+        most_together=MATCHED_TOGETHER,
     )
     return np.asarray(there[partner])
 
