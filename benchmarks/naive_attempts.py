@@ -1,14 +1,17 @@
-"""Try naive predictors that are none of ours, on fluid and multimaterial mini.
+"""Try naive predictors that are none of ours, on free surfaces.
 
-    python benchmarks/naive_attempts.py --root FOLDER [--split fluid] [--attempt NAME]
-        [-o attempts.json]
+    python benchmarks/naive_attempts.py --root FOLDER [--split fluid] [--size full]
+        [--attempt NAME] [--train-only] [-o attempts.json]
 
 Can anybody find a naive predictor that is much better than ``ballistic-analog``? Each
 attempt below sees train only. Its parameters are those with the least mean distance of
 clouds when each scenario of train is predicted from the other ones; there every fourth
-particle counts. Then test is scored once, with ``cloud_distance`` of the package. The
-script prints one row per attempt: the distance on train, the score on test, and the
-ratio to ``ballistic-analog`` as shipped.
+particle counts, in three dimensions every sixteenth. Then test is scored once, with
+``cloud_distance`` of the package. The script prints one row per attempt: the distance
+on train, the score on test, and the ratio to ``ballistic-analog`` as shipped.
+
+In three dimensions only ``ballistic-analog`` and ``barycentre`` are tried. With
+``--train-only`` the parameters are chosen, and test is neither scored nor needed.
 
 Predictions are formed at the frames that are measured only, so an attempt takes
 seconds a scenario. ``-o`` keeps finished attempts, and a repeated run goes on.
@@ -38,6 +41,7 @@ from lagbench.figures.tables import markdown
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.references.analog_barycentre import MATCHED_TOGETHER
 from lagbench.references.assignment import assign_particles
 from lagbench.references.ballistic_analog import frames_of_flight
 from lagbench.references.extrapolation import ballistic_positions
@@ -55,10 +59,12 @@ from lagbench.scoring.task import load_scored_task
 
 METRIC = "cloud_distance"
 BASELINE = "ballistic-analog"  # the best naive predictor of both, to be beaten
-SPLITS = ("fluid", "multimaterial")
+SPLITS = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
+SIZES = ("mini", "full")
 STRIDE = 4  # frames between the states that are compared
 LAST_STATE = 2 / 3  # share of a scenario's frames within which a state may lie
-THINNING = 4  # every so many particles count when parameters are chosen
+# Every so many particles count when parameters are chosen, by dimension.
+THINNING = {2: 4, 3: 16}
 MEASURED_EVERY = 10  # frames between those at which the metric is measured
 CHOSEN_EVERY = 30  # the same when parameters are chosen
 GOLDEN_RATIO = 0.6180339887498949  # the smaller one; its multiples spread evenly
@@ -193,7 +199,7 @@ class Library:
         """Return the mirrored positions of a scenario [length], and its materials."""
         return self._image(state.scenario, state.mirror)
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - one library lives as long as the run
+    @functools.lru_cache(maxsize=128)  # noqa: B019 - one library lives as long as the run
     def _image(self, scenario: int, mirror: int) -> tuple[Floats, Materials]:
         path = self.size.path(self.root, scenario)
         train = read_train_scenario(path)
@@ -343,6 +349,7 @@ class Predictors:
             own_material,
             material,
             case.given.box,
+            most_together=MATCHED_TOGETHER,
         )
         offset = own_position - image_position[partner]
         last_frame = len(image) - 1
@@ -454,14 +461,13 @@ class Predictors:
             paths.append(path)
         first_path, *other_paths = paths
         first_weight, *other_weights = weights
-        material = case.material
 
         def follow(frames_on: int) -> Floats:
             first = first_path(frames_on)
             total = first_weight * first
             for weight, path in zip(other_weights, other_paths, strict=True):
                 other = path(frames_on)
-                matched = _matched(first, other, material)
+                matched = _matched(first, other, case)
                 total = total + weight * matched
             return np.asarray(total)
 
@@ -599,7 +605,7 @@ class Predictors:
         for frame in case.frames:
             share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
-            target = _matched(cloud, pool, case.material)
+            target = _matched(cloud, pool, case)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
@@ -617,7 +623,7 @@ class Predictors:
             climate = self._mean_cloud(case, frame, images)
             share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
-            target = _matched(cloud, climate, case.material)
+            target = _matched(cloud, climate, case)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
@@ -676,9 +682,16 @@ def _weights(distances: Sequence[float], sharpness: float) -> Floats:
     return np.asarray(weights / total)
 
 
-def _matched(here: Floats, there: Floats, material: Materials) -> Floats:
+def _matched(here: Floats, there: Floats, case: AnalogCase) -> Floats:
     """Return the other cloud in the order in which it lies nearest to this one."""
-    partner = assign_particles(here, there, material, material)
+    partner = assign_particles(
+        here,
+        there,
+        case.material,
+        case.material,
+        case.given.box,
+        most_together=MATCHED_TOGETHER,
+    )
     return np.asarray(there[partner])
 
 
@@ -705,8 +718,13 @@ def _pool(case: AnalogCase) -> Floats:
 
 
 def attempts_on(library: Library) -> tuple[Attempt, ...]:
-    """Return the attempts on a data set; the first is our own, as a check."""
+    """Return the attempts on a data set; the first is our own, as a check.
+
+    In three dimensions there are two of them: the others did not help in the plane.
+    """
     own = Predictors(library)
+    if library.size.box.dimension == 3:
+        return (_shipped_predictor(own), _barycentre(own))
     return (
         *_variants_of_ballistic_analog(own),
         *_attempts_with_other_analogs(own),
@@ -714,15 +732,32 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
     )
 
 
+def _shipped_predictor(own: Predictors) -> Attempt:
+    return Attempt(
+        name="shipped",
+        what="ballistic-analog as shipped, every fourth state",
+        predict=own.shared,
+        choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
+    )
+
+
+def _barycentre(own: Predictors) -> Attempt:
+    return Attempt(
+        name="barycentre",
+        what="Wasserstein mean of k analogs, matched again at each measured frame",
+        predict=own.barycentre,
+        choices=grid(
+            lag=(0, 10),
+            analogs=(2, 3, 5),
+            sharpness=(0.0, 2.0),
+        ),
+    )
+
+
 def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
     """Return ballistic-analog as it is shipped, and with other settings."""
     return (
-        Attempt(
-            name="shipped",
-            what="ballistic-analog as shipped, every fourth state",
-            predict=own.shared,
-            choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
-        ),
+        _shipped_predictor(own),
         Attempt(
             name="offset",
             what="the same, with other factors for the offset from the partner",
@@ -759,16 +794,7 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
                 sharpness=(1.0, 3.0),
             ),
         ),
-        Attempt(
-            name="barycentre",
-            what="Wasserstein mean of k analogs, matched again at each measured frame",
-            predict=own.barycentre,
-            choices=grid(
-                lag=(0, 10),
-                analogs=(2, 3, 5),
-                sharpness=(0.0, 2.0),
-            ),
-        ),
+        _barycentre(own),
         Attempt(
             name="per-material",
             what="separate analogs for each material",
@@ -863,7 +889,7 @@ def cases_of_train(size: Size, root: Path) -> dict[int, AnalogCase]:
             given=given,
             frames=measured_frames(size, CHOSEN_EVERY, active),
             without=scenario,
-            thinning=THINNING,
+            thinning=THINNING[size.box.dimension],
         )
     return cases
 
@@ -884,7 +910,7 @@ def error_on_train(
         for frame in case.frames:
             error = cloud_distance_by_material(
                 clouds[frame],
-                truth[frame, ::THINNING],
+                truth[frame, :: case.thinning],
                 case.material,
             )
             frame_errors.append(error)
@@ -970,8 +996,12 @@ def run(
     *,
     cases: Mapping[int, AnalogCase],
     library: Library,
+    is_scored: bool,
 ) -> dict[str, object]:
-    """Return the chosen parameters of an attempt and its errors."""
+    """Return the chosen parameters of an attempt and its errors.
+
+    Without ``is_scored`` there is no error on test.
+    """
     errors = []
     for choice in attempt.choices:
         error = error_on_train(cases, library, attempt, choice)
@@ -979,13 +1009,15 @@ def run(
     least_error = min(errors)
     best = errors.index(least_error)
     best_choice = attempt.choices[best]
-    return {
+    result: dict[str, object] = {
         "what": attempt.what,
         "chosen": dict(best_choice),
         "choices": len(attempt.choices),
         "train": least_error,
-        "test": score_on_test(size, root, attempt, best_choice),
     }
+    if is_scored:
+        result["test"] = score_on_test(size, root, attempt, best_choice)
+    return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -995,7 +1027,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--root", type=Path)
     parser.add_argument("--split", choices=SPLITS, action="append")
+    parser.add_argument("--size", choices=SIZES, default="mini")
     parser.add_argument("--attempt", action="append", help="only these; all by default")
+    parser.add_argument("--train-only", action="store_true", help="do not score test")
     parser.add_argument("--output", "-o", type=Path, help="keeps finished attempts")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)
@@ -1005,22 +1039,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     rows = []
     for split in options.split or SPLITS:
-        size = load().size(split, "mini")
+        size = load().size(split, options.size)
         library = Library(size, root)
         cases = cases_of_train(size, root)
         baseline = baseline_score(size)
-        results = kept.setdefault(split, {})
+        data_set = f"{split} {size.name}"
+        results = kept.setdefault(data_set, {})
         for attempt in attempts_on(library):
             if options.attempt and attempt.name not in options.attempt:
                 continue
             if attempt.name not in results:
-                result = run(size, root, attempt, cases=cases, library=library)
+                result = run(
+                    size,
+                    root,
+                    attempt,
+                    cases=cases,
+                    library=library,
+                    is_scored=not options.train_only,
+                )
                 results[attempt.name] = result
-                sys.stderr.write(f"{split} {attempt.name}: {result}\n")
+                sys.stderr.write(f"{data_set} {attempt.name}: {result}\n")
                 if options.output:
                     text = json.dumps(kept, indent=1)
                     write_atomically(options.output, text.encode(), option="--output")
-            row = _row(split, attempt.name, results[attempt.name], baseline)
+            row = _row(data_set, attempt.name, results[attempt.name], baseline)
             rows.append(row)
     heads = ("data set", "attempt", "what", "chosen on train", "train", "test", "ratio")
     table = markdown(heads, rows)
@@ -1029,7 +1071,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _row(
-    split: str, attempt: str, result: Mapping[str, object], baseline: float
+    data_set: str, attempt: str, result: Mapping[str, object], baseline: float
 ) -> tuple[str, ...]:
     chosen = result["chosen"]
     parameters = []
@@ -1037,16 +1079,21 @@ def _row(
         for key, value in chosen.items():
             parameters.append(f"{key} {value:g}")
     train_error = float(str(result["train"]))
-    test_score = float(str(result["test"]))
-    ratio = test_score / baseline
+    test_text = "-"
+    ratio_text = "-"
+    if "test" in result:
+        test_score = float(str(result["test"]))
+        ratio = test_score / baseline
+        test_text = f"{test_score:.4f}"
+        ratio_text = f"{ratio:.2f}"
     return (
-        f"{split} mini",
+        data_set,
         attempt,
         str(result["what"]),
         ", ".join(parameters),
         f"{train_error:.4f}",
-        f"{test_score:.4f}",
-        f"{ratio:.2f}",
+        test_text,
+        ratio_text,
     )
 
 

@@ -7,7 +7,9 @@ one, anew in every tenth frame, and averaged:
     x_i = sum_k w_k x_k,m_k(i),     w_k = d_k^-s / sum d^-s,
 
 with d_k the distance of analog k from the state, and m_k the matching with the least
-sum of squared distances. This is one step towards the Wasserstein-2 barycentre of the
+sum of squared distances within each material. The mean is taken along the shortest ways
+from the nearest cloud to the others, so a cloud may lie across the ends of a periodic
+box. This is one step towards the Wasserstein-2 barycentre of the
 clouds (Agueh and Carlier 2011), whose mean squared distance from them is least.
 
 Frames after contact, analogs and s are chosen on train, each scenario predicted from
@@ -33,6 +35,13 @@ from .train_library import state_library
 
 MATCHED_EVERY = 10
 """Frames from one matching of the clouds to the next: it takes most of the time."""
+
+MATCHED_TOGETHER = 640
+"""Particles of a material that are matched together, at most.
+
+All of them in a scenario of two dimensions at size mini. In three dimensions there are
+ten times as many, and the time of a matching grows with the cube.
+"""
 
 LEAST_DISTANCE = 1e-12
 """Least distance of an analog, in units of features.
@@ -108,19 +117,25 @@ class MeanCloud:
         if not self._partners or frames_on % MATCHED_EVERY == 0:
             self._match(given, clouds)
 
-        mean = weights[0] * clouds[0]
+        nearest_cloud = clouds[0]
+        mean = nearest_cloud.copy()
         for weight, cloud, partner in zip(
             weights[1:], clouds[1:], self._partners, strict=True
         ):
-            mean = mean + weight * cloud[partner]
-        return np.asarray(mean)
+            mean += weight * given.box.displacement(nearest_cloud, cloud[partner])
+        return mean
 
     def _match(self, given: Given, clouds: Sequence[Floats]) -> None:
         """Match the clouds to the first one."""
         self._partners = []
         for cloud in clouds[1:]:
             partner = assign_particles(
-                clouds[0], cloud, given.material, given.material, given.box
+                clouds[0],
+                cloud,
+                given.material,
+                given.material,
+                given.box,
+                most_together=MATCHED_TOGETHER,
             )
             self._partners.append(partner)
 
@@ -135,6 +150,7 @@ def predict(given: Given) -> Prediction:
         library=library,
         divide=follow_all,
         combine=MeanCloud(choice.sharpness),
+        most_together=MATCHED_TOGETHER,
     ):
         yield position.astype("float32")
 

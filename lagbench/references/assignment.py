@@ -19,12 +19,14 @@ def assign_particles(
     material: NDArray[np.integer],
     other_material: NDArray[np.integer],
     box: Box = UNIT_SQUARE,
+    *,
+    most_together: int = MOST_TOGETHER,
 ) -> NDArray[np.intp]:
     """Return for each particle its partner in another cloud.
 
     Within each material the sum of squared distances is least, once the clouds are
     moved so that their means agree. Along a periodic axis, where a cloud has no mean,
-    they stay and distances are the shortest. More than :data:`MOST_TOGETHER` particles
+    they stay and distances are the shortest. More than ``most_together`` particles
     are halved along the longest side of their cloud, both clouds at the same rank,
     until there are no more than that. Where the other cloud has fewer or more particles
     of a material, some are taken more than once, or not at all, evenly over their
@@ -36,6 +38,7 @@ def assign_particles(
         material: material of each of our particles, shape [particle].
         other_material: material of each particle of the other cloud, shape [other].
         box: box that holds the particles.
+        most_together: particles of a material that are assigned together, at most.
 
     Returns:
         Indices into the other cloud, shape [particle].
@@ -51,7 +54,7 @@ def assign_particles(
         chosen = pool[places]
         here = _centre(position[ours], box)
         there = _centre(other_position[chosen], box)
-        matched = _match(here, there, box)
+        matched = _match(here, there, box, most_together)
         partner[ours] = chosen[matched]
     return partner
 
@@ -62,13 +65,15 @@ def _centre(position: Floats, box: Box) -> Floats:
     return np.asarray(position - mean)
 
 
-def _match(here: Floats, there: Floats, box: Box) -> NDArray[np.intp]:
+def _match(
+    here: Floats, there: Floats, box: Box, most_together: int
+) -> NDArray[np.intp]:
     """Return for each point here the index of its point there; there are as many."""
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
     count = len(here)
-    if count > MOST_TOGETHER:
+    if count > most_together:
         # Halves along the longest side are matched apart.
         partner = np.empty(count, np.intp)
         sides = np.ptp(here, axis=0)
@@ -79,7 +84,7 @@ def _match(here: Floats, there: Floats, box: Box) -> NDArray[np.intp]:
         for part in (slice(None, half), slice(half, None)):
             ours = order[part]
             others = other_order[part]
-            matched = _match(here[ours], there[others], box)
+            matched = _match(here[ours], there[others], box, most_together)
             partner[ours] = others[matched]
         return partner
     if box.is_periodic:

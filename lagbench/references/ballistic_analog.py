@@ -28,7 +28,7 @@ from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
 from lagbench.metrics.transport import sliced_wasserstein2
 
-from .assignment import assign_particles
+from .assignment import MOST_TOGETHER, assign_particles
 from .extrapolation import ballistic_positions
 from .predictor import (
     Floats,
@@ -201,6 +201,7 @@ def fly_then_follow(
     without: int | None = None,
     divide: Division = divide_evenly,
     combine: Combination = follow_own_analog,
+    most_together: int = MOST_TOGETHER,
 ) -> Iterator[Floats]:
     """Yield positions of the predicted frames [length], each [particle, axis].
 
@@ -211,6 +212,7 @@ def fly_then_follow(
         without: a scenario of train that may not be looked at.
         divide: which particles follow which analog.
         combine: what the analogs say together.
+        most_together: particles of a material that are assigned together, at most.
     """
     horizon = len(given.predicted_frames)
     flown = min(horizon, frames_of_flight(given) + choice.lag)
@@ -219,7 +221,13 @@ def fly_then_follow(
     if flown == horizon:
         return
     analogs = _analogs_of(
-        given, flown, choice, library=library, without=without, divide=divide
+        given,
+        flown,
+        choice,
+        library=library,
+        without=without,
+        divide=divide,
+        most_together=most_together,
     )
     for frames_on in range(1, horizon - flown + 1):
         if not analogs:
@@ -236,6 +244,7 @@ def _analogs_of(
     library: StateLibrary | None,
     without: int | None,
     divide: Division,
+    most_together: int,
 ) -> list[FollowedAnalog]:
     """Return the analogs of the state after so many frames of flight."""
     if library is None:
@@ -266,6 +275,7 @@ def _analogs_of(
             given.material[members],
             motion.material,
             given.box,
+            most_together=most_together,
         )
         stop = frame + 1 + len(given.predicted_frames)
         paths = mirror.positions(motion.position[frame:stop, partner])

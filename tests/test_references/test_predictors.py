@@ -46,7 +46,7 @@ from lagbench.references.analog import (
     distance,
     find_analog,
 )
-from lagbench.references.assignment import assign_particles
+from lagbench.references.assignment import MOST_TOGETHER, assign_particles
 from lagbench.references.ballistic_analog import (
     Choice,
     bodies_touch,
@@ -427,17 +427,28 @@ def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None
     assert near == pytest.approx(expected, rel=0.01)
 
 
-def test_many_particles_of_three_dimensions_find_themselves() -> None:
+@pytest.mark.parametrize(
+    ("count", "together"),
+    [
+        (4400, MOST_TOGETHER),
+        (1400, 640),
+    ],
+)
+def test_many_particles_of_three_dimensions_find_themselves(
+    count: int, together: int
+) -> None:
     """Clouds beyond what is assigned together are halved alike: a cloud in another
     order is found again, also through the ends of a periodic box.
     """
     rng = np.random.default_rng(0)
-    points = rng.random((4400, 3))
+    points = rng.random((count, 3))
     order = rng.permutation(len(points))
     liquid = np.zeros(len(points), np.int8)
     bounds = [(0.0, 1.0)] * 3
     box = Box.from_bounds(bounds, [True, False, True])
-    partner = assign_particles(points, points[order], liquid, liquid, box)
+    partner = assign_particles(
+        points, points[order], liquid, liquid, box, most_together=together
+    )
     partners = points[order][partner]
     np.testing.assert_array_equal(partners, points)
 
