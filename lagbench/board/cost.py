@@ -53,6 +53,7 @@ STYLE = """
 .dot.hybrid circle{fill:#c2410c;stroke:#fff}
 .dot.classical circle{fill:#667085;stroke:#fff}
 .dot.naive circle{fill:#fff;stroke:#667085}
+.dot.best circle{stroke:#1c2330}
 .classical-front{fill:none;stroke:#667085;stroke-width:1.5}
 .dot circle.reach{fill:none;stroke:none}
 .name{paint-order:stroke;stroke:#fff;stroke-width:4px}
@@ -177,7 +178,10 @@ def draw(
     solver_times = [point.seconds for point in solvers]
     solver_errors = [point.error for point in solvers]
     plot.line(solver_times, solver_errors, "classical-front")
-    plot.spots([_spot_of(point, ranking) for point in points])
+    spots = []
+    for point in points:
+        spots.append(_spot_of(point, ranking, is_best=point in front))
+    plot.spots(spots)
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:
@@ -191,17 +195,20 @@ def _label_of(ranking: str) -> str:
     return f"{words(ranking)} [{METRICS[ranking].unit}]"
 
 
-def _spot_of(point: CostPoint, ranking: str) -> Spot:
+def _spot_of(point: CostPoint, ranking: str, *, is_best: bool) -> Spot:
     description = (
         f"{point.name}{DESCRIPTIONS[point.kind]}: {text(point.seconds)} s per frame, "
         f"{words(ranking)} {text(point.error)}"
     )
+    kind = point.kind
+    if is_best:
+        kind += " best"
     return Spot(
         x=point.seconds,
         y=point.error,
         name=point.name,
         description=description,
-        kind=point.kind,
+        kind=kind,
         href=point.href,
     )
 

@@ -56,8 +56,15 @@ class SubmissionStatistics:
         return compute_skill([ranking], {self.best_reference: reference})
 
     def scores(self) -> dict[str, Score]:
-        """Return the scores of all installed metrics whose statistics are here."""
-        return self._aggregate(available())
+        """Return the scores of all installed metrics whose statistics are here.
+
+        Metrics that are formed only when they are named are left out.
+        """
+        names = []
+        for name, metric in available().items():
+            if not metric.is_on_request:
+                names.append(name)
+        return self._aggregate(names)
 
     def _aggregate(self, names: Iterable[str]) -> dict[str, Score]:
         """Return scores by the name of the metric."""

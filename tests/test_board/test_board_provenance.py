@@ -57,11 +57,18 @@ def test_words_of_a_person_are_no_provenance(sentence: str) -> None:
 
 
 def test_every_committed_entry_has_a_provenance() -> None:
-    """Entries have the sentence alone, and it comes back letter by letter."""
+    """Entries have the sentence alone, and it comes back letter by letter.
+
+    An ONNX file does not state its training.
+    """
     paths = sorted((LEADERBOARD / "submissions").glob("*/*/*.yaml"))
     assert len(paths) > 50
     for path in paths:
         entry = read_entry(path)
+        weights = entry.predictions[0].weights
+        if weights is not None and weights.path.endswith(".onnx"):
+            assert entry.provenance is None
+            continue
         assert entry.provenance is not None
         assert entry.provenance.describe() == entry.training
 

@@ -172,10 +172,12 @@ def test_flags_and_reference_scores_are_compared(
     """Flags, frozen scenarios and the scores of reference predictors are those of the
     scorer.
     """
+    size = own.registry.size("cavity", "tiny")
+    scenario = size.subsets["test"][0]
 
     def change_flags(entry: dict[str, Any]) -> None:
         file = entry["score"]["files"][0]
-        file["diverged_at"] = {0: 7}
+        file["diverged_at"] = {scenario: 7}
         file["flags"] = [{"name": "physics"}]
 
     own.edit("noisy", change_flags)
