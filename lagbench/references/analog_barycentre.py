@@ -59,7 +59,11 @@ class BarycentreChoice:
 
 
 CHOSEN: Mapping[str, BarycentreChoice] = {
+    "fluid-3d-mini-v1": BarycentreChoice(Choice(lag=0, analogs=2), sharpness=2.0),
     "fluid-mini-v3": BarycentreChoice(Choice(lag=0, analogs=5), sharpness=2.0),
+    "multimaterial-3d-mini-v1": BarycentreChoice(
+        Choice(lag=10, analogs=3), sharpness=2.0
+    ),
     "multimaterial-mini-v3": BarycentreChoice(Choice(lag=10, analogs=5), sharpness=2.0),
 }
 """Choices by split, size and MAJOR version."""
