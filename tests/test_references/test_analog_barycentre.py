@@ -219,7 +219,7 @@ def test_all_particles_follow_each_analog() -> None:
 
 
 def test_it_is_the_best_naive_predictor_where_it_was_chosen() -> None:
-    """Its mean is 5 % or more below that of the other naive predictors."""
+    """Its mean is 4 % or more below that of the other naive predictors."""
     for key in CHOSEN:
         split, name, _ = key.rsplit("-", 2)
         references = shipped(load().size(split, name))
@@ -230,4 +230,4 @@ def test_it_is_the_best_naive_predictor_where_it_was_chosen() -> None:
                 score = scores.scores["cloud_distance"]
                 means[reference] = score.mean
         best = means.pop("analog-barycentre")
-        assert best < 0.95 * min(means.values())
+        assert best < 0.96 * min(means.values())
