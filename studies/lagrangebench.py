@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -26,9 +26,13 @@ from lagbench.board.folder import Folder, entry_path
 from lagbench.data.registry import Size, load
 from lagbench.figures.tables import markdown
 from lagbench.metrics.aggregate import score
+from lagbench.metrics.lagrangebench import mean_of_every_tenth
+from lagbench.metrics.metric import FirstFrames
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import shipped
 from lagbench.scoring.score_file import read_statistics
+
+FRAMES = 20  # predicted frames of the published errors
 
 HEAD = ("flow", "data", "model", "MSE_20", "MSE of E_kin")
 
@@ -155,17 +159,20 @@ def _our_rows(
 def errors_of(entry: Entry, folder: Folder, size: Size) -> Mapping[str, float]:
     """Return the errors of an entry by name, as LagrangeBench defines them.
 
-    They are means over scenarios and seeds. LagrangeBench has velocities per second,
-    and the mass of a particle is its volume.
+    They are means over scenarios and seeds, of the first 20 predicted frames.
+    LagrangeBench has velocities per second, and the mass of a particle is its volume.
     """
     energy_unit = size.value("density") * size.frame_interval**2
     factors = {"position_mse_20": 1.0, "e_kin_mse": 1.0 / energy_unit**2}
+    first_frames = FirstFrames(FRAMES, mean_of_every_tenth)
+    e_kin_mse = replace(METRICS["e_kin_mse"], over_frames=first_frames)
+    metrics = {**METRICS, "e_kin_mse": e_kin_mse}
     errors = {}
     for name, factor in factors.items():
         of_seeds = []
         for path in entry.score_paths:
             statistics = read_statistics(folder.path / path)
-            measured = score(METRICS[name], statistics.tallies)
+            measured = score(metrics[name], statistics.tallies)
             if measured is not None:
                 of_seeds.append(measured.mean)
         errors[name] = factor * fmean(of_seeds)

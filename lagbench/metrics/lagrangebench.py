@@ -34,7 +34,7 @@ def squared_energy_errors(predicted: Floats, true: Floats) -> Floats:
     return error**2
 
 
-def _mean_of_every_tenth(errors: Floats) -> float:
+def mean_of_every_tenth(errors: Floats) -> float:
     """Return the mean over the second predicted frame and every tenth after it.
 
     LagrangeBench takes velocities from the way between two predicted frames, so the
@@ -59,7 +59,7 @@ METRICS = (
         summary="MSE of E_kin: squared error of the sum of m u^2, every tenth frame",
         of=("energy_predicted", "energy_true"),
         series=squared_energy_errors,
-        over_frames=_mean_of_every_tenth,
+        over_frames=mean_of_every_tenth,
         horizon=2,
     ),
 )

@@ -38,6 +38,6 @@ def test_errors_of_an_entry_by_hand() -> None:
         # sum of m |u|^2 in units of volume and second
         unit = 2.0 / (size.value("density") * size.frame_interval**2)
         gap = unit * (row["energy_predicted"] - row["energy_true"])
-        e_kin.append((gap[1::10] ** 2).mean())
+        e_kin.append((gap[:20][1::10] ** 2).mean())
     assert errors["position_mse_20"] == pytest.approx(np.mean(mse_20))
     assert errors["e_kin_mse"] == pytest.approx(np.mean(e_kin))
