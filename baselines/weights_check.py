@@ -111,7 +111,7 @@ def check_settings_in_child(
     answers = run_in_child(
         f"{__name__}.{check_settings.__name__}",
         requests,
-        seconds=SECONDS,
+        seconds=SECONDS * max(1, len(requests)),
         wall=WALL_SECONDS,
         memory=MEMORY,
     )

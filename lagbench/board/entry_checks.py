@@ -14,6 +14,7 @@ from lagbench.scoring.score_file import SubmissionStatistics
 from lagbench.submission.budget import Budget
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
+from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, ScoredFile
 from .issues import make_issue
@@ -34,13 +35,21 @@ def find_training_fault(
     for prediction in predictions:
         provenance = prediction.provenance
         if provenance is not None:
-            scored = sorted(SCORED_SUBSETS.intersection(provenance.subsets))
-            if scored:
-                return f"a training on windows of {' and '.join(scored)}"
+            fault = find_scored_subset(provenance)
+            if fault is not None:
+                return fault
         has_training = provenance is not None or prediction.budget is not None
         if kind is Kind.CLASSICAL and has_training:
             return "kind: classical, and predictions of a trained model"
     return None
+
+
+def find_scored_subset(provenance: TrainingProvenance) -> str | None:
+    """Return which scored subsets a training saw, None if it saw none of them."""
+    scored = sorted(SCORED_SUBSETS.intersection(provenance.subsets))
+    if not scored:
+        return None
+    return f"a training on windows of {' and '.join(scored)}"
 
 
 def find_contradiction(budget: Budget) -> str | None:
@@ -66,15 +75,17 @@ def check_training(entry: Entry) -> Iterator[ValidationIssue]:
     """Yield what an entry states of its training that cannot be."""
     path = entry.yaml_path
     fault = find_training_fault(entry.kind, entry.predictions)
+    if fault is None and entry.provenance is not None:
+        fault = find_scored_subset(entry.provenance)
     if fault is not None:
         yield make_issue("training", path, fault)
     for number, prediction in enumerate(entry.predictions):
-        stranger = _find_other_data_set(entry, prediction)
-        if stranger is not None:
+        other_data_set = _find_other_data_set(entry, prediction)
+        if other_data_set is not None:
             yield make_issue(
                 "training",
                 f"{path}, predictions.{number}",
-                f"a training on {stranger}",
+                f"a training on {other_data_set}",
                 what="the weights lie beside an entry of another data set",
                 expected="weights beside an entry of the data set of their training",
                 fix="submit predictions and weights of one training",

@@ -40,7 +40,7 @@ def check_line(
     ranking_values: RankingValues,
     seasons: Collection[str] = (),
 ) -> Iterator[ValidationIssue]:
-    """Yield what of a line cannot be.
+    """Yield the parts of a line that cannot be true.
 
     Args:
         line: the line of the entry, about its score files and models.
@@ -51,7 +51,8 @@ def check_line(
     """
     where = f"{VERIFIED}, {entry.yaml_path}"
     yield from _check_dates(line, where)
-    if line.cost is not None:
+    is_of_today = is_current(entry.dataset, size)
+    if line.cost is not None and is_of_today:
         yield from _check_cost(line.cost, size, where)
     if line.blind is not None and line.blind.season not in seasons:
         yield make_issue(
@@ -63,7 +64,7 @@ def check_line(
         )
     if line.is_reproduced:
         yield from _check_level(line, entry, ranking_values, where)
-        if is_current(entry.dataset, size):
+        if is_of_today:
             yield from _check_counts(line, len(size.scored_scenarios), where)
 
 
@@ -80,7 +81,8 @@ def _check_dates(line: Verification, where: str) -> Iterator[ValidationIssue]:
                 date,
                 what="a date lies in the future",
                 expected=f"at most {latest}",
-                fix="`lagbench leaderboard reproduce --again` writes the line anew",
+                fix="write the line anew: `lagbench leaderboard reproduce --again`; "
+                "without a model `leaderboard check --predictions FILE --record`",
             )
 
 

@@ -406,6 +406,9 @@ DAMAGE: dict[str, Damage] = {
     "training: trained on test": put(
         "predictions", 0, provenance=trained_on("train", "test")
     ),
+    "training: trained on shift, in words": put(
+        training="cavity tiny train+shift, recipe cavity/tiny, step 6"
+    ),
     "training: classical and trained": edited(call_trained_model_classical),
     "nothing: a budget": budgeted(
         steps=9, best_step=9, best=0.1, validations=[[3, 0.2], [9, 0.1]]

@@ -18,7 +18,6 @@ from hostile_safetensors import (
     sound_file,
 )
 
-from lagbench.baselines import weights_check
 from lagbench.baselines.checkpoint import load, restore
 from lagbench.baselines.predict import predict
 from lagbench.baselines.weights_check import check_in_child, examine
@@ -72,11 +71,6 @@ def test_a_header_may_be_as_long_as_a_pickle_begins(sound: Path) -> None:
     sound.write_bytes(longer.to_bytes(8, "little") + header + data[8 + length :])
     assert sound.read_bytes().startswith(b"\x80\x02")
     assert load(sound).baseline == "gns"
-
-
-def test_weights_are_not_refused_because_the_machine_is_busy() -> None:
-    """A child with a thirtieth of a core has time for all that it may compute."""
-    assert weights_check.WALL_SECONDS >= 30.0 * weights_check.SECONDS
 
 
 @pytest.mark.slow
