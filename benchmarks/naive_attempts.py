@@ -42,7 +42,7 @@ from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.metrics.transport import sliced_wasserstein2
 from lagbench.references.analog_barycentre import MATCHED_TOGETHER
-from lagbench.references.assignment import assign_particles
+from lagbench.references.assignment import MOST_TOGETHER, assign_particles
 from lagbench.references.ballistic_analog import frames_of_flight
 from lagbench.references.extrapolation import ballistic_positions
 from lagbench.references.predictor import Floats, Given, given_in
@@ -304,10 +304,14 @@ def find_nearest_states(
 
 
 class Predictors:
-    """The attempts on one data set."""
+    """The attempts on one data set.
 
-    def __init__(self, library: Library) -> None:
+    ``most_together`` particles of a material are matched to partners together, at most.
+    """
+
+    def __init__(self, library: Library, *, most_together: int = MOST_TOGETHER) -> None:
         self.library = library
+        self.most_together = most_together
 
     def _kinds(self, case: AnalogCase) -> Kinds:
         kinds = np.unique(case.given.material)
@@ -349,7 +353,7 @@ class Predictors:
             own_material,
             material,
             case.given.box,
-            most_together=MATCHED_TOGETHER,
+            most_together=self.most_together,
         )
         offset = own_position - image_position[partner]
         last_frame = len(image) - 1
@@ -723,11 +727,13 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
     In three dimensions there are two of them: the others did not help in the plane.
     """
     own = Predictors(library)
+    barycentre = _barycentre(library)
     if library.size.box.dimension == 3:
-        return (_shipped_predictor(own), _barycentre(own))
+        return (_shipped_predictor(own), barycentre)
     return (
         *_variants_of_ballistic_analog(own),
         *_attempts_with_other_analogs(own),
+        barycentre,
         *_attempts_that_come_to_rest(own),
     )
 
@@ -741,7 +747,9 @@ def _shipped_predictor(own: Predictors) -> Attempt:
     )
 
 
-def _barycentre(own: Predictors) -> Attempt:
+def _barycentre(library: Library) -> Attempt:
+    """Return the attempt that matches all clouds again and again: fewer at once."""
+    own = Predictors(library, most_together=MATCHED_TOGETHER)
     return Attempt(
         name="barycentre",
         what="Wasserstein mean of k analogs, matched again at each measured frame",
@@ -794,7 +802,6 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
                 sharpness=(1.0, 3.0),
             ),
         ),
-        _barycentre(own),
         Attempt(
             name="per-material",
             what="separate analogs for each material",
@@ -1020,6 +1027,13 @@ def run(
     return result
 
 
+def needs_run(result: Mapping[str, object] | None, *, is_scored: bool) -> bool:
+    """Return whether an attempt is to be run: it is not kept, or not yet scored."""
+    if result is None:
+        return True
+    return is_scored and "test" not in result
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the attempts that are not kept yet, and print the table."""
     parser = argparse.ArgumentParser(
@@ -1033,6 +1047,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", "-o", type=Path, help="keeps finished attempts")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)
+    is_scored = not options.train_only
     kept: dict[str, dict[str, dict[str, object]]] = {}
     if options.output and options.output.is_file():
         kept = json.loads(options.output.read_text())
@@ -1048,14 +1063,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for attempt in attempts_on(library):
             if options.attempt and attempt.name not in options.attempt:
                 continue
-            if attempt.name not in results:
+            if needs_run(results.get(attempt.name), is_scored=is_scored):
                 result = run(
                     size,
                     root,
                     attempt,
                     cases=cases,
                     library=library,
-                    is_scored=not options.train_only,
+                    is_scored=is_scored,
                 )
                 results[attempt.name] = result
                 sys.stderr.write(f"{data_set} {attempt.name}: {result}\n")

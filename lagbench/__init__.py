@@ -90,4 +90,18 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     """List the public names, also those that are not loaded yet, and no others."""
     special_names = [name for name in globals() if name.startswith("__")]
-    return sorted({*special_names, *__all__, *_PACKAGES})
+    names = {*special_names, *__all__, *_PACKAGES}
+    if not _has_torch():
+        # inspect.getmembers reads each of these names, and this one would raise
+        names.discard("torch")
+    return sorted(names)
+
+
+def _has_torch() -> bool:
+    """Return whether PyTorch is installed, without importing it."""
+    from importlib.util import find_spec
+
+    try:
+        return find_spec("torch") is not None
+    except ValueError:  # sys.modules holds None, or a module without a specification
+        return sys.modules.get("torch") is not None

@@ -232,6 +232,14 @@ class WrongCallError(UsageError, TypeError):
     """
 
 
+class NotInstalledError(UsageError, ModuleNotFoundError):
+    """An optional package is not installed.
+
+    It is a ModuleNotFoundError as well, as Python raises for such an import. So
+    ``except ImportError`` around an import catches it.
+    """
+
+
 class UsageErrorCollector:
     """Collect the usage errors of several ``with`` blocks, to raise them together."""
 
@@ -487,7 +495,8 @@ def require(module: str, *, extra: str) -> ModuleType:
     """Import an optional module.
 
     Raises:
-        UsageError: it is not installed; the message holds the command that installs it.
+        NotInstalledError: it is not installed; the message holds the command that
+            installs it.
     """
     try:
         return importlib.import_module(module)
@@ -502,15 +511,16 @@ def check_installed(module: str, *, extra: str) -> None:
     """Refuse before work starts, without importing: workers will import the module.
 
     Raises:
-        UsageError: it is not installed; the message holds the command that installs it.
+        NotInstalledError: it is not installed; the message holds the command that
+            installs it.
     """
     if importlib.util.find_spec(module) is None:
         raise _not_installed(module, extra)
 
 
-def _not_installed(module: str, extra: str) -> UsageError:
+def _not_installed(module: str, extra: str) -> NotInstalledError:
     package = module.split(".")[0]
-    return UsageError(
+    return NotInstalledError(
         f"{package} is not installed",
         where=f"this needs the extra {extra!r}",
         expected=f"the package {package}",

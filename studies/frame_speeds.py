@@ -28,11 +28,16 @@ from .thesis.split_results import BOARD
 AVERAGED = "-averaged"
 """End of the id of an entry that averages predictions over mirror images."""
 
+README_NETWORK = "readme-network"
+"""Method of the entry that the program of README.md trains."""
+
 
 def kind_of_model(entry: Entry) -> str:
     """Return the kind of model that an entry is listed under."""
     if entry.kind is Kind.HYBRID:
         return "hybrid"
+    if entry.method == README_NETWORK:
+        return "small grid network"
     family, *_ = entry.method.split("-")
     if family in OPERATORS:
         return "graph network"

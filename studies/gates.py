@@ -1,7 +1,7 @@
 """Gates: what the weights of a graph network must do before they support a claim.
 
     python -m studies.gates --root FOLDER [-o leaderboard] [--weights FILE ...]
-    python -m studies.gates --recorded
+    python -m studies.gates --recorded [-o leaderboard]
 
 A graph network that fails them was trained too little or with settings that do not fit:
 comparing it with another method says nothing about the method. On ``valid``:
@@ -16,7 +16,7 @@ comparing it with another method says nothing about the method. On ``valid``:
 Free flight and rest have no meaning in full boxes without gravity. On a free surface
 they are not measured where no window of ``valid`` falls freely or is at rest.
 ``--recorded`` measures nothing: it prints the table of the active entries from the
-leaderboard's gates.json.
+gates.json of the folder that ``-o`` names, by default the leaderboard of lagbench.
 """
 
 from __future__ import annotations
@@ -372,13 +372,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", default="mini")
     parser.add_argument("--scenarios", type=int, default=8)
     parser.add_argument("--rollouts", type=int, default=4)
-    parser.add_argument("--output", "-o", type=Path, help="folder of gates.json")
+    parser.add_argument(
+        "--output",
+        "-o",
+        type=Path,
+        help="folder of gates.json; with --recorded a leaderboard",
+    )
     parser.add_argument(
         "--recorded", action="store_true", help="print recorded measures only"
     )
     options = parser.parse_args(arguments)
     if options.recorded:
-        sys.stdout.write(to_markdown(active_rows(Folder(BOARD))))
+        folder = Folder(options.output or BOARD)
+        sys.stdout.write(to_markdown(active_rows(folder)))
         return 0
     if options.root is None:
         parser.error("name the folder of all data sets: --root FOLDER")

@@ -148,13 +148,15 @@ def time_over_simulator(results: SplitResults, model: str) -> float | None:
 def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
     """Return a sentence on how often models take longer than the simulator.
 
-    There is no sentence if no model does.
+    There is no sentence if no model does. The total is that of the data sets whose time
+    is known.
 
     Args:
         ratios: time of a frame over the simulator's, one per data set; None where it is
             not known.
     """
-    slower = sorted(ratio for ratio in ratios if ratio is not None and ratio > 1.0)
+    known = [ratio for ratio in ratios if ratio is not None]
+    slower = sorted(ratio for ratio in known if ratio > 1.0)
     if not slower:
         return []
     least = number(slower[0], 2)
@@ -165,6 +167,11 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
     place = ""
     if len(ratios) > 1:
         place = f"On {len(slower)} of these {len(ratios)} data sets "
+    if len(known) < len(ratios):
+        place = (
+            f"On {len(slower)} of the {len(known)} of these {len(ratios)} data sets"
+            " whose time was measured "
+        )
     sentence = (
         f"{place}this model takes more time per frame than the simulator that made the"
         f" data ({times})."
@@ -251,7 +258,12 @@ def claims_overview(
 
 
 def training_table(all_results: Sequence[SplitResults]) -> str:
-    """Return the budget of each training and its gains, best model first."""
+    """Return the budget of each training and its gains, best model first.
+
+    Epochs are those of the whole chain of trainings, where a training started from the
+    weights of another one. A record has the steps of the earlier ones, not their batch.
+    So all of them are assumed to have had the batch of the last one.
+    """
     heads = (
         "where",
         "model",

@@ -117,6 +117,11 @@ def points_of(tab: Tab) -> list[CostPoint]:
                 kind=str(reference.kind),
             )
             points.append(point)
+    return _drawable(points)
+
+
+def _drawable(points: Iterable[CostPoint]) -> list[CostPoint]:
+    """Return the points that have a place on logarithmic axes."""
     drawable_points = []
     for point in points:
         if point.is_drawable:
@@ -302,4 +307,4 @@ def _shipped_points(size: Size, ranking: str) -> list[CostPoint]:
             kind=str(REFERENCES[name].kind),
         )
         points.append(point)
-    return points
+    return _drawable(points)

@@ -214,7 +214,7 @@ def _plain_tab(tab: Tab) -> dict[str, Any]:
         "dataset_version": tab.size.version,
         "ranking_metric": tab.ranking,
         "rows": [_plain_row(row) for row in tab.rows],
-        "floors": references,
+        "references": references,
     }
 
 

@@ -194,7 +194,7 @@ def make_training(
         split,
         plan.size,
         recipe=model.recipe or plan.recipe,
-        settings=(*model.settings, *plan.settings),
+        settings=(*model.settings, *_settings_for(plan, model)),
         seed=seed,
         root=plan.root,
         output=folder,
@@ -369,9 +369,35 @@ def _recipe(plan: Plan, split: str, *, model: RosterModel, seed: int) -> Recipe:
         split,
         plan.size,
         variant=model.recipe or plan.recipe,
-        settings=(*model.settings, *plan.settings),
+        settings=(*model.settings, *_settings_for(plan, model)),
         seed=seed,
     )
+
+
+def _settings_for(plan: Plan, model: RosterModel) -> tuple[str, ...]:
+    """Return the changes of the plan that a model can use."""
+    # these load torch
+    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.recipe import (
+        FITTED_OPTIONS,
+        REFUSED_BY_FIT,
+        TrainingOptions,
+    )
+
+    if not find(model.baseline).model.closed_form:
+        return plan.settings
+    # A plan holds for all models of a split. One that is fitted takes no steps and
+    # refuses the options of steps; it is made without them, as other models with them.
+    unused_options = set(TrainingOptions.model_fields)
+    unused_options.difference_update(FITTED_OPTIONS, REFUSED_BY_FIT)
+    used_settings = []
+    for setting in plan.settings:
+        key, _, _ = setting.partition("=")
+        part, _, name = key.strip().partition(".")
+        option, _, _ = name.partition(".")
+        if part != "training" or option not in unused_options:
+            used_settings.append(setting)
+    return tuple(used_settings)
 
 
 def _stale_files(data_hash: str | None, folder: Path) -> list[Path]:

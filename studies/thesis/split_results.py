@@ -604,7 +604,8 @@ def count_start_steps(record: Mapping[str, Any]) -> int:
 def format_budget(record: Mapping[str, Any]) -> str:
     """Return steps and windows per step, as in "5,000 x 2"; a dash where unknown.
 
-    Steps of earlier trainings, from whose weights it started, count too.
+    Steps of earlier trainings, from whose weights it started, count too. They are
+    assumed to have had as many windows as those of the last training.
     """
     if "windows" in record:
         steps = count_start_steps(record) + record["step"]

@@ -486,7 +486,7 @@ def test_json_has_the_numbers_of_the_board(board: Board) -> None:
     assert metric["mean"] == digits(value.mean)
     assert damped["cost"]["speed_up"] == 4.0
     names = sorted(reference.name for reference in board.tabs[0].references)
-    references = sorted(reference["id"] for reference in plain["floors"])
+    references = sorted(reference["id"] for reference in plain["references"])
     assert references == names
     assert damped["shared_with"] == []
 

@@ -22,6 +22,7 @@ from studies.thesis import __main__ as command
 from studies.thesis import runs, tables
 from studies.thesis.plan import TABLES, Plan, read_study_results
 from studies.thesis.published import MLP_STUDIES
+from studies.thesis.roster import ROSTER
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 
@@ -168,6 +169,19 @@ def test_studies_of_another_recipe_are_not_reused(
     more_steps = replace(plan, settings=("training.steps=2", "model.widths=[4]"))
     with pytest.raises(UsageError):
         runs.make_studies(more_steps, "table_4_2")
+
+
+def test_options_of_steps_are_left_out_for_a_model_that_is_fitted() -> None:
+    """VAR takes no steps; other models get the option."""
+    plan = Plan(
+        size="tiny",
+        root=Path("data"),
+        runs=Path("runs"),
+        output=Path("out"),
+        settings=("training.steps=3", "training.windows=9"),
+    )
+    assert runs._settings_for(plan, ROSTER["var"]) == ("training.windows=9",)
+    assert runs._settings_for(plan, ROSTER["supergat"]) == plan.settings
 
 
 @pytest.fixture

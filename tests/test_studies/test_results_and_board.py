@@ -97,10 +97,17 @@ def test_the_interval_of_a_ratio_decides(
     assert verdict_of_interval(low, high) is verdict
 
 
+TWO_OF_THREE = (
+    r"On 2 of the 3 of these 4 data sets whose time was measured this model .*"
+    r" \(2 to 8.1 times as much\)"
+)
+
+
 @pytest.mark.parametrize(
     ("ratios", "words"),
     [
-        ([2.0, 0.5, 8.12, None], r"On 2 of these 4 data sets this .* \(2 to 8.1 "),
+        ([2.0, 0.5, 8.12, None], TWO_OF_THREE),
+        ([2.44, None], r"On 1 of the 1 of these 2 data sets whose time was measured "),
         ([2.0, 0.5], r"On 1 of these 2 data sets this model .* \(2 times as much\)"),
         ([2.44], r"This model takes more time .* \(2.4 times as much\)"),
     ],
@@ -108,7 +115,9 @@ def test_the_interval_of_a_ratio_decides(
 def test_data_sets_with_a_model_slower_than_the_simulator_are_counted(
     ratios: list[float | None], words: str
 ) -> None:
-    """The range is that of the slower ones; a time that is not known is not counted."""
+    """The range is that of the slower ones. A data set without a known time does not
+    count, neither as slower nor in the total.
+    """
     (sentence,) = slower_than_simulator(ratios)
     assert re.match(words, sentence)
 

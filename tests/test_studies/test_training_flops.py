@@ -31,7 +31,7 @@ def small_model(pushforward: int) -> NeuralMPM:
 @pytest.mark.parametrize("pushforward", [0, 1, 3])
 def test_every_length_of_a_pushforward_counts_the_same(pushforward: int) -> None:
     """The loss takes two calls. From 0 to P calls, P / 2 in the mean, come before. All
-    calls do the same on a grid, so one call that is counted alone tells their sum.
+    calls do the same on a grid, so their sum is a multiple of one counted call.
     """
     model = small_model(pushforward)
     window = batch(swirl(0, 13))
