@@ -162,7 +162,7 @@ FULL_BOX = (
         ("multimaterial", "full", f"{SURFACE} coarse-solver coarse-solver-4x"),
         ("multimaterial", "mini", f"{SURFACE} coarse-solver analog-barycentre"),
         ("multimaterial-3d", "full", f"{SURFACE} coarse-solver-two-thirds"),
-        ("multimaterial-3d", "mini", f"{SURFACE} coarse-solver"),
+        ("multimaterial-3d", "mini", f"{SURFACE} coarse-solver analog-barycentre"),
         ("fluid", "tiny", SURFACE),
         ("own", "cell_centres", FULL_BOX),
         ("own", "nodes", "persistence constant-velocity analog"),
