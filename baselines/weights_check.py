@@ -54,6 +54,7 @@ def check_in_child(path: Path) -> None:
     Raises:
         UnreadableFileError: the file or its recipe cannot be used, or needs too much
             memory or time.
+        WorkFailedError: the machine is too busy.
     """
     answers = run_in_child(
         f"{__name__}.{examine.__name__}",
@@ -62,6 +63,7 @@ def check_in_child(path: Path) -> None:
         wall=WALL_SECONDS,
         memory=MEMORY,
     )
+    answers.require_in_time(str(path))
     reason = answers.stopped
     fix = None
     if answers.values:
@@ -105,8 +107,9 @@ def check_settings_in_child(
 ) -> list[dict[str, Any]]:
     """Return what `check_settings` returns for each request.
 
-    All files are read in one child process. Where it is stopped, the settings of the
-    file that stopped it, and of those after it, are returned as they are written.
+    All files are read in one child process, which has :data:`SECONDS` for each. Where
+    it is stopped, the settings of the file that stopped it, and of those after it, are
+    returned as they are written.
     """
     answers = run_in_child(
         f"{__name__}.{check_settings.__name__}",

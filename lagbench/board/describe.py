@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.errors import UsageError, UsageErrorCollector
-from lagbench.references.predictor import Kind
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
+from lagbench.submission.budget import Budget
 from lagbench.submission.format import Header
+from lagbench.submission.provenance import TrainingProvenance
 
 from .draft import Draft, PredictionsFile, find_entries_to_differ_from, require_valid
 from .entry import About, Entry, EntryBudget, Meta, Prediction, mean_cost
@@ -141,27 +142,33 @@ def _require_free(folder: Folder, place: Place) -> None:
         )
 
 
-def _require_possible_training(headers: Sequence[Header], kind: Kind) -> None:
+def _require_possible_training(headers: Sequence[Header], meta: Meta) -> None:
     """Refuse a training that the board would refuse."""
-    fault = find_training_fault(kind, headers)
+    provenances = [TrainingProvenance.from_sentence(meta.training)]
+    budgets: list[Budget | None] = [meta.budget]
+    for header in headers:
+        provenances.append(header.provenance)
+        budgets.append(header.budget)
+    fault = find_training_fault(meta.kind, provenances, budgets)
     if fault is not None:
         raise UsageError(
             "the predictions state a training that cannot be",
-            where="kind in --from meta.yaml, and training of the predictions",
+            where="kind, training and budget in --from meta.yaml, and training of the "
+            "predictions",
             expected="a training on train; kind: learned or hybrid where something is "
             "learned",
             got=fault,
             fix="correct kind in meta.yaml, or predict with a model that was not "
             "trained on scored scenarios",
         )
-    for header in headers:
-        if header.budget is None:
+    for budget in budgets:
+        if budget is None:
             continue
-        contradiction = find_contradiction(header.budget)
+        contradiction = find_contradiction(budget)
         if contradiction is not None:
             raise UsageError(
-                "the budget of the predictions contradicts itself",
-                where="budget of the predictions",
+                "a budget contradicts itself",
+                where="budget of the predictions, or in --from meta.yaml",
                 expected="steps up to the last one, and the least validation as best",
                 got=contradiction,
                 fix="state it as training.json does, or leave it out",
@@ -204,7 +211,7 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
     """
     if extended is not None:
         meta = _fill_from_entry(meta, extended)
-    _require_possible_training(headers, meta.kind)
+    _require_possible_training(headers, meta)
     header = headers[0]
     keys: dict[str, Any] = {}
     for name in About.model_fields:

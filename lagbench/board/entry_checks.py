@@ -12,7 +12,6 @@ from itertools import pairwise
 from lagbench.references.predictor import Kind
 from lagbench.scoring.score_file import SubmissionStatistics
 from lagbench.submission.budget import Budget
-from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 from lagbench.submission.provenance import TrainingProvenance
 
@@ -24,32 +23,28 @@ SCORED_SUBSETS = frozenset({"test", "shift"})
 
 
 def find_training_fault(
-    kind: Kind, predictions: Sequence[Header | Prediction]
+    kind: Kind,
+    provenances: Sequence[TrainingProvenance | None],
+    budgets: Sequence[Budget | None],
 ) -> str | None:
-    """Return what predictions state of a training that cannot be; None if all can be.
+    """Return what is stated of a training and cannot be; None if all can be.
 
     Args:
         kind: what the submitter says of the method.
-        predictions: what the files of predictions state.
+        provenances: trainings that the submitter and the files of predictions state.
+        budgets: budgets that they state.
     """
-    for prediction in predictions:
-        provenance = prediction.provenance
-        if provenance is not None:
-            fault = find_scored_subset(provenance)
-            if fault is not None:
-                return fault
-        has_training = provenance is not None or prediction.budget is not None
-        if kind is Kind.CLASSICAL and has_training:
-            return "kind: classical, and predictions of a trained model"
+    for provenance in provenances:
+        if provenance is None:
+            continue
+        scored = sorted(SCORED_SUBSETS.intersection(provenance.subsets))
+        if scored:
+            return f"a training on windows of {' and '.join(scored)}"
+        if kind is Kind.CLASSICAL:
+            return "kind: classical, and a training"
+    if kind is Kind.CLASSICAL and any(budget is not None for budget in budgets):
+        return "kind: classical, and the budget of a training"
     return None
-
-
-def find_scored_subset(provenance: TrainingProvenance) -> str | None:
-    """Return which scored subsets a training saw, None if it saw none of them."""
-    scored = sorted(SCORED_SUBSETS.intersection(provenance.subsets))
-    if not scored:
-        return None
-    return f"a training on windows of {' and '.join(scored)}"
 
 
 def find_contradiction(budget: Budget) -> str | None:
@@ -74,11 +69,16 @@ def find_contradiction(budget: Budget) -> str | None:
 def check_training(entry: Entry) -> Iterator[ValidationIssue]:
     """Yield what an entry states of its training that cannot be."""
     path = entry.yaml_path
-    fault = find_training_fault(entry.kind, entry.predictions)
-    if fault is None and entry.provenance is not None:
-        fault = find_scored_subset(entry.provenance)
+    provenances = [TrainingProvenance.from_sentence(entry.training)]
+    budgets: list[Budget | None] = [entry.budget]
+    for prediction in entry.predictions:
+        provenances.append(prediction.provenance)
+        budgets.append(prediction.budget)
+    fault = find_training_fault(entry.kind, provenances, budgets)
     if fault is not None:
         yield make_issue("training", path, fault)
+    if entry.budget is not None:
+        yield from _check_budget(entry.budget, f"{path}, budget")
     for number, prediction in enumerate(entry.predictions):
         other_data_set = _find_other_data_set(entry, prediction)
         if other_data_set is not None:
@@ -90,18 +90,23 @@ def check_training(entry: Entry) -> Iterator[ValidationIssue]:
                 expected="weights beside an entry of the data set of their training",
                 fix="submit predictions and weights of one training",
             )
-        if prediction.budget is None:
-            continue
-        contradiction = find_contradiction(prediction.budget)
-        if contradiction is not None:
-            yield make_issue(
-                "budget",
-                f"{path}, predictions.{number}.budget",
-                contradiction,
-                what="a budget that contradicts itself",
-                expected="steps up to the last one, and the least validation as best",
-                fix="state the budget as `lagbench train` wrote it",
-            )
+        if prediction.budget is not None:
+            where = f"{path}, predictions.{number}.budget"
+            yield from _check_budget(prediction.budget, where)
+
+
+def _check_budget(budget: Budget, where: str) -> Iterator[ValidationIssue]:
+    """Yield the contradiction of a budget, if it has one."""
+    contradiction = find_contradiction(budget)
+    if contradiction is not None:
+        yield make_issue(
+            "budget",
+            where,
+            contradiction,
+            what="a budget that contradicts itself",
+            expected="steps up to the last one, and the least validation as best",
+            fix="state the budget as `lagbench train` wrote it",
+        )
 
 
 def _find_other_data_set(entry: Entry, prediction: Prediction) -> str | None:

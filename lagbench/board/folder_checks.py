@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
+from lagbench.data.hdf5 import SIGNATURE
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     LagbenchError,
@@ -50,9 +51,6 @@ from .verified_checks import check_line
 from .weights import check_weights
 
 SHOWN_DIGITS = 16  # digits of a hash in an issue
-
-# first bytes of an HDF5 file, as which netCDF-4 files are stored
-NETCDF_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -202,9 +200,12 @@ class FolderChecks:
             return "no such file"
         if not stat.S_ISREG(status.st_mode):
             return "something that is no regular file"
-        with (self.folder.path / path).open("rb") as stream:
-            signature = stream.read(len(NETCDF_SIGNATURE))
-        if signature != NETCDF_SIGNATURE:
+        try:
+            with (self.folder.path / path).open("rb") as stream:
+                signature = stream.read(len(SIGNATURE))
+        except OSError:
+            return "a file that cannot be read"
+        if signature != SIGNATURE:
             return "something that is no netCDF file"
         return status.st_size
 

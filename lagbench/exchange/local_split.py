@@ -192,9 +192,11 @@ def make_local_split(
         progress: called as the work advances.
 
     Raises:
-        UsageError: the name is taken, the folder is there, or the task does not fit.
+        UsageError: the name is taken, the folder is there, another call made it
+            meanwhile, or the task does not fit.
         DataError: a subset is empty, or a trajectory cannot be used.
-        WorkFailedError: the disk is full or not writable.
+        WorkFailedError: the disk is full or not writable, or another call makes the
+            folder.
     """
     folder = check_output(output)
     meter = Meter(progress)
@@ -280,6 +282,9 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
     try:
         root.mkdir(parents=True)
     except FileExistsError as error:
+        # a parent folder that is a dangling link raises it too
+        if not os.path.lexists(root):
+            raise _write_error(folder, error.strerror or error) from error
         raise WorkFailedError(
             "another call makes this folder",
             where=str(folder),

@@ -82,7 +82,8 @@ class OnnxModel:
         Raises:
             UnreadableFileError: the model cannot be run, or returns something else than
                 positions.
-            WorkFailedError: it needed more time or memory than allowed.
+            WorkFailedError: it needed more time or memory than allowed, or the machine
+                is too busy.
         """
         return self.roll_out(scenario_file, frames).position
 
@@ -118,6 +119,7 @@ class OnnxModel:
             wall=START_SECONDS + WALL_FACTOR * seconds,
             memory=self.memory,
         )
+        answers.require_in_time(str(self.path))
         if not answers.values:
             raise WorkFailedError(
                 "the model was stopped",
@@ -192,6 +194,7 @@ def open_onnx(
     Raises:
         UsageError: onnx or onnxruntime is not installed.
         UnreadableFileError: the file is no ONNX, or holds what is not allowed.
+        WorkFailedError: the machine is too busy.
     """
     declared = check_onnx(path)
     return OnnxModel(
@@ -219,6 +222,7 @@ def check_onnx(path: Path) -> DeclaredModel:
     Raises:
         UsageError: onnx or onnxruntime is not installed.
         UnreadableFileError: the file is no ONNX, or holds what is not allowed.
+        WorkFailedError: the machine is too busy.
     """
     for package in ("onnx", "onnxruntime"):
         check_installed(package, extra="onnx")
@@ -230,6 +234,7 @@ def check_onnx(path: Path) -> DeclaredModel:
         wall=START_SECONDS,
         memory=CHECK_MEMORY,
     )
+    answers.require_in_time(str(path))
     reason = answers.stopped
     declared: dict[str, Any] = {}
     if answers.values:

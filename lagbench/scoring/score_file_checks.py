@@ -317,7 +317,7 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
         if stops == MOST_STOPS or wall <= 0.0:
             return reasons | dict.fromkeys(pending, UNREAD)
         names = [str(path) for path in pending]
-        answers, stopped = run_in_child(
+        answers, stopped, _ = run_in_child(
             READ, names, seconds=CPU_SECONDS * parts, wall=wall
         )
 

@@ -62,6 +62,9 @@ ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
 }
 
+UNLIMITED_START = 60.0
+"""Time of the clock for the start of a child without a limit of processor time [s]."""
+
 MEMORY_SIGNS = (b"MemoryError", b"allocate memory", b"failed to map segment")
 """What a child prints that had too little memory to start."""
 
@@ -200,6 +203,11 @@ def address_space_limit() -> int | None:
 class ChildStopped(Exception):
     """A child under limits has ended before it answered; its text says why."""
 
+    def __init__(self, reason: str, *, is_late: bool = False) -> None:
+        """Set why it ended, and whether it was the time of the clock."""
+        super().__init__(reason)
+        self.is_late = is_late
+
 
 class LimitedChild:
     """A process with limits that calls functions of one module for this process.
@@ -282,7 +290,7 @@ class LimitedChild:
     def _failure(self, code: int) -> Exception:
         """Return the exception for a child that has ended with an exit code."""
         if self._is_late:
-            return ChildStopped(f"no end after {self._wall:.0f} s")
+            return ChildStopped(f"no end after {self._wall:.0f} s", is_late=True)
         self._stderr.seek(0)
         text = self._stderr.read()
         limit = address_space_limit()
@@ -327,6 +335,24 @@ class Answers(NamedTuple):
 
     values: list[Any]
     stopped: str | None
+    is_late: bool = False  # whether the time of the clock ended it
+
+    def require_in_time(self, where: str) -> None:
+        """Raise an error if the time of the clock ended the child.
+
+        Where processor time is limited, only a child that waits gets that far.
+
+        Raises:
+            WorkFailedError: the machine is too busy.
+        """
+        if self.is_late and LIMITS:
+            raise WorkFailedError(
+                "the machine is too busy",
+                where=where,
+                expected="an answer of a child process",
+                got=self.stopped,
+                fix="call again when the machine is idle",
+            )
 
 
 def run_in_child(
@@ -338,6 +364,9 @@ def run_in_child(
     memory: int = MEMORY,
 ) -> Answers:
     """Call a function once per request in a child with limits.
+
+    Where the system cannot limit the processor time, the time of the clock is at most
+    :data:`UNLIMITED_START` longer than the processor time would be.
 
     Args:
         function: dotted name of the function.
@@ -352,12 +381,14 @@ def run_in_child(
     """
     module, _, name = function.rpartition(".")
     answers = []
+    if not LIMITS:
+        wall = min(wall, seconds + UNLIMITED_START)
     with LimitedChild(module, seconds=seconds, wall=wall, memory=memory) as child:
         for request in requests:
             try:
                 answers.append(child.call(name, request))
             except ChildStopped as stopped:
-                return Answers(answers, str(stopped))
+                return Answers(answers, str(stopped), stopped.is_late)
     return Answers(answers, None)
 
 

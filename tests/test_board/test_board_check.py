@@ -410,6 +410,19 @@ DAMAGE: dict[str, Damage] = {
         training="cavity tiny train+shift, recipe cavity/tiny, step 6"
     ),
     "training: classical and trained": edited(call_trained_model_classical),
+    "training: trained on test, in the words of lagbench": put(
+        training="cavity tiny train+test, recipe cavity/tiny, step 6"
+    ),
+    "nothing: trained on train, in the words of lagbench": put(
+        training="cavity tiny train, recipe cavity/tiny, step 6"
+    ),
+    "training: classical, and trained in the words of lagbench": put(
+        kind="classical", training="cavity tiny train, recipe cavity/tiny, step 6"
+    ),
+    "training: classical, and a budget": put(kind="classical", budget={"steps": 9}),
+    "budget: best step of the entry after the last one": put(
+        budget={"steps": 9, "best_step": 10}
+    ),
     "nothing: a budget": budgeted(
         steps=9, best_step=9, best=0.1, validations=[[3, 0.2], [9, 0.1]]
     ),
@@ -428,6 +441,11 @@ DAMAGE: dict[str, Damage] = {
     ),
     "score: diverged after the last frame": edited(
         lambda entry: diverge(entry, frame=10**6)
+    ),
+    "nothing: diverged at a predicted frame": edited(
+        lambda entry: diverge(
+            entry, frame=load().size("cavity", "tiny").task.input_frames
+        )
     ),
     "predictions: a program as predictions": name_program,
     # what may happen to files
@@ -639,6 +657,8 @@ def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
 
     own.edit("noisy", withdraw)
     own.edit("damped", withdraw)
+    # a reference predictor that this version had
+    verified(cost=cost(classical={"projection-9x": 1.0}))(own)
     shutil.rmtree(references)
     result = check_board(own.folder, registry=newer, isolated=False)
     assert result.findings == ()

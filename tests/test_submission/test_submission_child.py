@@ -85,7 +85,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
     """Two answers, then it ends; the last request is never reached."""
-    values, stopped = run_in_child(
+    values, stopped, _ = run_in_child(
         "jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0
     )
     assert values == ["", ""]
@@ -137,7 +137,7 @@ def test_a_child_that_answers_waits_or_raises() -> None:
         asked,
         None,
     )
-    values, stopped = run_in_child(
+    values, stopped, _ = run_in_child(
         "jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0
     )
     assert values in ([], [""])  # on a busy machine it may not even have begun
