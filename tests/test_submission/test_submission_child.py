@@ -136,6 +136,7 @@ def test_a_child_that_answers_waits_or_raises() -> None:
     assert run_in_child("jobs.behave", asked, seconds=SECONDS, wall=WALL) == (
         asked,
         None,
+        False,
     )
     values, stopped, _ = run_in_child(
         "jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0
