@@ -601,12 +601,9 @@ def _output_errors() -> Iterator[None]:
     except RuntimeError as error:
         if PROCESSOR_WORDS not in str(error):
             raise
-        # The help of a group shall load no other module.
-        from .work.machine import processor_name
-
         raise WorkFailedError(
             "the installed NumPy cannot run on this processor",
-            where=processor_name(),
+            where="this machine",
             expected="a processor with the instructions that NumPy was built for",
             got=" ".join(str(error).split()),
             fix="install an older NumPy, which needs fewer: pip install 'numpy<2.4'",

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.errors import UsageError, require
+
 try:
     import torch
 except ModuleNotFoundError:
-    from lagbench.errors import require
-
     require("torch", extra="baselines")  # raises, with the command that installs it
     raise
 from torch import Tensor
@@ -35,7 +35,6 @@ from torch.utils.data import Dataset, Sampler
 
 from lagbench.arguments import check_arguments
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError
 from lagbench.store.windows import CACHE_BYTES, WindowReader
 from lagbench.store.windows import Window as ArrayWindow
 from lagbench.tensors import Batch, TensorWindow, collate

@@ -32,6 +32,7 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import shipped
 from lagbench.scoring.score_file import read_statistics
 
+SIZE = "mini"  # of our data sets
 FRAMES = 20  # predicted frames of the published errors
 
 HEAD = ("flow", "data", "model", "MSE_20", "MSE of E_kin")
@@ -53,7 +54,6 @@ class ComparedFlow:
 
     name: str
     split: str
-    size: str
     methods: tuple[str, ...]  # our entries
     published: tuple[PublishedRow, ...]
 
@@ -71,42 +71,36 @@ FLOWS = (
     ComparedFlow(
         name="decaying vortices",
         split="decaying-vortices",
-        size="mini",
         methods=("neuralmpm", "hybrid-projection"),
         published=_published("2D TGV", ("5.9e-6", "4.9e-7"), ("4.4e-6", "5.0e-7")),
     ),
     ComparedFlow(
         name="reverse Poiseuille",
         split="poiseuille",
-        size="mini",
         methods=("neuralmpm", "hybrid-projection"),
         published=_published("2D RPF", ("4.0e-6", "2.7e-5"), ("3.4e-6", "1.4e-5")),
     ),
     ComparedFlow(
         name="lid-driven cavity",
         split="cavity",
-        size="mini",
         methods=("neuralmpm", "gns-pushforward", "hybrid-projection"),
         published=_published("2D LDC", ("1.5e-5", "6.1e-7"), ("2.1e-5", "1.6e-5")),
     ),
     ComparedFlow(
         name="dam break and splash",
         split="fluid",
-        size="mini",
         methods=("neuralmpm", "gns-free-flight", "hybrid-coarse"),
         published=_published("2D DAM", ("3.1e-5", "1.1e-4"), ("4.1e-5", "5.2e-4")),
     ),
     ComparedFlow(
         name="decaying vortices in a cube",
         split="curl-noise-3d",
-        size="mini",
         methods=("neuralmpm", "hybrid-projection"),
         published=_published("3D TGV", ("5.8e-3", "4.8e-2"), ("5.0e-3", "3.9e-2")),
     ),
     ComparedFlow(
         name="lid-driven cavity in a cube",
         split="cavity-3d",
-        size="mini",
         methods=("neuralmpm", "hybrid-projection"),
         published=_published("3D LDC", ("4.1e-5", "1.9e-8"), ("4.1e-5", "2.5e-8")),
     ),
@@ -124,7 +118,7 @@ def table(board: Path) -> str:
     rows: list[tuple[str, ...]] = []
     registry = load()
     for flow in FLOWS:
-        size = registry.size(flow.split, flow.size)
+        size = registry.size(flow.split, SIZE)
         rows.extend(_our_rows(flow, size, Folder(board)))
         for row in flow.published:
             rows.append((flow.name, row.data, row.model, row.mse_20, row.e_kin_mse))
@@ -134,7 +128,7 @@ def table(board: Path) -> str:
 def _our_rows(
     flow: ComparedFlow, size: Size, folder: Folder
 ) -> Iterator[tuple[str, ...]]:
-    data = f"{flow.split} {flow.size}"
+    data = f"{flow.split} {SIZE}"
     references = shipped(size) or {}
     if "constant-velocity" in references:
         scores = references["constant-velocity"].scores
@@ -143,7 +137,7 @@ def _our_rows(
         # the shipped file has no kinetic energy of each frame
         yield flow.name, data, "constant-velocity", _number(mse_20), ""
     for method in flow.methods:
-        entry = read_entry(folder.path / entry_path((flow.split, flow.size, method)))
+        entry = read_entry(folder.path / entry_path((flow.split, SIZE, method)))
         if entry.status is not Status.ACTIVE:
             continue
         errors = errors_of(entry, folder, size)
@@ -159,8 +153,12 @@ def _our_rows(
 def errors_of(entry: Entry, folder: Folder, size: Size) -> Mapping[str, float]:
     """Return the errors of an entry by name, as LagrangeBench defines them.
 
-    They are means over scenarios and seeds, of the first 20 predicted frames.
+    They are means over scenarios and seeds, of the first 20 predicted frames:
+    ``position_mse_20`` [length^2] and ``e_kin_mse`` [(length^(d+2)/s^2)^2].
     LagrangeBench has velocities per second, and the mass of a particle is its volume.
+
+    Raises:
+        UnreadableFileError: a score file is missing or damaged.
     """
     energy_unit = size.value("density") * size.frame_interval**2
     factors = {"position_mse_20": 1.0, "e_kin_mse": 1.0 / energy_unit**2}
