@@ -34,7 +34,7 @@ from lagbench.generators.draws import generator
 from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
-from validation.full_box import Box, constants, lattice
+from validation.flows import Box, constants, lattice
 
 TARGET = 3.0
 

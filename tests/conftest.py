@@ -25,6 +25,7 @@ from filelock import FileLock
 from hypothesis import settings
 from registry_text import described_splits
 from score_bench import ScoreBench, bench_of
+from turns import leave_out_slow_tests
 from typer.main import get_command
 
 from lagbench.__main__ import app
@@ -84,6 +85,13 @@ def pytest_collectstart() -> None:
     The imports make some 700,000 objects, and nearly all of them stay.
     """
     gc.disable()
+
+
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> None:
+    """Leave out the slow tests whose turn it is not."""
+    leave_out_slow_tests(config, items)
 
 
 def pytest_collection_finish() -> None:

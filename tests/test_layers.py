@@ -105,6 +105,7 @@ def edges(*, for_types: bool = False) -> Graph:
     return import_graph(modules, for_types=for_types)
 
 
+@pytest.mark.slow
 def test_imports_stay_below() -> None:
     """A module imports from its own layer and those below, and never from what stays
     apart.
@@ -201,6 +202,7 @@ def test_no_two_classes_have_one_name() -> None:
     assert not twice
 
 
+@pytest.mark.slow
 def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
     """A folder named lagbench beside a script, the clone, does not hide the installed
     package.

@@ -5,9 +5,12 @@ from __future__ import annotations
 import functools
 import os
 import subprocess
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
+
+import pytest
 
 Case = TypeVar("Case")
 
@@ -50,6 +53,28 @@ def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[C
         return list(cases)
     first = -(turn() + shift) % turns
     return list(cases[first::turns])
+
+
+def leave_out_slow_tests(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out tests marked slow, others after another commit.
+
+    ``LAGBENCH_SLOW_SHARE`` is the share of them that runs, as in ``0.33``. By default
+    all run, as with ``LAGBENCH_TURN=all``. Each test is drawn by its name and the turn.
+    So it does not wait for ever where its module takes turns too.
+    """
+    share = float(os.environ.get("LAGBENCH_SLOW_SHARE", "1"))
+    if os.environ.get("LAGBENCH_TURN") == "all":
+        share = 1.0
+    left_out = []
+    kept = []
+    for item in items:
+        draw = zlib.crc32(f"{item.nodeid} {turn()}".encode()) / 2**32
+        if item.get_closest_marker("slow") and draw >= share:
+            left_out.append(item)
+        else:
+            kept.append(item)
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = kept
 
 
 PROGRAMS = of_this_turn(("README", "notebook", "demo"), turns=3, shift=2)

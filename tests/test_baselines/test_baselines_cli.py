@@ -274,6 +274,7 @@ def test_an_onnx_file_is_timed_beside_the_solver(
     assert 0 < seconds < solver_seconds
 
 
+@pytest.mark.slow
 def test_a_local_split_is_predicted_by_its_folder(
     lagbench: Command, original: LocalSplit, tmp_path: Path
 ) -> None:

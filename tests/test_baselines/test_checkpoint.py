@@ -465,6 +465,7 @@ def test_a_model_beyond_all_memory_is_refused() -> None:
     assert caught.value.where == "theirs.pt"
 
 
+@pytest.mark.slow
 def test_weights_of_the_board_can_be_run() -> None:
     """Every file that stands beside an entry is one that today's models are built
     from.

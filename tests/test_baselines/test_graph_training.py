@@ -347,6 +347,7 @@ def test_an_oracle_has_no_loss_after_own_steps() -> None:
             assert float(terms[name]) < 2e-5
 
 
+@pytest.mark.slow
 def test_noise_may_spread_over_its_levels() -> None:
     """An untrained network leaves fluid at rest: the noise of its velocity is lost.
 

@@ -333,6 +333,7 @@ def test_images_of_the_cube_are_a_group() -> None:
     assert torch.equal(image_of_y, up.expand(4, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "number"),
     [

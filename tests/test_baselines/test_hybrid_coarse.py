@@ -84,6 +84,7 @@ def test_without_changes_it_is_the_coarse_solver(
         np.testing.assert_array_equal(rollout.position.numpy(), positions)
 
 
+@pytest.mark.slow
 def test_rollouts_side_by_side_take_their_solvers_again(
     root: Path, figures: DatasetInfo
 ) -> None:

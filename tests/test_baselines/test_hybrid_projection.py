@@ -235,6 +235,7 @@ def test_an_obstacle_outside_a_channel_moves_no_particle() -> None:
     assert torch.equal(rollout.position, expected.position)
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_radius_of_a_flow_that_it_made_itself() -> None:
     """The disc that the fluid feels is a third larger than the disc in the file."""
     true_model = channel_model()
@@ -408,6 +409,7 @@ def test_a_fit_finds_a_damping_that_the_data_show() -> None:
     assert numbers["error"] < numbers["error_without"]
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_damping_of_flows_that_it_made_itself() -> None:
     """The lid's speed changes each frame: a fit that is a frame off has 0.4."""
     true_model = HybridProjection.build({}, cavity_info())

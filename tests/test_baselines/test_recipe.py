@@ -78,6 +78,7 @@ def test_every_recipe_is_right(name: str) -> None:
             assert has_length or entry.model.closed_form
 
 
+@pytest.mark.slow
 def test_operators_share_their_recipes() -> None:
     """The six operators have one recipe on every split; they differ in the steps alone,
     by their cost.

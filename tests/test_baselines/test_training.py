@@ -138,6 +138,7 @@ def have_same_weights(first: Path, second: Path) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> None:
     """The coefficient becomes sum(u(f) u(f+1)) / sum(u(f)^2) over train."""
     result = run(

@@ -106,6 +106,7 @@ def test_digits_of_the_scorer_in_a_full_box(
     assert validated_on_test(*there, "curl-noise") == scored(*there, "vorticity_nrmse")
 
 
+@pytest.mark.slow
 def test_digits_of_the_scorer_on_the_free_surface(
     run: Run,
     unmeasured: Registry,
@@ -223,6 +224,7 @@ def test_a_training_records_windows_times_and_validations(run: Run) -> None:
     assert 3600 * hours == pytest.approx(record["cpu_seconds"], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_long_records_are_thinned(run: Run) -> None:
     """Of 22 validations a budget keeps at most 20, the last one among them."""
     result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")

@@ -99,6 +99,7 @@ def test_the_overview_of_all_splits_fits_a_laptop(
         close(page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("width", "dark"),
     [(1280, False), (1280, True), (390, False), (390, True), (320, False)],
@@ -196,6 +197,7 @@ def test_every_line_of_the_charts_is_drawn(page: Page, board: Board) -> None:
         assert all({"L", "H"} & {*path} for path in paths)
 
 
+@pytest.mark.slow
 def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None:
     """Truth beside the leader of the tab, in view at once on both widths; a key pauses
     it.
@@ -357,6 +359,7 @@ def test_all_columns_are_shown_on_request(page: Page, board: Board) -> None:
             assert cell.startswith(format_value(value_of(row, column), column.form))
 
 
+@pytest.mark.slow
 def test_the_table_needs_no_script(
     running: Browser, file: Path, page: Page, board: Board
 ) -> None:
@@ -500,6 +503,7 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     until(page, f"String({shown}) === 'cavity-mini'")
 
 
+@pytest.mark.slow
 def test_address_restores_the_state(page: Page) -> None:
     """What was chosen stands in the address; loading that address shows the same."""
     run(page, "document.querySelectorAll('.tabs a')[3].click()")

@@ -664,6 +664,7 @@ def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
     assert result.findings == ()
 
 
+@pytest.mark.slow
 def test_a_stale_page_is_found(own: BoardBench) -> None:
     """No page, an edited one, a link and a page of other entries are stale; a new build
     mends it.

@@ -207,6 +207,7 @@ def test_the_board_of_the_clone_is_found_elsewhere(
     assert str(clone_board) not in run("leaderboard", "show").stdout
 
 
+@pytest.mark.slow
 def test_the_page_of_docs_is_true(run: Run) -> None:
     """docs/submitting.md names every check and key; its commands are accepted, its
     example is the file's.

@@ -938,6 +938,7 @@ def test_hostile_text_stays_text(board: Board) -> None:
     assert row_data["command"] == HOSTILE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entries", [16, 32])
 def test_an_entry_takes_at_most_40_kilobytes(entries: int) -> None:
     """On two splits, the tables included."""

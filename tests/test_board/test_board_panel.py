@@ -112,6 +112,7 @@ def test_panel_by_keyboard(page: Page, board: Board) -> None:
     assert page.value("document.activeElement.textContent") == entry.name
 
 
+@pytest.mark.slow
 def test_the_panel_leads_to_the_entry_whose_weights_a_row_shares(
     running: Browser, board: Board, tmp_path: Path
 ) -> None:
@@ -253,6 +254,7 @@ def test_film_shows_the_obstacle(
     close(opened)
 
 
+@pytest.mark.slow
 def test_film_plays_unless_motion_is_unwanted(page: Page) -> None:
     """With reduced motion it waits for Play; otherwise it starts; Pause stops it."""
     at = "Number(document.querySelector('#panel input[type=range]').value)"
@@ -325,6 +327,7 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     until(page, "document.getElementById('panel').open")
 
 
+@pytest.mark.slow
 def test_hostile_text_does_nothing(
     running: Browser, board: Board, tmp_path: Path
 ) -> None:
@@ -375,6 +378,7 @@ def test_hostile_text_does_nothing(
     close(page)
 
 
+@pytest.mark.slow
 def test_fifty_entries_are_there_within_a_second(
     running: Browser, tmp_path: Path
 ) -> None:

@@ -54,6 +54,7 @@ def checks_of(result: CheckResult) -> list[str]:
     return [issue.check for issue in result.findings]
 
 
+@pytest.mark.slow
 def test_a_model_gives_the_scores_of_its_entry(own: ModelBoard) -> None:
     """Its line says so, it is not run twice, and the board has nothing to object."""
     result = run_again(own, NAME, costs=True, time_solver=lambda *_: 0.5)
@@ -155,6 +156,7 @@ def test_a_line_holds_for_its_models_only(own: ModelBoard) -> None:
     assert checks_of(own.find()) == ["verified"]
 
 
+@pytest.mark.slow
 def test_check_counts_whole_and_partial_reproductions(own: ModelBoard) -> None:
     """A level that its records do not show is an issue, and so are other numbers of
     scenarios than the test subset has.
@@ -264,6 +266,7 @@ def test_contradictory_options_are_refused_before_any_work(
     assert result.exit_code == 2
 
 
+@pytest.mark.slow
 def test_a_recorded_result_is_shown_with_the_option_that_runs_it_again(
     own: ModelBoard, run: Callable[..., Result]
 ) -> None:

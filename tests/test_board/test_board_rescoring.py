@@ -82,6 +82,7 @@ def verified(bench: BoardBench) -> set[str]:
     return {row.id for row in board.tabs[0].rows if row.verified}
 
 
+@pytest.mark.slow
 def test_scoring_again_confirms_and_is_recorded(
     own: BoardBench, predictions: Path
 ) -> None:
@@ -106,6 +107,7 @@ def test_scoring_again_confirms_and_is_recorded(
     assert findings_of(own) == ["verified"]
 
 
+@pytest.mark.slow
 def test_metrics_of_packages_decide_nothing(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -479,6 +481,7 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     assert list_is_touched in places_of("noisy")
 
 
+@pytest.mark.slow
 def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its scores and the list of the verified, whatever the method is called."""
     first = own.predict(nearer, "new")

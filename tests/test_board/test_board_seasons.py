@@ -188,6 +188,7 @@ def test_blind_scenarios_are_new(master: ModelBoard) -> None:
     assert len(starts) == scenario_count
 
 
+@pytest.mark.slow
 def test_a_repeated_season_has_the_same_bytes(
     master: ModelBoard, tmp_path: Path
 ) -> None:

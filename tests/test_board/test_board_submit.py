@@ -71,6 +71,7 @@ def well(bench: BoardBench) -> bool:
     ).findings
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_shipped")
 def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
     """Labels of the predictions, what the submitter adds, data set, hashes, scores and
@@ -592,6 +593,7 @@ def finish(processes: Sequence[Any]) -> list[int]:
     return codes
 
 
+@pytest.mark.slow
 @rounds(1, 20)
 def test_two_that_add_a_seed_at_once_lose_none(
     own: BoardBench, numbers: Sequence[int]
@@ -614,6 +616,7 @@ def test_two_that_add_a_seed_at_once_lose_none(
     assert well(own)
 
 
+@pytest.mark.slow
 @rounds(1, 20)
 def test_two_that_submit_one_name_at_once(
     own: BoardBench, numbers: Sequence[int]

@@ -503,6 +503,7 @@ def test_an_entry_shares_the_weights_of_another(own: BoardBench) -> None:
     assert_sound(own)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("first")
 def test_shared_weights_stay_those_of_the_entry_that_keeps_them(
     own: BoardBench,
@@ -599,6 +600,7 @@ def test_one_option_in_two_spellings_is_one(
     assert failing_checks(own) == {"weights"}
 
 
+@pytest.mark.slow
 def test_a_child_process_reads_the_options_of_weights(
     own: BoardBench, first: Path
 ) -> None:
@@ -682,6 +684,7 @@ def test_options_that_the_model_does_not_take_are_not_submitted(
     assert own.state() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["supersede", "withdraw"])
 def test_a_successor_takes_over_the_weights_of_an_inactive_entry(
     own: BoardBench, first: Path, change: str
@@ -823,6 +826,7 @@ def test_what_the_check_finds(own: BoardBench, name: str) -> None:
     assert failing_checks(own) == {check}
 
 
+@pytest.mark.slow
 def test_what_is_no_record_is_not_copied(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -846,6 +850,7 @@ def test_what_is_no_record_is_not_copied(
     assert failing_checks(own) == {"weights"}
 
 
+@pytest.mark.slow
 def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
     """Scoring again finds predictions that state another budget, though the entry is
     consistent by itself.
@@ -869,6 +874,7 @@ def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
     assert checks == {"rescored"}
 
 
+@pytest.mark.slow
 def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     own: BoardBench, home: Path, tmp_path: Path
 ) -> None:
@@ -901,6 +907,7 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     assert own.state() == other.state()
 
 
+@pytest.mark.slow
 def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
     """An entry of that method, its parameters, training in words and score files;
     another seed.
@@ -981,6 +988,7 @@ def restore(entry: dict[str, Any]) -> None:
     entry["reason"] = "it was none"
 
 
+@pytest.mark.slow
 def test_only_sound_active_entries_get_seeds(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,6 +64,7 @@ def test_python_draws_the_same_picture(
         lagbench.animate(file, beside=4, output=tmp_path / "none" / "film.gif")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "name"),
     [

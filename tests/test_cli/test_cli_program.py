@@ -296,6 +296,7 @@ def test_a_name_that_is_too_long_is_no_fault_of_lagbench(
     assert len(result.stderr) < 1500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "line",
     [
@@ -323,6 +324,7 @@ def test_a_limit_of_memory_is_named_in_the_message(line: str, tmp_path: Path) ->
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_letters_that_a_stream_lacks_are_escaped() -> None:
     """The sign ÷ of a heading is no ASCII; the table is printed all the same."""
     board = Path(lagbench.__file__).parents[1] / "leaderboard"
@@ -332,6 +334,7 @@ def test_letters_that_a_stream_lacks_are_escaped() -> None:
     assert "\\xf7" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_leaderboard_is_shown_in_one_table_for_each_data_set(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -114,6 +114,7 @@ def test_a_solver_that_cannot_be_timed_gives_no_speed_up(
     assert demo.bench_demo_solver() is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_registry", "no_torch")
 def test_without_torch_the_demo_makes_data_only(
     run: Run, copied: Callable[[], Path]

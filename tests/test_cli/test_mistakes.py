@@ -447,6 +447,7 @@ def lose_permissions() -> None:
         libc.prctl(drop_capability, capability, 0, 0, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
 def test_a_scenario_without_permission_is_named_in_the_message(
     files: Path, bench: ScoreBench, tmp_path: Path
@@ -469,6 +470,7 @@ def test_a_scenario_without_permission_is_named_in_the_message(
     assert "ermission" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="this system has no /dev/full"
 )

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import h5py
 import independent_hash
 import netCDF4
+import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -20,6 +21,7 @@ from lagbench.data.scenario import rehash
 KEY = make_key()
 
 
+@pytest.mark.slow
 @settings(
     max_examples=20,
     deadline=None,

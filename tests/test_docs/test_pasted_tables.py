@@ -56,6 +56,7 @@ def test_the_table_of_speeds_has_the_costs_of_verified_yaml() -> None:
     assert table_like(page, printed[0]) == printed
 
 
+@pytest.mark.slow
 def test_the_table_of_shift_has_the_scores_of_shift_yaml() -> None:
     """The best method of each kind on four data sets."""
     chosen = collect_shifted(BOARD, "mini")
@@ -65,6 +66,7 @@ def test_the_table_of_shift_has_the_scores_of_shift_yaml() -> None:
     assert table_like(page, printed[0]) == printed
 
 
+@pytest.mark.slow
 def test_the_tables_of_references_have_the_shipped_scores(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

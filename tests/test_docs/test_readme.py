@@ -289,6 +289,7 @@ def test_dam_break_is_a_split(dam_break: None, tmp_path: Path) -> None:
         assert (last < 0.8 * first).all()
 
 
+@pytest.mark.slow
 def test_sage_is_a_baseline_and_enstrophy_a_metric(
     monkeypatch: pytest.MonkeyPatch, bench: ScoreBench, tmp_path: Path
 ) -> None:

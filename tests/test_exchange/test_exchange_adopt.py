@@ -353,6 +353,7 @@ def test_one_error_names_all_missing_options(tmp_path: Path) -> None:
         assert words in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "test_count"),
     [
@@ -553,6 +554,7 @@ def assert_says_what_happened(error: LagbenchError) -> None:
     assert "disk space" not in str(error)
 
 
+@pytest.mark.slow
 def test_the_folder_that_another_process_made_meanwhile_stays_whole(
     tmp_path: Path, runs: Runs
 ) -> None:
@@ -643,6 +645,7 @@ def test_a_horizon_that_valid_is_too_short_for_is_refused(tmp_path: Path) -> Non
     assert "at most 12 frames" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) -> None:
     """Each scenario has as many particles in its predictions as in its file."""
     ragged = []

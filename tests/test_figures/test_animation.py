@@ -137,6 +137,7 @@ def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:
     assert in_the_middle < at_the_rim
 
 
+@pytest.mark.slow
 def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> None:
     """Eight frames at 30 a second; the same frames give the same bytes."""
     first = animate(swirl, tmp_path / "first.mp4")

@@ -93,6 +93,7 @@ def card(size: Size, manifest: Manifest, **update: object) -> str:
     return cards.dataset_card(size, split, changed, pictures=[])
 
 
+@pytest.mark.slow
 def test_pictures_that_cannot_be_written_name_the_root(tmp_path: Path) -> None:
     """`lagbench generate` has no --output."""
     size, manifest = make(tmp_path)
@@ -406,6 +407,7 @@ def test_hostile_text_of_a_registry_stays_text() -> None:
 PRINTABLE = st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"])
 
 
+@pytest.mark.slow
 @given(st.text(PRINTABLE))
 def test_escaping_only_adds_backslashes(text: str) -> None:
     """Taking the backslashes away gives the text on one line; no special character

@@ -95,6 +95,7 @@ def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
     assert len(pictures) == len(kinds)
 
 
+@pytest.mark.slow
 def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
     """A data set of several scenarios is refused."""
     from_file = plot_frame(swirl, -1, tmp_path / "file.png")
@@ -398,6 +399,7 @@ def test_a_broken_dependency_is_not_called_missing(
         errors.require("broken_extra", extra="plots")
 
 
+@pytest.mark.slow
 def test_sheet_of_driven_scenarios_has_a_panel_for_each(tmp_path: Path) -> None:
     """More scenarios make a wider page; the same page has the same bytes."""
 
@@ -421,6 +423,7 @@ def test_sheet_of_driven_scenarios_has_a_panel_for_each(tmp_path: Path) -> None:
     assert np.count_nonzero(starts) >= 5
 
 
+@pytest.mark.slow
 def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
     """Scenarios of one family share a row, families lie below each other."""
     heights = []
@@ -441,6 +444,7 @@ def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
     assert two_circles < with_splash
 
 
+@pytest.mark.slow
 def test_a_sheet_shows_the_kind_that_is_named(swirl: Path, tmp_path: Path) -> None:
     root = swirl.parents[4]
     pages = set()

@@ -204,6 +204,7 @@ def assert_harmless(reading: Reading) -> None:
         assert style.text.count("{") == style.text.count("}")
 
 
+@pytest.mark.slow
 @EVERY_PAGE
 def test_page_is_whole_and_harmless(page: Page, split: str) -> None:
     """Elements close in order, links lead somewhere, nothing runs; 3 MB hold it."""
@@ -275,6 +276,7 @@ def test_every_figure_can_be_read_aloud(page: Page, split: str) -> None:
         assert is_hidden or drawing.text or "role" not in drawing.attributes
 
 
+@pytest.mark.slow
 def test_text_of_strangers_is_shown_not_run(home: Path, tmp_path: Path) -> None:
     """Hostile names of methods, files and trainings stand on the page as text."""
     bench = make_report_bench(home, "curl-noise")
@@ -338,6 +340,7 @@ def test_same_bytes_every_time(
     assert str(bench.root) not in first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", ["cavity", "multimaterial"])
 def test_undefined_and_huge_numbers_are_drawn_around(
     home: Path, tmp_path: Path, split: str

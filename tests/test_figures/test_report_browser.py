@@ -101,6 +101,7 @@ def test_the_table_of_scores_is_not_cut(running: Browser, report: Path) -> None:
     assert page.value(f"{box}.scrollWidth") <= page.value(f"{box}.clientWidth")
 
 
+@pytest.mark.slow
 def test_the_page_prints(running: Browser, report: Path) -> None:
     """A PDF has a sensible number of pages."""
     pdf = running.open(report, width=1280).pdf()

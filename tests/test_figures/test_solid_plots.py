@@ -244,6 +244,7 @@ def test_a_view_shows_the_outline_of_an_obstacle(
     np.testing.assert_allclose(np.linalg.norm(from_centre, axis=1), 0.1, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Panel.VORTICITY, Panel.STREAMLINES])
 def test_a_slice_shows_the_cut_of_an_obstacle(kind: Panel) -> None:
     """A circle where the plane cuts it, and nothing where it passes by."""

@@ -87,6 +87,7 @@ def failure(
     return caught.value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "expected", "got"),
     [
@@ -116,6 +117,7 @@ def test_substep_and_bounds_are_those_that_broke_first(
     assert not list(tmp_path.rglob("*.nc*"))
 
 
+@pytest.mark.slow
 def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> None:
     """Of scenarios that advance together, the one that breaks first; not the first of
     the batch.
@@ -126,6 +128,7 @@ def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> 
     assert error.where == f"{SPLIT} {SIZE}, scenario {scenario}, substep {substep}"
 
 
+@pytest.mark.slow
 def test_a_good_run_loads_its_states_once(
     unmeasured: Registry,
     tmp_path: Path,

@@ -105,6 +105,7 @@ def deformations(spread: float) -> Single:
     return gradients.astype(np.float32)
 
 
+@pytest.mark.slow
 def test_left_stretch_is_the_polar_factor() -> None:
     """V equals SciPy's polar factor, for stretches from 0.3 to 2.5 along any axes."""
     rng = np.random.default_rng(7)

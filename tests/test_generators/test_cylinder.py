@@ -147,6 +147,7 @@ def test_windows_state_the_disc_and_no_particle_enters_it(
         assert entry.facts["jacobian_max"] < 1.15
 
 
+@pytest.mark.slow
 def test_batches_carry_the_disc(tiny_split: Callable[..., GenerationResult]) -> None:
     """A batch has one row for each window; in a mirror image the disc stands as far
     from the other wall.

@@ -35,6 +35,7 @@ from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_drivers_give_the_same_bits(threads: int) -> None:
     """Serial frames, and parallel phases with atomics over two scenarios, agree after
@@ -58,6 +59,7 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
         np.testing.assert_equal(own, after(constants, [state], 450))
 
 
+@pytest.mark.slow
 def test_threads_lose_no_contribution() -> None:
     """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose
     none of them.
@@ -238,6 +240,7 @@ def started(**variables: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_the_environment_does_not_choose_the_arithmetic() -> None:
     """Device, optimisation and checks are the same with hostile variables, which stay
     as they were.
@@ -249,6 +252,7 @@ def test_the_environment_does_not_choose_the_arithmetic() -> None:
     assert hostile[1] == str(sorted(HOSTILE))
 
 
+@pytest.mark.slow
 def test_simulating_anew_without_taichi_names_the_remedy(
     generated: GenerationResult,
     unmeasured: Registry,

@@ -130,6 +130,7 @@ def test_atomic_adds_from_two_threads_change_no_bit(state: InitialState) -> None
     assert_the_parallel_driver_agrees(state, threads=2)
 
 
+@pytest.mark.slow
 def test_the_parallel_driver_on_one_thread_gives_the_same_bits() -> None:
     assert_the_parallel_driver_agrees(MIXED, threads=1)
 

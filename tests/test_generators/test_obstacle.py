@@ -73,6 +73,7 @@ def advanced(state: InitialState, substeps: int) -> dict[str, NDArray[np.float32
     }
 
 
+@pytest.mark.slow
 def test_numpy_agrees_and_the_order_of_particles_does_not_matter() -> None:
     """An independent float64 solver agrees; a permutation has the same bits."""
     state = channel_state()
@@ -102,6 +103,7 @@ def test_numpy_agrees_and_the_order_of_particles_does_not_matter() -> None:
         np.testing.assert_array_equal(values, result[name][order])
 
 
+@pytest.mark.slow
 def test_scenarios_side_by_side_have_the_bits_of_each_alone() -> None:
     """Two discs at different places, in parallel threads."""
     states = [channel_state(), channel_state((0.3 + 1.0 / 32.0, 0.5 - 1.0 / 32.0))]
@@ -119,6 +121,7 @@ def test_scenarios_side_by_side_have_the_bits_of_each_alone() -> None:
     serial_solver.cache_clear()
 
 
+@pytest.mark.slow
 def test_no_particle_enters_the_disc() -> None:
     """After the stream has passed the disc several times, all particles lie outside,
     and the fluid in front of it stands still.

@@ -139,6 +139,7 @@ def test_a_steady_force_drives_the_parabola() -> None:
     assert greatest_momentum(solver) < 0.005 * speed
 
 
+@pytest.mark.slow
 def test_a_program_of_forces_drives_the_flow_that_fourier_modes_have() -> None:
     """A drawn program without eddies: momentum diffuses as in the closed form, the
     total momentum stays zero, and the fluid keeps its density.

@@ -104,6 +104,7 @@ def test_statistics_are_computed_anew(
     assert measured.statistics == manifest_of(generated.root).statistics
 
 
+@pytest.mark.slow
 def test_recording_again_changes_no_byte(
     generated: GenerationResult, registry: Path
 ) -> None:

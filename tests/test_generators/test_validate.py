@@ -308,6 +308,7 @@ def _read_result(folder: Path) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.slow
 def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
     """Ghia's points with his values, errors that follow from them, checks, energy that
     grows.
@@ -371,6 +372,7 @@ def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> No
     assert first_point["ghia"] is None
 
 
+@pytest.mark.slow
 def test_validate_curl_noise(tmp_path: Path) -> None:
     """Most of the energy is left after ten frames, and divergence is small against
     vorticity.

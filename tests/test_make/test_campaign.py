@@ -128,6 +128,7 @@ def test_another_machine_has_tolerance_until_its_hashes_agree(
     assert "same bits on every" in card_of(root)
 
 
+@pytest.mark.slow
 def test_other_bits_of_another_machine_stay_and_count_as_tolerance(
     tmp_path: Path,
     unmeasured: Registry,

@@ -159,6 +159,7 @@ def test_all_workers_killed_is_an_error(
     assert writers(tmp_path) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_result_that_is_lost_with_its_worker_is_not_awaited_for_ever(
     monkeypatch: pytest.MonkeyPatch,

@@ -134,6 +134,7 @@ def test_a_file_holds_what_its_scenario_says(
     assert header.parameters["modulus"] == size.value("modulus")
 
 
+@pytest.mark.slow
 def test_cavity_files_hold_the_walls_of_every_frame(
     tiny_split: Callable[..., GenerationResult],
 ) -> None:
@@ -251,6 +252,7 @@ def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -
     assert not np.array_equal(signs > 0, plain >= 0.5)
 
 
+@pytest.mark.slow
 def test_resuming_makes_what_is_missing_or_wrong(
     copied: Callable[[], Path],
     unmeasured: Registry,
@@ -408,6 +410,7 @@ def hashes_of(manifest: Manifest) -> dict[int, str]:
     return {entry.scenario: entry.content_sha256 for entry in manifest.files}
 
 
+@pytest.mark.slow
 def test_batches_start_each_scenario_at_its_own_frame(
     tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
@@ -638,6 +641,7 @@ print(*(name for name in sys.modules if name.startswith("lagbench.figures.")))
 """
 
 
+@pytest.mark.slow
 def test_a_generation_that_paints_nothing_loads_no_drawing_module(
     copied: Callable[[], Path], unmeasured: Registry, unmeasured_path: Path
 ) -> None:

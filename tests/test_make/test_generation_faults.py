@@ -113,6 +113,7 @@ def test_a_disk_too_small_is_refused_at_once(
     assert files(small_disk) == []
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_leaves_whole_files_only(
     small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -200,6 +200,7 @@ def test_notes_add_up_and_stay_few(cache: Path, size: Size) -> None:
     assert json.loads(rates_file.read_text()) == content
 
 
+@pytest.mark.slow
 def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) -> None:
     """The time from the second frame on, when everything is compiled, to the end of the
     file.
@@ -226,6 +227,7 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
 NOT_YET = "measured after the first generate"
 
 
+@pytest.mark.slow
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
     """Before the first one tables say that times are estimated, after it that they are
     measured here.

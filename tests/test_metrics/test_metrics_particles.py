@@ -521,6 +521,7 @@ def test_cloud_distance_asks_for_materials_not_for_particles() -> None:
     assert distance(across) > 0.01
 
 
+@pytest.mark.slow
 def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     """Entropic transport debiased by its own terms leaves |s|^2 for a shift by s, 0 for
     none. It is measured on request only, and without its package the error has the

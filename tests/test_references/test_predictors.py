@@ -531,6 +531,7 @@ def test_the_subset_is_spread_evenly_in_three_dimensions() -> None:
     assert counts.std() < 2.0
 
 
+@pytest.mark.slow
 def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     """With its own grid, time step and particles it moves them as the solver does."""
     size = load().size("fluid", "tiny")
@@ -640,6 +641,7 @@ def test_rollouts_that_take_turns_compile_each_solver_once(
     assert built.count(coarse.grid) == coarse_solver.MOST_KEPT + 2
 
 
+@pytest.mark.slow
 def test_the_coarse_solver_moves_all_particles() -> None:
     """A block in flight keeps its parabola on the coarser grid."""
     size = load().size("fluid", "mini")

@@ -173,6 +173,7 @@ def test_the_roughest_flow_decays(dimension: int) -> None:
     assert np.all(np.diff(energies) < 0.0)
 
 
+@pytest.mark.slow
 def test_a_driven_channel_comes_to_poiseuille_flow() -> None:
     """The profile is f y (L - y) / (2 nu) between walls at rest."""
     bounds = [(0.0, 1.0), (0.0, 0.5)]

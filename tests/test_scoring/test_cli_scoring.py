@@ -44,6 +44,7 @@ def predictions(run: Run, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_template_validates_and_scores(run: Run, predictions: Path) -> None:
     """The output names references, undefined frames, flags and files."""
     assert run("validate", predictions).exit_code == 0
@@ -239,6 +240,7 @@ def test_compare_refuses_an_unknown_metric(run: Run, predictions: Path) -> None:
     assert run(*arguments, "--metric", "mse").exit_code == 2
 
 
+@pytest.mark.slow
 def test_other_files_of_lagbench_are_no_predictions(
     run: Run, predictions: Path, generated: GenerationResult
 ) -> None:
@@ -336,6 +338,7 @@ def test_a_failing_metric_of_a_package_costs_its_column(
     assert content == expected
 
 
+@pytest.mark.slow
 def test_several_files_keep_their_scores(
     run: Run, two_submissions: list[Path], tmp_path: Path
 ) -> None:
@@ -349,6 +352,7 @@ def test_several_files_keep_their_scores(
     assert [path.name for path in report.iterdir()] == ["index.html"]
 
 
+@pytest.mark.slow
 def test_namesakes_are_numbered(run: Run, two_submissions: list[Path]) -> None:
     result = run("compare", *two_submissions)
     assert result.exit_code == 0, result.stderr
@@ -387,6 +391,7 @@ def test_two_files_never_share_a_folder_of_scores(
     assert [path.name for path in first.parent.iterdir()] == ["p.nc"]
 
 
+@pytest.mark.slow
 def test_files_of_two_data_sets_are_refused_before_any_is_scored(
     run: Run,
     two_submissions: list[Path],

@@ -266,6 +266,7 @@ def test_predictions_of_another_split_are_refused_before_they_are_scored(
         compare(a, predictions, root=tmp_path / "empty", registry=bench.registry)
 
 
+@pytest.mark.slow
 def test_folders_files_and_predictions_give_the_same_result(
     bench: ScoreBench, scored: Folders
 ) -> None:
@@ -324,6 +325,7 @@ def board(scored: Folders, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_seeds_of_a_leaderboard_go_by_their_common_name(
     board: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -348,6 +350,7 @@ def entries(scored: Folders, bench: ScoreBench, tmp_path: Path) -> Path:
     return board
 
 
+@pytest.mark.slow
 def test_an_entry_of_the_leaderboard_goes_by_its_name(
     scored: Folders, entries: Path, bench: ScoreBench
 ) -> None:

@@ -64,6 +64,7 @@ def row_of_submission(content: dict[str, Any]) -> dict[str, Any]:
     return row
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_shipped")
 def test_the_truth_scores_perfectly(bench: ScoreBench, tmp_path: Path) -> None:
     """It gets the perfect value of every metric that has one, and is suspect."""
@@ -417,6 +418,7 @@ def test_an_extra_that_is_not_installed_is_refused_before_the_work(
     assert seen == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("ot") is None, reason="needs the extra transport"
 )
@@ -483,6 +485,7 @@ FALL = Metric(
 )
 
 
+@pytest.mark.slow
 def test_own_metrics_are_measured_without_a_package(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -505,12 +508,14 @@ def test_own_metrics_are_measured_without_a_package(
         assert "fall" not in read(file).scores[SUBMISSION]
 
 
+@pytest.mark.slow
 def test_one_own_metric_needs_no_list(bench: ScoreBench, tmp_path: Path) -> None:
     path = bench.submit(tmp_path / "predictions.nc", right)
     card = bench.evaluate(path, metrics=FALL)
     assert card.submission["fall"].mean == 0.0
 
 
+@pytest.mark.slow
 def test_an_own_metric_may_follow_from_others(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
@@ -581,6 +586,7 @@ def test_a_built_in_metric_needs_no_argument(
     assert "metrics=" in str(caught.value.fix)
 
 
+@pytest.mark.slow
 def test_the_own_metric_of_the_docs_is_measured(
     bench: ScoreBench, tmp_path: Path
 ) -> None:

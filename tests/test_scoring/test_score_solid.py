@@ -87,6 +87,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     )
 
 
+@pytest.mark.slow
 def test_truth_is_perfect_and_references_are_measured(
     made: LocalSplit, tmp_path: Path
 ) -> None:

@@ -461,6 +461,7 @@ def test_a_forged_shipped_score_is_found(
     assert set(changed_metrics["constant-velocity"]) == all_metrics
 
 
+@pytest.mark.slow
 def test_a_new_measurement_finds_a_forged_score(
     bench: ScoreBench,
     measured_references: References,

@@ -332,6 +332,7 @@ def test_without_pytorch_the_message_says_what_to_install() -> None:
     assert run.stdout.strip() == "pip install 'lagbench[baselines]'"
 
 
+@pytest.mark.slow
 def test_without_pytorch_code_that_asks_for_it_goes_on() -> None:
     """As any import of a missing module: the error is an ImportError, too. Looking at
     all members of the package raises nothing.

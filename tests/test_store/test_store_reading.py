@@ -133,6 +133,7 @@ def test_scenarios_that_the_store_lacks_are_an_error(
         lagbench.open_split(SPLIT, size=SIZE, subset="train", root=root)
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_the_folder(
     url: str,
     generated: GenerationResult,
@@ -247,6 +248,7 @@ def test_verify_names_an_object_that_is_gone(store: Store, tiny: Registry) -> No
         assert str(caught.value.where).endswith("scenarios 2")
 
 
+@pytest.mark.slow
 def test_files_of_the_copy_make_no_store_whole(store: Store, tiny: Registry) -> None:
     """Be it one file or all."""
     assert_verified(store.url, tiny)

@@ -130,6 +130,7 @@ def silent_store(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         yield "s3://bucket/data"
 
 
+@pytest.mark.slow
 def test_a_silent_store_is_given_up(
     silent_store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

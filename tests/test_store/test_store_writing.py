@@ -113,6 +113,7 @@ def named(data: bytes) -> list[str]:
     return [entry["path"] for entry in json.loads(data)["files"]]
 
 
+@pytest.mark.slow
 def test_another_machine_ends_what_one_began(
     url: str,
     run: Run,
@@ -158,6 +159,7 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
     assert [*files(result.root)] == [MANIFEST]
 
 
+@pytest.mark.slow
 def test_the_manifest_comes_last(
     url: str,
     run: Run,
@@ -183,6 +185,7 @@ def test_the_manifest_comes_last(
         assert {*named(there.get("manifest.json", b'{"files": []}'))} <= there.keys()
 
 
+@pytest.mark.slow
 def test_a_fault_in_the_middle_leaves_whole_objects(
     url: str, run: Run, simulated_here: Fill, generated: GenerationResult, wrote: Wrote
 ) -> None:
@@ -226,6 +229,7 @@ def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
     assert objects(full) == files(generated.root)
 
 
+@pytest.mark.slow
 def test_two_writers_do_no_harm(
     url: str,
     run: Run,

@@ -200,6 +200,7 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "EXPECTED", {SPLIT: ("supergat", "mlp")})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_models_without_the_recipe_are_left_out(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]

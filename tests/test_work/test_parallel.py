@@ -129,6 +129,7 @@ def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> No
     assert captured.out + captured.err == ""
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
     """Nothing of Dask's is printed either when the process ends."""
     there = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}

@@ -1,7 +1,7 @@
-"""Validate the solver of full boxes, in two and three dimensions, from one command.
+"""Validate the solvers on flows with a known answer, from one command.
 
-    python -m validation.full_box                    all cases, about half an hour
-    python -m validation.full_box --case poiseuille --case taylor-green
+    python -m validation.flows                    all cases, about half an hour
+    python -m validation.flows --case poiseuille --case taylor-green
 
 Prints one line per case: what was measured, the truth, the deviation, the largest that
 counts as valid, and the processor time. Exit code 0: all valid; 1: one is not.
@@ -28,6 +28,9 @@ strouhal
 cylinder-drag
     Mean drag coefficient of the same disc against Park, Kwon and Choi (1998). It is
     taken from the momentum that the fringe gives to the stream.
+dam-break, dam-break-3d
+    Front of a breaking column of liquid, with the constants of fluid full and fluid-3d
+    mini, against Martin and Moyce (1952); `dam_break.py` prints the whole curve.
 """
 
 from __future__ import annotations
@@ -53,6 +56,7 @@ from lagbench.generators.solver import Solver, build
 from lagbench.generators.split import InitialState, Material
 from lagbench.references.staggered import StaggeredGrid
 
+from . import dam_break
 from .diagnostics import Y, centre_lines
 
 Array = NDArray[np.float64]
@@ -556,6 +560,20 @@ def cylinder_drag() -> CaseResult:
     )
 
 
+def dam_front(split: str, size: str, tolerance: float) -> CaseResult:
+    """Last place of the front of a breaking column, in widths of the column; J. C.
+    Martin and W. J. Moyce, Phil. Trans. R. Soc. A 244 (1952) 312-324. The deviation is
+    the mean over the front's way.
+    """
+    result = dam_break.run(size, split)
+    return CaseResult(
+        measured=result.front[-1],
+        truth=result.experiment[-1],
+        deviation=result.deviation,
+        tolerance=tolerance,
+    )
+
+
 CASES: dict[str, Callable[[], CaseResult]] = {
     "taylor-green": taylor_green,
     "poiseuille": poiseuille,
@@ -565,6 +583,8 @@ CASES: dict[str, Callable[[], CaseResult]] = {
     "cube-1000": cube_at_1000,
     "strouhal": strouhal,
     "cylinder-drag": cylinder_drag,
+    "dam-break": functools.partial(dam_front, "fluid", "full", 0.10),
+    "dam-break-3d": functools.partial(dam_front, "fluid-3d", "mini", 0.05),
 }
 
 
