@@ -51,9 +51,10 @@ class Symmetry(enum.StrEnum):
 
 
 def check_symmetry(symmetry: object, size: Size) -> None:
-    """Refuse mirror images in which walls or gravity have another direction.
+    """Refuse all images of the square where some of them are no motion of the split.
 
-    A split whose description names no gravity, as an imported one may, passes.
+    Mirror images alone are possible everywhere. A split whose description names no
+    gravity, as an imported one may, passes.
 
     Raises:
         UsageError: all images of the square are asked for where gravity acts, or where
@@ -69,15 +70,15 @@ def check_symmetry(symmetry: object, size: Size) -> None:
             got=str(symmetry),
             fix="set model.symmetry=mirror",
         )
-    parameter = size.parameters.get("gravity")
-    if not parameter or not parameter.value:
+    gravity = size.parameters.get("gravity")
+    if not gravity or not gravity.value:
         return
     raise UsageError(
-        f"gravity in {size.split} points down, and its images of the square fall "
-        f"sideways and up",
+        f"gravity in {size.split} points down; in a rotated image of the square the "
+        f"particles would fall sideways or up",
         where="model.symmetry",
         expected=f"{Symmetry.NONE} or {Symmetry.MIRROR} where gravity is "
-        f"{parameter.value}",
+        f"{gravity.value}",
         got=str(symmetry),
         fix="set model.symmetry=mirror",
     )

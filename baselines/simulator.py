@@ -642,10 +642,10 @@ class GraphNetwork(Baseline):
     def _forget(
         self, state: ParticleState, windows: int, generator: torch.Generator
     ) -> ParticleState:
-        """Return the state in which some windows have fewer velocities.
+        """Return the state after some windows forgot their oldest velocities.
 
-        The option ``forgetful`` says how many windows. The first velocity that is left
-        stands in place of the forgotten ones before it.
+        The option ``forgetful`` is the probability that a window forgets. The first
+        velocity that is left stands in place of the forgotten ones before it.
         """
         velocities = self.options.velocities
         if self.options.forgetful == 0.0 or velocities == 1:

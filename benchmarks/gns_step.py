@@ -61,19 +61,18 @@ def use_conventional(options: argparse.Namespace) -> None:
 def make_graph(count: int, windows: int) -> Tensor:
     """Return a graph with about 8 neighbours per particle, shape [2, edge].
 
-    Each window is a box with one particle in each cell of a lattice.
+    In each window the particles lie in the first cells of a square lattice, one in each
+    cell. No edge leads from one window to another.
     """
-    even_side = math.sqrt(count)
-    side = math.ceil(even_side)
+    side = math.ceil(math.sqrt(count))
     cell = torch.arange(side)
     lattice = torch.cartesian_prod(cell, cell)
     corner = lattice[:count]
-    source = torch.Generator().manual_seed(0)
-    offset = torch.rand(count * windows, 2, generator=source)
+    random = torch.Generator().manual_seed(0)
+    offset = torch.rand(count * windows, 2, generator=random)
     position = corner.repeat(windows, 1) + offset
-    window = torch.arange(windows)
-    sample = window.repeat_interleave(count)
-    edge_index: Tensor = radius_graph(position, RADIUS, sample)
+    window_of_particle = torch.arange(windows).repeat_interleave(count)
+    edge_index: Tensor = radius_graph(position, RADIUS, window_of_particle)
     return edge_index
 
 

@@ -264,12 +264,12 @@ def fill(
 ) -> Array:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
-    The columns number floor(sqrt(count)), their counts differ by one at the most, and
-    each spreads its own particles evenly over the height.
+    There are floor(sqrt(count)) columns. The numbers of their particles differ by one
+    at the most. Each column spreads its particles evenly over the height.
 
     Args:
         rng: source of the jitter.
-        count: number of particles.
+        count: number of particles, at least one.
         low: coordinate of the left and bottom walls [length].
         high: coordinate of the right and top walls [length].
         jitter: width of the uniform displacement, in spacings [1].

@@ -334,7 +334,7 @@ def taylor_green_3d(grid: int = 24) -> CaseResult:
 
 
 def _centre_line(
-    grid: int, depth: int, *, is_thin: bool, turns: float, reynolds: float = 100.0
+    grid: int, depth: int, *, is_thin: bool, lid_travel: float, reynolds: float = 100.0
 ) -> Array:
     """Return u / U at the nodes of the vertical centre line of a driven cavity.
 
@@ -342,22 +342,22 @@ def _centre_line(
         grid: cells along x and y.
         depth: cells along z.
         is_thin: whether the box is periodic along z.
-        turns: how long the lid moves, in sides of the box that it travels.
+        lid_travel: distance by which the lid moves [sides of the box].
         reynolds: speed of the lid times the side over the viscosity.
     """
     speed = 0.26
     box = Box.from_bounds(
         [(0.0, 1.0), (0.0, 1.0), (0.0, depth / grid)], [False, False, is_thin]
     )
-    per_cell = 2 if is_thin else 1.5
-    counts = [round(per_cell * cells) for cells in (grid, grid, depth)]
+    per_cell_side = 2 if is_thin else 1.5
+    counts = [round(per_cell_side * cells) for cells in (grid, grid, depth)]
     position = lattice(box, counts)
     parameters = constants(box, grid, len(position))
     walls = np.zeros((6, 3))
     walls[3, 0] = speed
     viscosity = speed / reynolds
     solver = started(parameters, position, viscosity=viscosity, walls=walls)
-    steps = round(turns / speed / parameters.dt)
+    steps = round(lid_travel / speed / parameters.dt)
     solver.advance(round(0.9 * steps))
     mean = np.zeros(grid)
     middle = slice(grid // 2 - 1, grid // 2 + 1)
@@ -371,7 +371,7 @@ def _centre_line(
 
 def thin_cavity(grid: int = 24) -> CaseResult:
     """The cavity in a thin box, periodic along z, against Ghia's u at Re 100."""
-    u = _centre_line(grid, 4, is_thin=True, turns=25.0)
+    u = _centre_line(grid, 4, is_thin=True, lid_travel=25.0)
     height = np.r_[0.0, (np.arange(grid) + 0.5) / grid, 1.0]
     ghia = centre_lines(100.0)
     assert ghia is not None  # Reynolds number 100 is tabulated
@@ -387,7 +387,7 @@ def thin_cavity(grid: int = 24) -> CaseResult:
 
 def cube(grid: int = 24, reference_cells: int = 32) -> CaseResult:
     """The driven cube at Re 100 against the staggered grid, along its centre line."""
-    u = _centre_line(grid, grid, is_thin=False, turns=20.0)
+    u = _centre_line(grid, grid, is_thin=False, lid_travel=20.0)
     box = Box.from_bounds([(0.0, 1.0)] * 3)
     staggered = StaggeredGrid(box, cells=(reference_cells,) * 3, no_slip=True)
     walls = np.zeros((6, 3))
@@ -411,7 +411,7 @@ def cube(grid: int = 24, reference_cells: int = 32) -> CaseResult:
 
 def cube_at_1000(grid: int = 32) -> CaseResult:
     """The driven cube at Re 1000 beside Albensoeder and Kuhlmann (2005)."""
-    u = _centre_line(grid, grid, is_thin=False, turns=40.0, reynolds=1000.0)
+    u = _centre_line(grid, grid, is_thin=False, lid_travel=40.0, reynolds=1000.0)
     height = np.r_[0.0, (np.arange(grid) + 0.5) / grid, 1.0]
     profile = CubicSpline(height, np.r_[0.0, u, 1.0])
     published = ALBENSOEDER[:, 1]

@@ -49,7 +49,7 @@ LEAST_SCORE = 1e-38
 normal number of float32.
 """
 
-EQUALITY = 1e-6
+RELATIVE_TOLERANCE = 1e-6
 """Relative difference up to which two numbers are equal; NumPy versions may differ in
 the last bits.
 """

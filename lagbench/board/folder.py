@@ -92,7 +92,7 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
 
 
 def is_place_of_file(path: Path) -> bool:
-    """Tell whether a relative path is that of a file which a submission writes.
+    """Tell whether a submission may write a file at a relative path.
 
     >>> is_place_of_file(Path("scores/cavity/mini/gns.nc"))
     True

@@ -28,7 +28,7 @@ from lagbench.scoring.score_file_checks import (
 from lagbench.submission.issues import ValidationIssue
 
 from .entry import (
-    EQUALITY,
+    RELATIVE_TOLERANCE,
     Entry,
     EntryBudget,
     Prediction,
@@ -503,14 +503,14 @@ def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...]
 
 
 def _is_same_summary(first: Summary | None, second: Summary | None) -> bool:
-    """Tell whether two summaries of a metric agree; a missing one agrees with none."""
+    """Tell whether two summaries of a metric agree; False where one is missing."""
     if first is None or second is None:
         return False
     for (_, a), (_, b) in zip(first, second, strict=True):
         if a is None or b is None:
             if a is not b:
                 return False
-        elif not math.isclose(a, b, rel_tol=EQUALITY, abs_tol=1e-300):
+        elif not math.isclose(a, b, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300):
             return False
     return True
 

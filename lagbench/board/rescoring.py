@@ -25,7 +25,7 @@ from lagbench.scoring.score_layout import FILM_RANGE, LAST_STEP, SUBMISSION
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import EQUALITY, Entry, EntryFlag, Prediction, ScoredFile
+from .entry import RELATIVE_TOLERANCE, Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
 from .issues import REFERENCES_ANEW, make_issue
 from .ranking import scored_file
@@ -311,7 +311,7 @@ def compare_tallies(
 
     first_tally = next(iter(first.values()))
     second_tally = next(iter(second.values()))
-    tolerance = EQUALITY
+    tolerance = RELATIVE_TOLERANCE
     if len(second_tally.frames) > LONG_ROLLOUT:
         # the last bits may have pushed a value over to the next step of its rounding
         tolerance = 2.0 ** (1 - LONG_BITS)

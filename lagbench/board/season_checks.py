@@ -15,7 +15,7 @@ from lagbench.references.shipped import shipped
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import EQUALITY, Entry
+from .entry import RELATIVE_TOLERANCE, Entry
 from .folder import SEASON_SCORES, SEASONS, Folder, Place
 from .issues import issue_from_error, make_issue
 from .season import Season, SeasonDataSet, read_season, season_path
@@ -163,7 +163,7 @@ def _issue_of_difference(
 def _is_same(stated: float | None, measured: float | None) -> bool:
     if stated is None or measured is None:
         return False
-    return math.isclose(stated, measured, rel_tol=EQUALITY, abs_tol=1e-300)
+    return math.isclose(stated, measured, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300)
 
 
 def _describe(scenario: int, value: float | None) -> str:

@@ -20,7 +20,7 @@ from lagbench.references.predictor import Kind
 from lagbench.references.table import references_of
 from lagbench.submission.issues import ValidationIssue
 
-from .entry import EQUALITY, Entry, MeasuredCost, Reproduction, Verification
+from .entry import RELATIVE_TOLERANCE, Entry, MeasuredCost, Reproduction, Verification
 from .fields import latest_date
 from .folder import VERIFIED
 from .issues import make_issue
@@ -181,7 +181,7 @@ def _compare_submitted(
         path: the score file.
     """
     submitted = _mean_of_sample(values, reproduction)
-    if not math.isclose(reproduction.submitted, submitted, rel_tol=EQUALITY):
+    if not math.isclose(reproduction.submitted, submitted, rel_tol=RELATIVE_TOLERANCE):
         yield (
             f"submitted {reproduction.submitted}, where {path} has "
             f"{submitted:.{DIGITS}g}"

@@ -369,29 +369,31 @@ def _time_solver(split: str, size: str) -> float | None:
 
 
 def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterator[str]:
-    for path, line in result.lines.items():
-        name = path.removeprefix("submissions/").removesuffix(".yaml")
-        for one in line.reproduced:
-            seed = ""
-            if one.seed is not None:
-                seed = f", seed {one.seed}"
+    """Yield a text line for each seed and each cost, then the totals."""
+    for path, verification in result.lines.items():
+        entry_name = path.removeprefix("submissions/").removesuffix(".yaml")
+        for seed_result in verification.reproduced:
+            name = entry_name
+            if seed_result.seed is not None:
+                name = f"{entry_name}, seed {seed_result.seed}"
             verdict = "reproduced"
-            if not one.agrees:
+            if not seed_result.agrees:
                 verdict = "NOT reproduced"
-            when = ""
-            if f"{name}{seed}" not in result.predicted:
-                when = f"; recorded on {line.date}, --again runs it now"
+            remark = ""
+            if name not in result.predicted:
+                remark = f"; recorded on {verification.date}, --again runs it now"
             yield (
-                f"{name}{seed}: {verdict}, {one.metric} {one.reproduced:.6g} against "
-                f"{one.submitted:.6g} ({one.difference:.1e} relative, {one.scenarios} "
-                f"of {one.of} scenarios){when}"
+                f"{name}: {verdict}, {seed_result.metric} "
+                f"{seed_result.reproduced:.6g} against {seed_result.submitted:.6g} "
+                f"({seed_result.difference:.1e} relative, {seed_result.scenarios} "
+                f"of {seed_result.of} scenarios){remark}"
             )
-        if line.cost is not None and with_costs:
-            cost = line.cost
+        if verification.cost is not None and with_costs:
+            cost = verification.cost
             yield (
-                f"{name}: {cost.seconds_per_frame:.3g} s per frame: processor time, "
-                f"mean over {TIMED_FRAMES} frames, least of {cost.repeats} rounds; "
-                f"{cost.machine}"
+                f"{entry_name}: {cost.seconds_per_frame:.3g} s per frame: "
+                f"processor time, mean over {TIMED_FRAMES} frames, "
+                f"least of {cost.repeats} rounds; {cost.machine}"
             )
     yield (
         f"{result.folder}: {format_count(len(result.lines), 'entry')}, "

@@ -332,7 +332,10 @@ def _shown_metrics(result: ComparisonResult, *, every: bool) -> list[MetricCompa
 
 
 def _difference_row(comparison: MetricComparison) -> tuple[str, ...]:
-    """Return a row without the unit, for four columns to fit a terminal."""
+    """Return the row of a metric: name, better or worse, difference, p-value.
+
+    It has no unit, so that four columns fit a terminal.
+    """
     test = comparison.test
     p = "-"
     if not math.isnan(test.p):

@@ -260,8 +260,9 @@ def _seed_values(method: Method, metric: str, frame: int | None) -> list[Score]:
 def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
     """Return all comparisons of a claim, those by the ranking metric first.
 
-    Models that fail a gate take no part. An operator is compared by the variant that is
-    trained with pushforward, where that has scores.
+    A claim that names no first model is about the best naive baseline. Under-trained
+    models, which fail a gate, take no part. If operators are compared with each other,
+    the variant that is trained with pushforward stands in, where it has scores.
     """
     first = claim.first or results.best_naive
     if first is None:
