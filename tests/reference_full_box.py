@@ -440,8 +440,8 @@ class ReferenceFullBox:
         volume = ONE / np.maximum(density, HALF)
         factor = self.shift * volume
         wanted = factor[:, None] * density_slope
-        shift = np.clip(wanted, -self.shift_bound, self.shift_bound)
-        u = self.v + particle_gain
+        shift: Floats = np.clip(wanted, -self.shift_bound, self.shift_bound)
+        u: Floats = self.v + particle_gain
         u = u + Float(p.velocity_relaxation) * (mean_velocity - u)
         change = np.zeros_like(u)
         for axis in range(self.dimension):

@@ -24,7 +24,7 @@ from lagbench.generators.full_box import FullBox
 from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.split import InitialState
 
-# Cells of 1/12 are no numbers of float32.
+# The solver has 12 cells across a length of 1 here: 1/12 is no number of float32.
 SQUARE = Box.from_bounds([(0.0, 1.0), (0.0, 2.0 / 3.0)], periodic=[True, True])
 SQUARE_COUNTS = (24, 16)  # particles along each axis: four in a cell
 CHANNEL = Box.from_bounds([(0.0, 1.0), (0.125, 0.875)], periodic=[True, False])
@@ -45,7 +45,6 @@ DRIVEN_SQUARE = constants(
     substeps_per_frame=7,
 )
 NO_FORCE = np.zeros((1, 2, 2))
-
 
 # Kernels take seconds to compile; two scenarios of the square share theirs.
 compiled = functools.cache(FullBox)
