@@ -1,187 +1,326 @@
-"""The solver of full boxes a second time, in NumPy and float64, in any dimension.
+"""The solver of full boxes a second time, in NumPy, in two and three dimensions.
 
 Written from the equations of ``generators/nodal_stress_nd.py``, whole arrays at once.
-Ghosts are filled and folded axis by axis, as slices, without tables.
+Every operation rounds to float32 in the order in which the equation is written; sums
+over particles are 64-bit integers. Ghosts are filled and folded as slices, without
+tables.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from reference_free_surface import (
+    HALF,
+    ONE,
+    TWO,
+    ZERO,
+    Float,
+    Floats,
+    Mask,
+    Sums,
+    fixed,
+)
 
 from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.obstacle import Obstacle
 from lagbench.generators.split import InitialState
 
-Array = NDArray[np.float64]
 Index = tuple[Any, ...]
 """What picks a layer of nodes, or a node of each particle."""
 
+Place = tuple[int, ...]
+"""Steps from a node to a neighbour along each axis."""
+
+INSET = 1e-3  # distance that particles keep from a wall [cells]
+LARGEST_JACOBIAN = 8.0
+SPEED_REACH = {2: 16.0, 3: 32.0}
+"""Largest velocity in a stencil over dx/dt [1], by dimension: a power of two."""
+
+NEIGHBOURS: dict[int, tuple[tuple[Place, ...], ...]] = {
+    2: (
+        ((1, 0), (0, 1)),
+        ((1, 1), (1, -1)),
+    ),
+    3: (
+        ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((1, 1, 0), (1, 0, 1), (1, 0, -1), (1, -1, 0), (0, 1, 1), (0, 1, -1)),
+        ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)),
+    ),
+}
+"""One of each two opposite neighbours of a node, by dimension: those beside it along
+one axis, along two, along three.
+"""
+
+GRADIENT_WEIGHTS = {
+    2: (Float(0.75), Float(0.125)),
+    3: (Float(0.5625), Float(0.09375), Float(0.015625)),
+}
+"""Weights of the differences over these neighbours: products of 3/4 and 1/8."""
+
+
+@dataclass
+class Stencil:
+    """Where the particles touch the grid.
+
+    These are the lowest node, the offset from the middle node [cells], shape [particle,
+    axis], and the weights, shape [place, particle, axis].
+    """
+
+    base: NDArray[np.int32]
+    offset: Floats
+    weights: Floats
+
+    @classmethod
+    def at(cls, scaled: Floats, cells: Sequence[int]) -> Stencil:
+        """Quadratic B-splines around positions in cells from the lowest ghosts."""
+        base = (scaled - HALF).astype(np.int32)
+        # A periodic coordinate may round up to the end of the last cell.
+        last = np.array(cells, np.int32) - 1
+        base = np.minimum(base, last)
+        distance = scaled - base.astype(Float)
+        outer = Float(1.5) - distance
+        middle = distance - ONE
+        inner = distance - HALF
+        low = HALF * (outer * outer)
+        mid = Float(0.75) - middle * middle
+        high = HALF * (inner * inner)
+        weights = np.stack([low, mid, high])
+        return cls(base, middle, weights)
+
+    def nodes(self) -> Iterator[tuple[Place, Index, Floats]]:
+        """Yield steps from the middle node, nodes and weights, shape [particle, 1]."""
+        dimension = self.base.shape[1]
+        for place in itertools.product(range(3), repeat=dimension):
+            weight = self.weights[place[0]][:, 0]
+            for axis in range(1, dimension):
+                weight = weight * self.weights[place[axis]][:, axis]
+            node = self.base + np.array(place, np.int32)
+            step = tuple(i - 1 for i in place)
+            yield step, tuple(node.T), weight[:, None]
+
 
 class ReferenceFullBox:
-    """One scenario whose walls and force do not change."""
+    """One scenario; constants are computed in float64, then rounded once."""
 
     def __init__(
         self,
         parameters: FullBoxParameters,
         state: InitialState,
     ) -> None:
+        p = parameters
         self.p = parameters
-        self.dx = 1.0 / parameters.grid
-        self.box = parameters.box
-        self.dimension = parameters.box.dimension
-        self.shape = tuple(count + 2 for count in parameters.cells)
-        self.vector_shape = (*self.shape, self.dimension)
+        self.state = state
+        self.box = p.box
+        self.dimension = p.box.dimension
+        self.dx = 1.0 / p.grid
+        self.dt = Float(p.dt)
+        self.shape = tuple(count + 2 for count in p.cells)
         self.inner = (slice(1, -1),) * self.dimension
         self.sides = list(itertools.product(range(self.dimension), (0, 1)))
-        self.viscosity = state.viscosity
-        self.walls = state.wall_velocity
-        particle_volume = state.area / parameters.particles
-        self.mass = particle_volume / self.dx**self.dimension
-        self.x = state.position.copy()
-        self.v = state.velocity.copy()
-        self.c = state.affine.copy()
+        low = np.array(p.box.low)
+        high = np.array(p.box.high)
+        # where the lowest ghosts lie [cells]
+        self.origin = (low * p.grid - 0.5).astype(Float)
+        self.low = low.astype(Float)
+        self.high = high.astype(Float)
+        self.period = (high - low).astype(Float)
+        self.least = (low + INSET * self.dx).astype(Float)
+        self.most = (high - INSET * self.dx).astype(Float)
+        self.tangential = ONE
+        if p.no_slip:
+            self.tangential = -ONE
+
+        particle_count = p.particles + p.obstacle_particles
+        count_bits = np.ceil(np.log2(particle_count))
+        room = min(50, 62 - int(count_bits))
+        greatest_speed = SPEED_REACH[self.dimension] * self.dx / p.dt
+        speed_bits = np.ceil(np.log2(greatest_speed))
+        self.velocity_scale = 2.0 ** (room - int(speed_bits))
+        self.count_scale = 2.0**room / LARGEST_JACOBIAN
+
+        nodes_per_volume = p.grid**self.dimension
+        particle_volume = state.area / p.particles * nodes_per_volume
+        stiffness = p.dt * p.modulus / (2.0 * p.density * self.dx)
+        diffusion = state.viscosity * p.dt * p.grid**2
+        self.particle_volume = Float(particle_volume)
+        self.stiffness = Float(stiffness)
+        self.diffusion = Float(diffusion)
+        self.shift = Float(-p.shift * self.dx**2)
+        self.shift_bound = Float(0.1 * self.dx)
+
+        position = state.position.astype(Float)
+        self.x = self.kept_inside(position)
+        self.v = state.velocity.astype(Float)
+        # C, shape [particle, component, axis]
+        self.c = state.affine.astype(Float)
         # the particles of an obstacle, which follow those of the fluid
-        self.solid = slice(parameters.particles, None)
-        self.solid_nodes = np.zeros(self.shape, bool)
-        self.obstacle = state.obstacle
+        self.solid = slice(p.particles, None)
+        self.solid_nodes = np.zeros(p.cells, bool)
         if state.obstacle is not None:
             self.add_obstacle(state.obstacle)
-        self.j = np.ones(len(self.x))
-        self.force = np.zeros(self.vector_shape)
-        if state.body_force is not None:
-            layers = state.body_force[0]
-            row_count = parameters.cells[1]
-            node = np.arange(self.shape[1])
-            row = np.clip(node - 1, 0, row_count - 1)
-            layer_of_row = row * len(layers) // row_count
-            per_row = layers[layer_of_row]
-            other_axes = [axis for axis in range(self.dimension) if axis != 1]
-            self.force += np.expand_dims(per_row, tuple(other_axes))
-        self.rate = np.zeros(self.vector_shape)
-        self.stream = np.zeros(self.dimension)
+        self.j = np.ones(particle_count, Float)
+
+        self.damping = np.zeros(p.cells, Float)
+        self.stream = np.zeros(self.dimension, Float)
         if state.stream is not None:
-            self.stream = state.stream
-            rate = self.fringe(parameters)
-            along_x = rate.reshape(-1, *(1,) * self.dimension)
-            self.rate += along_x
-        self.tangential = 1.0
-        if parameters.no_slip:
-            self.tangential = -1.0
+            damping = p.dt * self.fringe()
+            along_x = damping.reshape(-1, *(1,) * (self.dimension - 1))
+            self.damping += along_x.astype(Float)
+            self.stream = state.stream.astype(Float)
+        self.done = 0
+        self.drive()
 
     def add_obstacle(self, obstacle: Obstacle) -> None:
         """Append the particles of an obstacle, and mark the nodes that it stops."""
-        solid = obstacle.position
+        solid = obstacle.position.astype(Float)
         resting = np.zeros_like(solid)
         self.x = np.concatenate([self.x, solid])
         self.v = np.concatenate([self.v, resting])
-        still = np.zeros((len(solid), self.dimension, self.dimension))
+        still = np.zeros((len(solid), self.dimension, self.dimension), Float)
         self.c = np.concatenate([self.c, still])
         distance = np.linalg.norm(self.node_places() - obstacle.centre, axis=-1)
         self.solid_nodes = distance < obstacle.radius
 
-    def node_places(self) -> Array:
-        """Return where the nodes lie [length], ghosts included."""
-        number = np.moveaxis(np.indices(self.shape), 0, -1)
-        place = np.array(self.box.low) + (number - 0.5) * self.dx
+    def node_places(self) -> NDArray[np.float64]:
+        """Return where the interior nodes lie [length], shape [*cells, axis]."""
+        number = np.moveaxis(np.indices(self.p.cells), 0, -1)
+        place = np.array(self.box.low) + (number + 0.5) * self.dx
         return np.asarray(place)
 
-    def fringe(self, parameters: FullBoxParameters) -> Array:
+    def fringe(self) -> NDArray[np.float64]:
         """Return the rate of the fringe at each column of nodes along x [1/s]."""
-        column = np.arange(self.shape[0])
-        place = self.box.low[0] + (column - 0.5) * self.dx
-        way = place - (self.box.high[0] - parameters.fringe_length)
-        share = way / parameters.fringe_length
+        p = self.p
+        column = np.arange(p.cells[0])
+        place = self.box.low[0] + (column + 0.5) * self.dx
+        way = place - (self.box.high[0] - p.fringe_length)
+        share = way / p.fringe_length
         bump = 16.0 * (share * (1.0 - share)) ** 2
         is_in_fringe = (share > 0.0) & (share < 1.0)
-        return np.where(is_in_fringe, parameters.fringe_rate * bump, 0.0)
+        return np.where(is_in_fringe, p.fringe_rate * bump, 0.0)
+
+    def drive(self) -> None:
+        """Set the velocity of the walls and the force that act in this substep."""
+        frame = self.done // self.p.substeps_per_frame + 1
+        walls = self.state.wall_velocity
+        if walls.ndim == 3:
+            walls = walls[min(frame, len(walls) - 1)]
+        self.walls = walls.astype(Float)
+        # dt f at each interior node
+        self.force = np.zeros((*self.p.cells, self.dimension), Float)
+        program = self.state.body_force
+        if program is not None:
+            layers = program[min(frame, len(program) - 1)]
+            row_count = self.p.cells[1]
+            layer_of_row = np.arange(row_count) * len(layers) // row_count
+            per_row = self.dt * layers[layer_of_row].astype(Float)
+            other_axes = [axis for axis in range(self.dimension) if axis != 1]
+            self.force += np.expand_dims(per_row, tuple(other_axes))
 
     def step(self, count: int) -> None:
         """Advance by some substeps."""
         for _ in range(count):
-            v, r, jbar = self.to_grid()
+            self.drive()
+            self.done += 1
+            scaled = self.x * Float(self.p.grid) - self.origin
+            stencil = Stencil.at(scaled, self.p.cells)
+            sums = self.to_grid(stencil)
+            v, r, jbar = self.fold(sums)
             self.fill(v, moving=True)
             self.fill_scalar(r)
             self.fill_scalar(jbar)
-            acceleration = self.acceleration(v, jbar) + self.force
-            acceleration += self.rate * (self.stream - v)
-            gain = self.p.dt * acceleration
+            gain = self.gain(v, jbar)
             v = v + gain
-            v[self.solid_nodes] = 0.0
-            gain[self.solid_nodes] = 0.0
+            v[self.inner][self.solid_nodes] = ZERO
             self.fill(v, moving=True)
             self.fill(gain, moving=False)
-            self.to_particles(v, gain, r, jbar)
+            self.to_particles(stencil, v, gain, r, jbar)
 
-    def stencil(self) -> list[tuple[Index, Array, Array]]:
-        """Return node, weight and distance from the particle, of each neighbour."""
-        low_corner = np.array(self.box.low)
-        scaled = (self.x - low_corner) / self.dx + 0.5
-        base = np.floor(scaled - 0.5).astype(int)
-        f = scaled - base
-        low = 0.5 * (1.5 - f) ** 2
-        middle = 0.75 - (f - 1) ** 2
-        high = 0.5 * (f - 0.5) ** 2
-        weight = [low, middle, high]
-        result = []
-        for step in np.ndindex((3,) * self.dimension):
-            w = np.ones(len(f))
-            for axis, i in enumerate(step):
-                w = w * weight[i][:, axis]
-            offset = np.array(step)
-            node = tuple((base + offset).T)
-            apart = (offset - f) * self.dx
-            result.append((node, w, apart))
-        return result
+    def to_grid(self, stencil: Stencil) -> Sums:
+        """P2G of (n v, n J, n) in fixed point, shape [*nodes, axis + 2]."""
+        sums = np.zeros((*self.shape, self.dimension + 2), np.int64)
+        slope = Float(self.dx) * self.c
+        middle = self.v
+        for axis in range(self.dimension):
+            offset = stencil.offset[:, axis, None]
+            middle = middle - offset * slope[:, :, axis]
+        ratio = self.j[:, None]
+        for step, node, weight in stencil.nodes():
+            flow = middle
+            for axis in range(self.dimension):
+                flow = flow + Float(step[axis]) * slope[:, :, axis]
+            momentum = fixed(weight * flow, self.velocity_scale)
+            volume = fixed(weight * ratio, self.count_scale)
+            count = fixed(weight, self.count_scale)
+            parts = np.concatenate([momentum, volume, count], axis=1)
+            np.add.at(sums, node, parts)
+        return sums
 
-    def to_grid(self) -> tuple[Array, Array, Array]:
-        """P2G, and the fold of the ghosts axis by axis; return v, r, Jbar."""
-        momentum = np.zeros(self.vector_shape)
-        count = np.zeros(self.shape)
-        volume = np.zeros(self.shape)
-        # what moving walls add; across two walls it keeps its sign
-        drag = np.zeros_like(momentum)
-        for node, w, apart in self.stencil():
-            turning = np.einsum("pab,pb->pa", self.c, apart)
-            flow = self.v + turning
-            np.add.at(momentum, node, w[:, None] * flow)
-            np.add.at(count, node, w)
-            np.add.at(volume, node, w * self.j)
-        for axis, side in self.sides:
-            ghost, edge, far = self.ends(axis, side)
-            if self.box.periodic[axis]:
-                for q in (momentum, count, volume, drag):
-                    q[far] += q[ghost]
-                    q[ghost] = 0.0
+    def fold(self, sums: Sums) -> tuple[Floats, Floats, Floats]:
+        """Give what ghosts received to the nodes that they stand for; return v, r,
+        Jbar.
+        """
+        total = sums.copy()
+        # what moving walls add to n v
+        drag = np.zeros((*self.shape, self.dimension), Float)
+        unit = Float(1.0 / self.count_scale)
+        # the ends of the axes that a ghost lies beyond, as seen from its node
+        for ends in itertools.product((None, 0, 1), repeat=self.dimension):
+            if not any(end is not None for end in ends):
                 continue
-            sign = self.image_sign(axis)
-            speed = self.walls[2 * axis + side]
-            ghost_count = count[ghost][..., None]
-            wall_drag = 2.0 * speed * ghost_count
-            drag[edge] += drag[ghost] + wall_drag
-            momentum[edge] += sign * momentum[ghost]
-            count[edge] += count[ghost]
-            volume[edge] += volume[ghost]
-            for q in (momentum, count, volume, drag):
-                q[ghost] = 0.0
-        inner = self.inner
-        v = np.zeros_like(momentum)
-        r = np.zeros_like(count)
-        jbar = np.ones_like(count)
-        total = momentum + drag
-        inner_count = count[inner]
-        v[inner] = total[inner] / inner_count[..., None]
-        r[inner] = count[inner] * self.mass
-        jbar[inner] = volume[inner] / count[inner]
+            node, ghost = self.image(ends)
+            sign = np.ones(self.dimension + 2, np.int64)
+            speed = np.zeros(self.dimension, Float)
+            for axis, end in enumerate(ends):
+                if end is None or self.box.periodic[axis]:
+                    continue
+                vector_sign = self.image_sign(axis)
+                sign[: self.dimension] *= vector_sign.astype(np.int64)
+                speed = speed + TWO * self.walls[2 * axis + end]
+            received = sums[ghost]
+            total[node] += sign * received
+            ghost_count = received[..., -1:].astype(Float) * unit
+            drag[node] += speed * ghost_count
+
+        is_filled = total[..., -1] > 0
+        count = total[..., -1].astype(Float) * unit
+        count = np.where(is_filled, count, ONE)
+        volume = total[..., -2].astype(Float) * unit
+        velocity_unit = Float(1.0 / self.velocity_scale)
+        momentum = total[..., :-2].astype(Float) * velocity_unit + drag
+        v = np.where(is_filled[..., None], momentum / count[..., None], ZERO)
+        r = np.where(is_filled, count * self.particle_volume, ZERO)
+        jbar = np.where(is_filled, volume / count, ONE)
         return v, r, jbar
 
-    def image_sign(self, axis: int) -> Array:
+    def image(self, ends: Sequence[int | None]) -> tuple[Index, Index]:
+        """Return the interior nodes at some ends of the box, and the ghosts that stand
+        for them there: the next ones at walls, those beyond the other end of periodic
+        axes.
+        """
+        node: list[Any] = [slice(1, -1)] * self.dimension
+        ghost: list[Any] = [slice(1, -1)] * self.dimension
+        for axis, end in enumerate(ends):
+            if end is None:
+                continue
+            edge, next_ghost, far_ghost = (1, 0, -1)
+            if end == 1:
+                edge, next_ghost, far_ghost = (-2, -1, 0)
+            node[axis] = edge
+            ghost[axis] = next_ghost
+            if self.box.periodic[axis]:
+                ghost[axis] = far_ghost
+        return tuple(node), tuple(ghost)
+
+    def image_sign(self, axis: int) -> Floats:
         """Return the signs of a vector's mirror image behind a wall."""
         sign = np.full(self.dimension, self.tangential)
-        sign[axis] = -1.0
+        sign[axis] = -ONE
         return sign
 
     def ends(self, axis: int, side: int) -> tuple[Index, Index, Index]:
@@ -200,7 +339,7 @@ class ReferenceFullBox:
         chosen[axis] = index
         return tuple(chosen)
 
-    def fill_scalar(self, q: Array) -> None:
+    def fill_scalar(self, q: Floats) -> None:
         """Fill the ghosts of a scalar."""
         for axis, side in self.sides:
             ghost, edge, far = self.ends(axis, side)
@@ -209,7 +348,7 @@ class ReferenceFullBox:
                 source = far
             q[ghost] = q[source]
 
-    def fill(self, v: Array, *, moving: bool) -> None:
+    def fill(self, v: Floats, *, moving: bool) -> None:
         """Fill the ghosts of a vector; walls move where one alone lies across."""
         drive = np.zeros_like(v)
         crossed = np.zeros((*self.shape, 1))
@@ -218,108 +357,168 @@ class ReferenceFullBox:
             if self.box.periodic[axis]:
                 v[ghost] = v[far]
                 continue
-            sign = self.image_sign(axis)
-            v[ghost] = sign * v[edge]
+            v[ghost] = self.image_sign(axis) * v[edge]
             crossed[ghost] += 1.0
-            taper = np.full(drive[ghost].shape, 2.0)
+            taper = np.full(drive[ghost].shape, TWO)
             others = [other for other in range(self.dimension) if other != axis]
             for position, other in enumerate(others):
                 if not self.box.periodic[other]:
                     across = taper[..., other]
                     layer = np.moveaxis(across, position, 0)
-                    layer[[1, -2]] = 1.0
+                    layer[[1, -2]] = ONE
             wall_velocity = self.walls[2 * axis + side]
             drive[ghost] += taper * wall_velocity
         if moving:
-            v += np.where(crossed == 1.0, drive, 0.0)
+            v += np.where(crossed == 1.0, drive, ZERO)
 
-    def acceleration(self, v: Array, jbar: Array) -> Array:
-        """Return (E/rho) grad Jbar + nu lap v at the interior nodes, 0 elsewhere."""
-        a = np.zeros_like(v)
-        sound_square = self.p.modulus / self.p.density
-        stiffness = sound_square / (2.0 * self.dx)
-        for axis in range(self.dimension):
-            after = np.roll(jbar, -1, axis)
-            before = np.roll(jbar, 1, axis)
-            q = after - before
-            for other in range(self.dimension):
-                if other != axis:
-                    beside = self.neighbour_sum(q, other)
-                    q = 0.75 * q + 0.125 * beside
-            component = v[..., axis]
-            laplacian = -2.0 * self.dimension * component
-            for along in range(self.dimension):
-                laplacian = laplacian + self.neighbour_sum(component, along)
-            diffusion = self.viscosity / self.dx**2 * laplacian
-            total = stiffness * q + diffusion
-            a[..., axis][self.inner] = total[self.inner]
-        return a
+    def gain(self, v: Floats, jbar: Floats) -> Floats:
+        """Return dt a = dt ((E/rho) grad Jbar + nu lap v + f + sigma (U - v)) at the
+        interior nodes, 0 elsewhere and in an obstacle.
+        """
+        middle = v[self.inner]
+        pressure_force = self.stiffness * self.pressure_gradient(jbar)
+        inner_gain = pressure_force + self.diffusion * self.laplacian(v)
+        inner_gain = inner_gain + self.force
+        inner_gain = inner_gain + self.damping[..., None] * (self.stream - middle)
+        inner_gain[self.solid_nodes] = ZERO
+        gain = np.zeros_like(v)
+        gain[self.inner] = inner_gain
+        return gain
 
-    def neighbour_sum(self, q: Array, axis: int) -> Array:
-        """Return the sum of the two neighbours of each node along an axis."""
-        return np.roll(q, 1, axis) + np.roll(q, -1, axis)
+    def pressure_gradient(self, jbar: Floats) -> Floats:
+        """Return 2 dx grad Jbar at the interior nodes, shape [*cells, axis]."""
+        shape = (*self.p.cells, self.dimension)
+        gradient = np.zeros(shape, Float)
+        weights = GRADIENT_WEIGHTS[self.dimension]
+        neighbours = NEIGHBOURS[self.dimension]
+        for weight, steps in zip(weights, neighbours, strict=True):
+            total = np.zeros(shape, Float)
+            for step in steps:
+                ahead, behind = self.opposite(jbar, step)
+                rise = ahead - behind
+                total = total + rise[..., None] * np.array(step, Float)
+            gradient = gradient + weight * total
+        return gradient
+
+    def laplacian(self, v: Floats) -> Floats:
+        """Return dx^2 lap v at the interior nodes, shape [*cells, axis]."""
+        middle = v[self.inner]
+        total = np.zeros_like(middle)
+        for step in NEIGHBOURS[self.dimension][0]:
+            ahead, behind = self.opposite(v, step)
+            total = total + (ahead + behind)
+        return np.asarray(total - Float(2.0 * self.dimension) * middle)
+
+    def opposite(self, q: Floats, step: Place) -> tuple[Floats, Floats]:
+        """Return the values at a neighbour of each interior node, and opposite it."""
+        ahead = []
+        behind = []
+        for steps, count in zip(step, self.p.cells, strict=True):
+            ahead.append(slice(1 + steps, 1 + steps + count))
+            behind.append(slice(1 - steps, 1 - steps + count))
+        return q[tuple(ahead)], q[tuple(behind)]
 
     def to_particles(
         self,
-        v: Array,
-        gain: Array,
-        r: Array,
-        jbar: Array,
+        stencil: Stencil,
+        v: Floats,
+        gain: Floats,
+        r: Floats,
+        jbar: Floats,
     ) -> None:
         """G2P with relaxation, shift, motion and the update of J."""
         p = self.p
-        count = len(self.x)
-        here = np.zeros((count, self.dimension))
-        push = np.zeros((count, self.dimension))
-        density = np.zeros(count)
-        ratio = np.zeros(count)
-        c = np.zeros_like(self.c)
-        thicker = np.zeros((count, self.dimension))
-        for node, w, apart in self.stencil():
-            column = w[:, None]
-            weighted_density = w * r[node]
-            here += column * v[node]
-            push += column * gain[node]
-            density += weighted_density
-            ratio += w * jbar[node]
-            c += np.einsum("p,pa,pb->pab", w, v[node], apart)
-            thicker += weighted_density[:, None] * apart
-        scale = 4.0 / self.dx**2
-        c *= scale
-        density = np.maximum(density, 0.5)
-        gradient = scale * thicker / density[:, None]
-        shift = -p.shift * self.dx**2 * gradient
-        most = 0.1 * self.dx
-        shift = np.clip(shift, -most, most)
-        u = self.v + push
-        u += p.velocity_relaxation * (here - u)
-        self.v = u + np.einsum("pab,pb->pa", c, shift)
-        moved = self.x + p.dt * here + shift
+        nodal = np.concatenate([v, r[..., None], gain, jbar[..., None]], axis=-1)
+        here, slopes = self.gather(stencil, nodal)
+        mean_velocity = here[:, : self.dimension]
+        density = here[:, self.dimension]
+        particle_gain = here[:, self.dimension + 1 : -1]
+        mean_ratio = here[:, -1]
+        c = slopes[:, : self.dimension]
+        density_slope = slopes[:, self.dimension]
+
+        volume = ONE / np.maximum(density, HALF)
+        factor = self.shift * volume
+        wanted = factor[:, None] * density_slope
+        shift: Floats = np.clip(wanted, -self.shift_bound, self.shift_bound)
+        u: Floats = self.v + particle_gain
+        u = u + Float(p.velocity_relaxation) * (mean_velocity - u)
+        change = np.zeros_like(u)
+        for axis in range(self.dimension):
+            change = change + shift[:, axis, None] * c[:, :, axis]
         start = self.x
-        inset = 1e-3 * self.dx
-        low = np.array(self.box.low)
-        high = np.array(self.box.high)
-        wrapped = low + (moved - low) % (high - low)
-        clipped = np.clip(moved, low + inset, high - inset)
-        self.x = np.where(self.box.periodic, wrapped, clipped)
-        if self.obstacle is not None:
-            self.keep_outside(self.obstacle)
+        step = self.dt * mean_velocity + shift
+        self.x = self.kept_inside(start + step)
+        if self.state.obstacle is not None:
+            self.x = self.kept_outside(self.state.obstacle, self.x)
+        self.v = u + change
         self.x[self.solid] = start[self.solid]
-        self.v[self.solid] = 0.0
-        c[self.solid] = 0.0
+        self.v[self.solid] = ZERO
+        c[self.solid] = ZERO
         self.c = c
-        divergence = np.einsum("paa->p", c)
-        growth = p.dt * divergence * self.j
-        relaxation = p.jacobian_relaxation * (ratio - self.j)
-        coupling = p.density_coupling * (1.0 / density - ratio)
+
+        divergence = np.zeros_like(self.j)
+        for axis in range(self.dimension):
+            divergence = divergence + c[:, axis, axis]
+        growth = self.dt * divergence * self.j
+        relaxation = Float(p.jacobian_relaxation) * (mean_ratio - self.j)
+        coupling = Float(p.density_coupling) * (volume - mean_ratio)
         self.j = self.j + growth + relaxation + coupling
 
-    def keep_outside(self, obstacle: Obstacle) -> None:
-        """Put particles that are inside an obstacle on its surface."""
-        least = obstacle.radius + 1e-3 * self.dx
-        way = self.x - obstacle.centre
-        distance = np.linalg.norm(way, axis=1)
-        is_inside = distance < least
-        direction = way / distance[:, None]
-        surface = obstacle.centre + least * direction
-        self.x = np.where(is_inside[:, None], surface, self.x)
+    def gather(self, stencil: Stencil, nodal: Floats) -> tuple[Floats, Floats]:
+        """Return values at the particles, shape [particle, value], and their slopes
+        along each axis, shape [particle, value, axis].
+        """
+        here = np.zeros((len(self.x), nodal.shape[-1]), Float)
+        slopes = np.zeros((*here.shape, self.dimension), Float)
+        shares: dict[Place, Floats] = {}
+        for step, node, weight in stencil.nodes():
+            shares[step] = weight * nodal[node]
+        if self.dimension == 2:
+            add_nodes(here, slopes, shares)
+        else:
+            add_rows(here, slopes, shares)
+        for axis in range(self.dimension):
+            slopes[..., axis] -= stencil.offset[:, axis, None] * here
+        return here, Float(4.0 * self.p.grid) * slopes
+
+    def kept_inside(self, x: Floats) -> Floats:
+        """Return positions between the walls, wrapped along periodic axes."""
+        clipped = np.clip(x, self.least, self.most)
+        wrapped = np.where(x >= self.high, x - self.period, x)
+        wrapped = np.where(wrapped < self.low, wrapped + self.period, wrapped)
+        wrapped = np.where(wrapped < self.high, wrapped, self.low)
+        return np.where(self.box.periodic, wrapped, clipped)
+
+    def kept_outside(self, obstacle: Obstacle, x: Floats) -> Floats:
+        """Return positions outside an obstacle, those inside put on its surface."""
+        least = Float(obstacle.radius + INSET * self.dx)
+        way = x - np.array(obstacle.centre, Float)
+        square = np.zeros(len(x), Float)
+        for component in way.T:
+            square = square + component * component
+        is_inside: Mask = square < least * least
+        stretch = least / np.sqrt(np.where(is_inside, square, ONE))
+        factor = stretch - ONE
+        on_surface = x + factor[:, None] * way
+        return np.where(is_inside[:, None], on_surface, x)
+
+
+def add_nodes(here: Floats, slopes: Floats, shares: dict[Place, Floats]) -> None:
+    """Sum the shares of the nodes and their differences, node by node."""
+    for step, share in shares.items():
+        here += share
+        for axis, steps in enumerate(step):
+            slopes[..., axis] += Float(steps) * share
+
+
+def add_rows(here: Floats, slopes: Floats, shares: dict[Place, Floats]) -> None:
+    """Sum the same in space: first the three nodes of each row along z."""
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        low = shares[i, j, -1]
+        high = shares[i, j, 1]
+        row = low + shares[i, j, 0] + high
+        here += row
+        slopes[..., 0] += Float(i) * row
+        slopes[..., 1] += Float(j) * row
+        slopes[..., 2] += high - low

@@ -36,9 +36,12 @@ from lagbench.board.page import render
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Direction
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
-)
+NO_CHROMIUM = "no Chromium here: apt-get install chromium"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
+]
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,6 @@ def go(page: Page, tab: Tab) -> None:
     until(page, f"!document.getElementById('{tab.id}').hidden")
 
 
-@pytest.mark.slow
 def test_the_overview_of_all_splits_fits_a_laptop(
     running: Browser, tmp_path: Path
 ) -> None:
@@ -99,7 +101,6 @@ def test_the_overview_of_all_splits_fits_a_laptop(
         close(page)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("width", "dark"),
     [(1280, False), (1280, True), (390, False), (390, True), (320, False)],
@@ -197,7 +198,6 @@ def test_every_line_of_the_charts_is_drawn(page: Page, board: Board) -> None:
         assert all({"L", "H"} & {*path} for path in paths)
 
 
-@pytest.mark.slow
 def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None:
     """Truth beside the leader of the tab, in view at once on both widths; a key pauses
     it.
@@ -257,7 +257,6 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
     until(page, f"{label} === 'Pause'")
 
 
-@pytest.mark.slow
 def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:
     """After three ends, one picture is drawn per picture of the screen, not four."""
     slider = "document.querySelector('#hero input')"
@@ -359,7 +358,6 @@ def test_all_columns_are_shown_on_request(page: Page, board: Board) -> None:
             assert cell.startswith(format_value(value_of(row, column), column.form))
 
 
-@pytest.mark.slow
 def test_the_table_needs_no_script(
     running: Browser, file: Path, page: Page, board: Board
 ) -> None:
@@ -503,7 +501,6 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     until(page, f"String({shown}) === 'cavity-mini'")
 
 
-@pytest.mark.slow
 def test_address_restores_the_state(page: Page) -> None:
     """What was chosen stands in the address; loading that address shows the same."""
     run(page, "document.querySelectorAll('.tabs a')[3].click()")

@@ -11,9 +11,12 @@ from board_bench import page_of
 from browser import CHROMIUM, Browser
 from PIL import Image
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
-)
+NO_CHROMIUM = "no Chromium here: apt-get install chromium"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
+]
 
 TEXT_BOXES = """
 [...document.querySelectorAll('.chart text')].map(text => {
@@ -101,7 +104,6 @@ def test_the_table_of_scores_is_not_cut(running: Browser, report: Path) -> None:
     assert page.value(f"{box}.scrollWidth") <= page.value(f"{box}.clientWidth")
 
 
-@pytest.mark.slow
 def test_the_page_prints(running: Browser, report: Path) -> None:
     """A PDF has a sensible number of pages."""
     pdf = running.open(report, width=1280).pdf()

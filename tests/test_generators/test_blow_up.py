@@ -25,6 +25,9 @@ from lagbench.generators.simulate import simulate
 from lagbench.generators.split import Device, InitialState
 from lagbench.make.generate import generate
 
+# Each module of kernels takes seconds to compile.
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +90,6 @@ def failure(
     return caught.value
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "expected", "got"),
     [
@@ -117,7 +119,6 @@ def test_substep_and_bounds_are_those_that_broke_first(
     assert not list(tmp_path.rglob("*.nc*"))
 
 
-@pytest.mark.slow
 def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> None:
     """Of scenarios that advance together, the one that breaks first; not the first of
     the batch.
@@ -128,7 +129,6 @@ def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> 
     assert error.where == f"{SPLIT} {SIZE}, scenario {scenario}, substep {substep}"
 
 
-@pytest.mark.slow
 def test_a_good_run_loads_its_states_once(
     unmeasured: Registry,
     tmp_path: Path,
@@ -200,7 +200,6 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
     assert caught.value.where == "curl-noise tiny, scenario 2, substeps 0 to 12"
 
 
-@pytest.mark.slow
 def test_a_failed_scenario_leaves_what_was_there(
     copied: Callable[[], Path],
     stiff_registry: Registry,

@@ -25,6 +25,9 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.draws import quantise
 from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
 
+# Each module of kernels takes seconds to compile.
+pytestmark = pytest.mark.slow
+
 
 def with_velocity(
     state: InitialState,
@@ -66,7 +69,6 @@ def cells_of_vortex(
     return velocity, gradient
 
 
-@pytest.mark.slow
 def test_a_regular_lattice_stays_at_rest() -> None:
     """Nine particles per cell, evenly spaced: density and J are 1 everywhere and
     nothing moves.
@@ -80,7 +82,6 @@ def test_a_regular_lattice_stays_at_rest() -> None:
     assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
 
 
-@pytest.mark.slow
 def test_transfers_conserve_momentum() -> None:
     """Without pressure, viscosity and shift nothing changes the momentum of a patch off
     the walls.
@@ -101,7 +102,6 @@ def test_transfers_conserve_momentum() -> None:
     assert_allclose(momentum, before, rtol=0, atol=1e-6 * total_speed)
 
 
-@pytest.mark.slow
 def test_a_vortex_decays_as_navier_stokes_says() -> None:
     """The free-slip vortex sin kx cos ky is a solution with amplitude exp(-2 nu k^2
     t).
@@ -137,7 +137,6 @@ def test_a_vortex_decays_as_navier_stokes_says() -> None:
     assert amplitude == pytest.approx(expected, rel=0.003)
 
 
-@pytest.mark.slow
 def test_energy_falls_when_the_lid_rests() -> None:
     """Walls at rest do no work: kinetic energy falls from every 25 substeps to the
     next.
@@ -198,7 +197,6 @@ FLIP = [
 FLIPPED_WALLS = [1, 0, 2, 3]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "constants",
     [NO_SLIP, FREE_SLIP],
@@ -287,7 +285,6 @@ def test_sums_hold_every_particle_in_one_place() -> None:
     assert_allclose(around_the_spot, speed, rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("device", "scenarios"),
     [

@@ -18,6 +18,9 @@ from reference_closed_box import ReferenceClosedBox
 
 from lagbench.generators.split import ClosedBoxParameters, InitialState
 
+# Each module of kernels takes seconds to compile.
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("constants", "state"),

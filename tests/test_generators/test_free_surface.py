@@ -15,6 +15,9 @@ from lagbench.generators.free_surface import FreeSurface, courant
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.split import Device, InitialState, Material
 
+# Each module of kernels takes seconds to compile.
+pytestmark = pytest.mark.slow
+
 CONSTANTS = parameters()
 WEIGHTLESS = parameters(gravity=0.0)
 LOW = CONSTANTS.wall / CONSTANTS.grid
@@ -74,7 +77,6 @@ def total_spin(solver: FreeSurface, dx: float) -> float:
     return angular_momentum(position, velocity, affine, dx)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("material", Material)
 def test_free_flight_is_a_parabola(material: Material) -> None:
     """A body in the air has mean velocity v + g t and mean height y + v t + g t^2 /
@@ -98,7 +100,6 @@ def test_free_flight_is_a_parabola(material: Material) -> None:
     assert abs(mean_height(solver) - expected_height) <= 2e-5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("material", Material)
 def test_momentum_and_spin_are_conserved(material: Material) -> None:
     """Without gravity and walls, linear and angular momentum stay what they were."""
@@ -229,7 +230,6 @@ def test_displace_moves_and_keeps_in_the_box() -> None:
     solver.advance(5)
 
 
-@pytest.mark.slow
 def test_runaway_particle_is_reported() -> None:
     """Speeds beyond one cell per substep name the scenario, the substeps and the
     bound.

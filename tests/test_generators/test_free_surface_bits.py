@@ -16,6 +16,9 @@ from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.split import Device, InitialState, Material
 from lagbench.work.machine import available_cores
 
+# Each module of kernels takes seconds to compile.
+pytestmark = pytest.mark.slow
+
 CONSTANTS = parameters()
 SQUARE = Rectangle(0.2, 0.2)
 DISC = Disc(0.1)
@@ -130,7 +133,6 @@ def test_atomic_adds_from_two_threads_change_no_bit(state: InitialState) -> None
     assert_the_parallel_driver_agrees(state, threads=2)
 
 
-@pytest.mark.slow
 def test_the_parallel_driver_on_one_thread_gives_the_same_bits() -> None:
     assert_the_parallel_driver_agrees(MIXED, threads=1)
 
