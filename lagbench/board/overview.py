@@ -27,19 +27,13 @@ class LearningVerdict(enum.Enum):
     NO_SOLVER = enum.auto()  # every classical solver costs more
 
 
-SUMMARIES = {
-    LearningVerdict.PAYS: (
-        "Learning pays on {names}: {model} has less error than the best classical "
-        "solver that costs no more per frame."
-    ),
-    LearningVerdict.OPEN: "Whether learning pays is open on {names}.",
-    LearningVerdict.DOES_NOT_PAY: (
-        "Learning does not pay on {names}: a classical solver that costs no more has "
-        "less error than {model}."
-    ),
-    LearningVerdict.NO_SOLVER: "No classical solver is as cheap as {model} on {names}.",
+ANSWERS = {
+    LearningVerdict.PAYS: "yes",
+    LearningVerdict.OPEN: "open",
+    LearningVerdict.DOES_NOT_PAY: "no",
+    LearningVerdict.NO_SOLVER: "no solver is as cheap",
 }
-"""What is said of the data sets of a size by verdict, in this order."""
+"""Whether learning pays, in the table of the data sets of a size."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -226,6 +220,8 @@ class Conclusion:
     verdict: LearningVerdict
     # whether a model whose cost is not known has less error: it decides nothing
     better_has_no_cost: bool
+    # the most accurate of the models of known cost that contain no solver
+    learned: BoardRow | None
 
     @property
     def model(self) -> str:
@@ -235,12 +231,29 @@ class Conclusion:
         return "the most accurate model"
 
     @property
-    def measure(self) -> str:
-        """Name and ratio of the model, as in "GNS: 0.86×"; the name alone without."""
-        name = self.row.entry.name
-        if self.row.against_classical is None:
-            return name
-        return f"{name}: {_format_ratio(self.row.against_classical)}"
+    def is_hybrid(self) -> bool:
+        """Whether the most accurate model contains a solver."""
+        return self.row.entry.kind is Kind.HYBRID
+
+    @property
+    def slowdown(self) -> float | None:
+        """Time of a frame of the model over that of the simulator; None if unknown."""
+        return slowdown_of(self.row)
+
+    @property
+    def learned_verdict(self) -> LearningVerdict | None:
+        """Whether the most accurate purely learned model beats solvers of its cost."""
+        if self.learned is None:
+            return None
+        return _verdict_on(self.learned.against_classical)
+
+
+def slowdown_of(row: BoardRow) -> float | None:
+    """Return the time of a frame over that of the simulator; None if unknown."""
+    cost = cost_of(row)
+    if cost is None or cost.speed_up is None:
+        return None
+    return 1.0 / cost.speed_up
 
 
 def judge(tab: Tab) -> Conclusion | None:
@@ -249,21 +262,30 @@ def judge(tab: Tab) -> Conclusion | None:
     The most accurate model decides, as in docs/results.md. Variants count; entries
     whose weights fail a gate take part in no claim.
     """
-    best = None
+    models = []
     for row in _models_of(tab):
-        if row.against_classical is None and not row.is_cheapest:
-            continue
-        if best is None or _error_of(row, tab) < _error_of(best, tab):
-            best = row
-    if best is None:
+        if row.against_classical is not None or row.is_cheapest:
+            models.append(row)
+    if not models:
         return None
+    best = _most_accurate(models, tab)
+    learned_models = [row for row in models if row.entry.kind is Kind.LEARNED]
+    learned = None
+    if learned_models:
+        learned = _most_accurate(learned_models, tab)
     least_error = min(_error_of(row, tab) for row in _models_of(tab))
     return Conclusion(
         tab=tab,
         row=best,
         verdict=_verdict_on(best.against_classical),
         better_has_no_cost=least_error < _error_of(best, tab),
+        learned=learned,
     )
+
+
+def _most_accurate(rows: Sequence[BoardRow], tab: Tab) -> BoardRow:
+    """Return the row with the least error; the first of several."""
+    return min(rows, key=lambda row: _error_of(row, tab))
 
 
 def _verdict_on(ratio: Value | None) -> LearningVerdict:
@@ -307,6 +329,21 @@ def _format_ratio(ratio: Value) -> str:
     return f"{text(ratio.mean, 2)}×"
 
 
+def is_open(ratio: Value) -> bool:
+    """Tell whether the interval of a ratio contains 1, or is missing."""
+    return _verdict_on(ratio) is LearningVerdict.OPEN
+
+
+def format_comparison(row: BoardRow) -> str:
+    """Return the ratio to the solvers of the row's cost, as in "0.86× (0.8 to 0.9)"."""
+    ratio = row.against_classical
+    if ratio is None:
+        return "no solver is as cheap"
+    if math.isnan(ratio.low + ratio.high):
+        return _format_ratio(ratio)
+    return f"{_format_ratio(ratio)} ({text(ratio.low, 2)} to {text(ratio.high, 2)})"
+
+
 def _compare(row: BoardRow, ratio: Value) -> str:
     """Return a ratio with its interval and its solver, in words."""
     interval = ""
@@ -335,12 +372,11 @@ def conclude(tab: Tab) -> str:
     else:
         sentences = [_state_verdict(conclusion.verdict, data_set, model, row, ratio)]
     if conclusion.verdict is LearningVerdict.PAYS:
-        cost = cost_of(row)
-        if cost is not None and cost.speed_up is not None and cost.speed_up < 1.0:
-            times = text(1.0 / cost.speed_up, 2)
+        slowdown = conclusion.slowdown
+        if slowdown is not None and slowdown > 1.0:
             sentences.append(
-                f"A frame of the model costs {times} times as much as a frame of the "
-                "simulator that made the data."
+                f"A frame of the model costs {text(slowdown, 2)} times as much as a "
+                "frame of the simulator that made the data."
             )
     else:
         sentences += _name_exception(tab)
@@ -437,30 +473,82 @@ def join_names(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def summarise(overview: SizeOverview) -> list[str]:
-    """Return who leads over all data sets of a size, and where learning pays."""
-    sentences = [_name_leader(overview)]
-    data_sets: dict[tuple[LearningVerdict, str], list[str]] = {}
-    for tab in overview.tabs:
+def conclusions_of(tabs: Sequence[Tab]) -> list[Conclusion]:
+    """Return what data sets say about learning, where they say anything."""
+    conclusions = []
+    for tab in tabs:
         conclusion = judge(tab)
-        if conclusion is None:
-            continue
-        data_set = f"{tab.size.split} ({conclusion.measure})"
-        key = conclusion.verdict, conclusion.model
-        data_sets.setdefault(key, []).append(data_set)
-    for verdict, words_of_verdict in SUMMARIES.items():
-        for key, names in data_sets.items():
-            verdict_of_names, model = key
-            if verdict_of_names is verdict:
-                sentence = words_of_verdict.format(names=join_names(names), model=model)
-                sentences.append(sentence)
+        if conclusion is not None:
+            conclusions.append(conclusion)
+    return conclusions
+
+
+def summarise(overview: SizeOverview) -> list[str]:
+    """Return where learning pays at a size, and who leads over all its data sets."""
+    sentences = state_verdicts(conclusions_of(overview.tabs))
     without_skill = _find_data_sets_without_skill(overview)
     if without_skill:
         sentences.append(
             f"No entry has a skill above 0 on {join_names(without_skill)}: the best "
             "naive baseline has less error than every entry."
         )
+    sentences.append(_name_leader(overview))
     return sentences
+
+
+def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
+    """Return on how many data sets learning pays, by which models, at which cost."""
+    if not conclusions:
+        return []
+    winners = []
+    for conclusion in conclusions:
+        if conclusion.verdict is LearningVerdict.PAYS:
+            winners.append(conclusion)
+    count = len(conclusions)
+    if not winners:
+        return [f"Learning pays on none of {count} data sets."]
+    hybrid_count = sum(winner.is_hybrid for winner in winners)
+    slower_count = 0
+    for winner in winners:
+        if winner.slowdown is not None and winner.slowdown > 1.0:
+            slower_count += 1
+    sentences = [
+        f"Learning pays on {len(winners)} of {count} data sets: there the most "
+        "accurate model has less error than every classical solver of lagbench that "
+        "costs no more per frame."
+    ]
+    if hybrid_count:
+        models = _count_models(hybrid_count, len(winners))
+        sentences.append(
+            f"{models} hybrid: a classical solver with a few learned numbers."
+        )
+    if slower_count:
+        models = _count_models(slower_count, len(winners))
+        sentences.append(f"{models} slower than the simulator that made the data.")
+    learned_verdicts = [conclusion.learned_verdict for conclusion in conclusions]
+    learned_count = len(learned_verdicts) - learned_verdicts.count(None)
+    if hybrid_count and learned_count:
+        wins = learned_verdicts.count(LearningVerdict.PAYS)
+        open_count = learned_verdicts.count(LearningVerdict.OPEN)
+        sentences.append(
+            f"Purely learned models beat the solvers of their cost on {wins} of "
+            f"{learned_count}; on {open_count} the question is open."
+        )
+    return sentences
+
+
+def _count_models(count: int, total: int) -> str:
+    """Return how many models are something.
+
+    >>> _count_models(9, 12), _count_models(12, 12), _count_models(1, 1)
+    ('9 of these 12 models are', 'All 12 models are', 'The model is')
+    """
+    if total == 1:
+        return "The model is"
+    if count == total:
+        return f"All {count} models are"
+    verb = "is" if count == 1 else "are"
+    return f"{count} of these {total} models {verb}"
 
 
 def _find_data_sets_without_skill(overview: SizeOverview) -> list[str]:
@@ -514,10 +602,18 @@ def count_data_sets(overview: SizeOverview) -> str:
 def find_hero(overviews: Sequence[SizeOverview]) -> tuple[Tab, BoardRow] | None:
     """Return the data set whose film stands first, and the row of it.
 
-    The film is of the first method of the first table that has one: a row in sight. Of
-    its data sets those with skill come first, then those with the most materials, then
-    those with the most skill.
+    The film is of a model by which learning pays: of these the one with the most
+    materials, then the one with the most skill. Where there is none, it is of the first
+    method of the first table that has a film; there data sets with skill come first.
     """
+    for overview in overviews:
+        films = []
+        for conclusion in conclusions_of(overview.tabs):
+            if conclusion.verdict is LearningVerdict.PAYS:
+                films.append((conclusion.tab, conclusion.row))
+        film = _choose_film(films)
+        if film is not None:
+            return film
     for overview in overviews:
         for method in overview.methods:
             film = _find_film(method, overview.tabs)
@@ -529,11 +625,20 @@ def find_hero(overviews: Sequence[SizeOverview]) -> tuple[Tab, BoardRow] | None:
 def _find_film(
     method: MethodOverview, tabs: Sequence[Tab]
 ) -> tuple[Tab, BoardRow] | None:
+    """Return the film of a method."""
+    films = []
+    for tab in tabs:
+        if tab.id in method.rows:
+            films.append((tab, method.rows[tab.id]))
+    return _choose_film(films)
+
+
+def _choose_film(films: Sequence[tuple[Tab, BoardRow]]) -> tuple[Tab, BoardRow] | None:
+    """Return the row with pictures that has skill, most materials, then most skill."""
     best: tuple[Tab, BoardRow] | None = None
     most = (False, 0, -math.inf)
-    for tab in tabs:
-        row = method.rows.get(tab.id)
-        if row is None or row.pictures is None or tab.truth is None:
+    for tab, row in films:
+        if row.pictures is None or tab.truth is None:
             continue
         materials = len(set(tab.truth.material.tolist()))
         skill = -math.inf

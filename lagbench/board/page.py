@@ -48,13 +48,19 @@ from .encoding import decode, encode
 from .entry import Level
 from .model import Board, BoardRow, ReferenceRow, Tab
 from .overview import (
+    ANSWERS,
+    Conclusion,
     MethodOverview,
     SizeOverview,
     conclude,
+    conclusions_of,
     count_data_sets,
     find_hero,
+    format_comparison,
+    is_open,
     join_names,
     make_overviews,
+    state_verdicts,
     summarise,
 )
 from .page_data import page_data
@@ -118,8 +124,9 @@ TAKE_PART = """\
 pip install -c constraints.txt '.[generate,plots,baselines]'
 # the data, bit for bit; so for every split
 lagbench generate --split cavity --size mini
-# or write the file yourself
-lagbench predict weights.pt -o predictions.nc
+# a model of ours, or write predictions.nc with a program of your own
+lagbench train --baseline neuralmpm --split cavity --size mini
+lagbench predict runs/cavity/mini/neuralmpm-0/weights.pt -o predictions.nc
 # scores, and adds the entry
 lagbench submit predictions.nc --from meta.yaml
 # what the pull request must pass
@@ -138,19 +145,33 @@ OVERVIEW_WORDS = (
     "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
     "prediction. “0.9×” is the error beside that of the best classical solver that "
     "costs no more per frame: below 1, learning pays. The question is open where the "
-    "95 % interval contains 1. Ranks count entries only: classical solvers and "
-    "baselines have none."
+    "95 % interval contains 1. The error is the metric that ranks on the data set: "
+    "that of vorticity in boxes full of fluid, the distance of particle clouds on free "
+    "surfaces. The cost is the processor time of a frame on one core. Size mini is "
+    "what a laptop makes in minutes, full is larger."
 )
 
-OVERVIEW_NOTES = (
-    "Size mini is what a laptop makes in minutes, full is larger.",
+CELL_WORDS = (
     "A cell has the skill, the rank on this data set, and the error beside that of the "
     "best classical solver that costs no more per frame. The last one is missing where "
-    "the cost is unknown, or every classical solver costs more.",
-    "A rank such as 2–4 names the places that a method takes when the test scenarios "
-    "are drawn again (95 %). Variants of a method are folded behind it, without a "
-    "rank.",
+    "the cost is unknown, or every classical solver costs more. A question mark stands "
+    "where its 95 % interval contains 1. A rank such as 2–4 "
+    "names the places that a method takes when the test scenarios are drawn again "
+    "(95 %). Ranks count entries only: classical solvers and baselines have none. "
+    "Variants of a method are folded behind it, without a rank."
 )
+
+VERDICT_HEADINGS = (
+    "data set",
+    "does learning pay?",
+    "most accurate model",
+    "kind",
+    "its error beside the solver",
+    "its time beside the simulator",
+    "best purely learned model",
+    "its error beside the solver",
+)
+"""Columns of the table of a size's data sets."""
 
 LEVEL_MEANINGS = {
     Level.AS_SUBMITTED: "the maintainers did not follow the scores",
@@ -290,22 +311,33 @@ def _source_of(content: str) -> str:
 
 
 def draw_intro(board: Board) -> Markup:
-    """Return the sentences under the title: what this is, and what is verified.
+    """Return the paragraphs under the title: question, answer, what is verified.
 
     They count active entries only.
     """
     rows: list[BoardRow] = []
     for tab in board.tabs:
         rows += [row for row in tab.rows if row.active]
+    question = (
+        "Which neural surrogate predicts how fluids and soft bodies move, and is it "
+        "better than a classical solver of the same cost?"
+    )
+    paragraphs = [tag("p", question, class_="lede")]
+    verdicts = state_verdicts(conclusions_of(board.tabs))
+    if verdicts:
+        answer = tag("strong", verdicts[0])
+        details = " ".join(["", *verdicts[1:]])
+        paragraphs.append(tag("p", answer, details, class_="lede"))
     entries = _count(len(rows), "entry", "entries")
     data_sets = _count(len(board.tabs), "data set", "data sets")
-    sentences = escaped(
-        "Which neural surrogate predicts how fluids and soft bodies move, and is it "
-        f"better than a classical solver of the same cost? {entries} on {data_sets} "
-        "that every x86-64 Linux CPU regenerates bit for bit. Every score follows from "
-        f"committed score files. {_describe_levels(rows)} {_describe_costs(rows)} "
+    evidence = escaped(
+        f"{entries} on {data_sets} that every x86-64 Linux CPU regenerates bit for "
+        "bit. Every score follows from committed score files. "
+        f"{_describe_levels(rows)} {_describe_costs(rows)} "
     )
-    return join([sentences, tag("a", "Take part", href="#take-part")])
+    link = tag("a", "Take part", href="#take-part")
+    paragraphs.append(tag("p", evidence, link, class_="facts"))
+    return join(paragraphs)
 
 
 def _describe_levels(rows: Sequence[BoardRow]) -> str:
@@ -325,10 +357,14 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
         models = _count(run_again, "entry", "entries")
         clause = f"ran the models of {models} again and got the same scores"
         clause += _describe_extent(whole_count, run_again - whole_count)
-        if counts[Level.BLIND]:
+        blind_count = counts[Level.BLIND]
+        if blind_count:
+            blind_entries = f"{blind_count} of these entries"
+            if blind_count == run_again:
+                blind_entries = "the same entries"
             clause += (
-                f"; {counts[Level.BLIND]} of these entries were also scored on "
-                "scenarios that were drawn after the models were frozen (blind)"
+                f"; {blind_entries} were also scored on scenarios that were drawn "
+                "after the models were frozen (blind)"
             )
         clauses.append(clause)
     if counts[Level.SCORED_AGAIN]:
@@ -429,14 +465,76 @@ def draw_overview(overviews: Sequence[SizeOverview]) -> Markup:
         tag("h2", "All data sets"),
         tag("p", OVERVIEW_WORDS, class_="facts"),
     ]
-    for overview in overviews:
+    for number, overview in enumerate(overviews):
         items = [tag("li", sentence) for sentence in summarise(overview)]
         parts.append(tag("h3", overview.size))
         parts.append(tag("ul", *items, class_="verdicts"))
+        parts.append(_verdict_table(overview))
+        if number == 0:
+            parts.append(tag("p", CELL_WORDS, class_="facts"))
         parts.append(_overview_table(overview))
-    notes = [tag("p", note) for note in OVERVIEW_NOTES]
-    parts.append(tag("div", *notes, class_="notes"))
     return tag("section", *parts, id="overview", class_="tab")
+
+
+def _verdict_table(overview: SizeOverview) -> Markup:
+    """Return a table with a row per data set: whether learning pays, by how much."""
+    conclusions = conclusions_of(overview.tabs)
+    if not conclusions:
+        return Markup("")
+    headings = [tag("th", heading, scope="col") for heading in VERDICT_HEADINGS]
+    rows = [_verdict_row(conclusion) for conclusion in conclusions]
+    caption = f"Where learning pays at size {overview.size}"
+    table = tag(
+        "table",
+        tag("caption", caption, class_="unseen"),
+        tag("thead", tag("tr", *headings)),
+        tag("tbody", *rows),
+        class_="board answers",
+    )
+    return tag(
+        "div",
+        table,
+        class_="scroll",
+        role="region",
+        aria_label=caption,
+        tabindex=0,
+    )
+
+
+def _verdict_row(conclusion: Conclusion) -> Markup:
+    """Return the line of a data set; entries in it are links."""
+    tab = conclusion.tab
+    answer = ANSWERS[conclusion.verdict]
+    row = conclusion.row
+    model: list[Markup | str] = [_entry_link(tab, row)]
+    if conclusion.better_has_no_cost:
+        model.append(tag("span", f" {conclusion.model}", class_="ci"))
+    time = "unknown"
+    if conclusion.slowdown is not None:
+        time = f"{text(conclusion.slowdown, 2)}×"
+    learned = conclusion.learned
+    cells = [
+        tag("th", tag("a", tab.size.split, href=f"#{tab.id}"), scope="row"),
+        tag("td", answer, class_="best" if answer == "yes" else None),
+        tag("td", *model),
+        tag("td", str(row.entry.kind)),
+        tag("td", format_comparison(row)),
+        tag("td", time),
+    ]
+    if learned is None:
+        cells += [tag("td"), tag("td")]
+    else:
+        cells += [
+            tag("td", _entry_link(tab, learned)),
+            tag("td", format_comparison(learned)),
+        ]
+    return tag("tr", *cells)
+
+
+def _entry_link(tab: Tab, row: BoardRow) -> Markup:
+    """Return a link to an entry, by its name."""
+    name = clipped(row.entry.name, 60)
+    return tag("a", name, href=f"#tab={tab.id}&entry={row.id}")
 
 
 def _overview_table(overview: SizeOverview) -> Markup:
@@ -556,7 +654,10 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row.rank is not None:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
     if row.against_classical is not None:
-        remarks.append(f"{text(row.against_classical.mean, 2)}×")
+        ratio = f"{text(row.against_classical.mean, 2)}×"
+        if is_open(row.against_classical):
+            ratio += "?"
+        remarks.append(ratio)
     parts = []
     if row.skill is not None:
         parts.append(tag("span", text(row.skill.mean), class_="n"))

@@ -429,7 +429,37 @@ def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
     assert "model of known cost" in shown
     shown = text_of_overview(page_of(board, first_tab(board, accurate)))
     assert "model of known cost" not in shown
-    assert "cavity (Accurate: 0.50×)" in shown
+    assert "cavityyesAccuratelearned0.50× (0.40 to 0.60)" in shown
+
+
+def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
+    """That the winner is a hybrid and slow, and how purely learned models do."""
+    cost = EntryCost(seconds_per_frame=1.0, device="a", solver_seconds_per_frame=0.5)
+    winner = compared(board, "Winner", error=1.0, ratio=GOOD)
+    winner = with_entry(winner, kind=Kind.HYBRID, cost=cost)
+    learned = compared(board, "Net", error=2.0, ratio=(0.8, 0.9, 1.1))
+    tab = first_tab(board, winner, learned)
+    shown = text_of_overview(page_of(board, tab))
+    assert "Learning pays on 1 of 1 data sets" in shown
+    assert "The model is hybrid: a classical solver" in shown
+    assert "The model is slower than the simulator" in shown
+    assert (
+        "beat the solvers of their cost on 0 of 1; on 1 the question is open" in shown
+    )
+    winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×"
+    assert f"cavityyes{winner_cells}Net0.90× (0.80 to 1.1)" in shown
+    paragraphs = read_html(page_of(board, tab)).named("p")
+    ledes = [one for one in paragraphs if one.attributes.get("class") == "lede"]
+    assert "Learning pays on 1 of 1 data sets" in ledes[1].text
+
+
+def test_the_overview_says_where_learning_does_not_pay(board: Board) -> None:
+    """Without a winner nothing is said of winners."""
+    row = compared(board, "Model", error=1.0, ratio=DEAR)
+    shown = text_of_overview(page_of(board, first_tab(board, row)))
+    assert "Learning pays on none of 1 data sets." in shown
+    assert "cavitynoModellearned1.5× (1.2 to 1.9)" in shown
+    assert "hybrid:" not in shown
 
 
 def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> None:
@@ -535,7 +565,7 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     sentences = conclude(tab)
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
-    assert "cavity (Model)" in shown
+    assert "cavityno solver is as cheapModellearnedno solver is as cheap" in shown
 
     tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
     sentences = conclude(tab)
