@@ -57,13 +57,14 @@ def test_the_table_of_speeds_has_the_costs_of_verified_yaml() -> None:
 
 
 @pytest.mark.slow
-def test_the_table_of_shift_has_the_scores_of_shift_yaml() -> None:
+@pytest.mark.parametrize("size", ["mini", "full"])
+def test_the_table_of_shift_has_the_scores_of_shift_yaml(size: str) -> None:
     """The best method of each kind on four data sets."""
-    chosen = collect_shifted(BOARD, "mini")
+    chosen = collect_shifted(BOARD, size)
     assert len(chosen) == 4
     (printed,) = tables_in(table_of_shift(chosen))
     page = tables_in((DOCS / "tasks.md").read_text())
-    assert table_like(page, printed[0]) == printed
+    assert printed in page
 
 
 @pytest.mark.slow
