@@ -6,7 +6,8 @@ for resuming, ``optimizer``. It is read with ``weights_only=True``, which refuse
 with any other object in it. So a stranger's file runs no code. The one threat that is
 left is memory: an archive of a few kilobytes may unpack to more than the machine has.
 So the size that its members state is limited. Options may ask for a model beyond all
-memory; building it fails, and so does :func:`restore`.
+memory, or for layers without end: :func:`restore` stops building a model that has far
+more parameters than the file has numbers.
 
 A file named ``.safetensors`` holds the weights and the text ``about``, see
 :mod:`.safetensors_file`.
@@ -17,9 +18,11 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import threading
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,7 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from lagbench.atomic import atomic_path
 from lagbench.data.field_errors import describe_expectation, describe_input
@@ -52,6 +56,8 @@ KEY = "lagbench_checkpoint"
 EXPECTED = "a checkpoint that lagbench train wrote"
 RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"  # in a file of weights to start from
 MOST_BYTES = 4 << 30  # of an unpacked checkpoint
+# beyond twice the numbers of a file: layers that are built and not kept
+FREE_PARAMETERS = 100_000
 # the name of a foreign function in torch's refusal of a pickle
 _FOREIGN_NAME = re.compile(r"GLOBAL ([\w.]+)")
 # the first bytes of a pickle
@@ -297,8 +303,10 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
             got=error.got,
             fix="install the package that adds it",
         ) from error
+    file_numbers = sum(value.numel() for value in checkpoint.weights.values())
     try:
-        model = entry.model.build(checkpoint.options, checkpoint.info)
+        with _limited_parameters(2 * file_numbers + FREE_PARAMETERS):
+            model = entry.model.build(checkpoint.options, checkpoint.info)
     except ValidationError as error:
         detail = error.errors()[0]
         key = ".".join(map(str, detail["loc"]))
@@ -327,6 +335,36 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()
+
+
+@contextmanager
+def _limited_parameters(limit: int) -> Iterator[None]:
+    """Stop the building of a model in this thread once it has too many parameters.
+
+    Layers register a parameter before they draw its numbers. So memory that is asked
+    for is not touched yet, and no time is lost with it.
+
+    Raises:
+        ValueError: the layers that are built within have more numbers than ``limit``.
+    """
+    thread = threading.get_ident()
+    count = 0
+
+    def count_numbers(module: nn.Module, name: str, parameter: nn.Parameter) -> None:
+        nonlocal count
+        if threading.get_ident() != thread or nn.parameter.is_lazy(parameter):
+            return
+        count += parameter.numel()
+        if count > limit:
+            raise ValueError(
+                "the options ask for more parameters than the file has numbers"
+            )
+
+    handle = register_module_parameter_registration_hook(count_numbers)
+    try:
+        yield
+    finally:
+        handle.remove()
 
 
 def load_weights(

@@ -51,7 +51,15 @@ FAILED = 5
 PIPE_CLOSED = 141
 """Exit code that shells report when the reader of a pipe left, 128 + SIGPIPE."""
 
-RESUMABLE_COMMANDS = {"demo", "generate", "download", "train", "season"}
+RESUMABLE_COMMANDS = {
+    "demo",
+    "generate",
+    "download",
+    "train",
+    "season run",
+    "leaderboard reproduce",
+    "leaderboard shift",
+}
 """Commands that go on where they stopped."""
 
 GROUPS = ("leaderboard", "season")
@@ -533,9 +541,12 @@ def _first_detail(error: Any) -> Any:  # noqa: ANN401 (two copies of click)
 
 
 def _interruption_message(command: str | None) -> str:
-    if command not in RESUMABLE_COMMANDS:
-        return "lagbench: interrupted"
     same_command = "the same command"
+    words = [command or ""]
+    if command in GROUPS:
+        words.extend(sys.argv[2:3])
+    if " ".join(words) not in RESUMABLE_COMMANDS:
+        return f"lagbench: interrupted; {same_command} begins anew"
     for option in ("--force", "--again", "--fresh"):
         if option in sys.argv:
             same_command += f", without {option},"

@@ -223,6 +223,11 @@ def options_beyond_all_memory(path: Path) -> None:
     rewrite_recipe(path, lambda recipe: recipe["options"].update(latent=10**7))
 
 
+def options_of_layers_without_end(path: Path) -> None:
+    """Small layers, 10^9 of them."""
+    rewrite_recipe(path, lambda recipe: recipe["options"].update(layers=10**9))
+
+
 HOSTILE = (
     a_pickle,
     an_archive,
@@ -243,4 +248,5 @@ HOSTILE = (
     an_infinite_weight,
     an_unknown_architecture,
     options_beyond_all_memory,
+    options_of_layers_without_end,
 )

@@ -29,7 +29,13 @@ from lagbench.board.show import (
 )
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
-from lagbench.errors import DataError, LagbenchError, UsageError, format_count
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UsageError,
+    check_regular,
+    format_count,
+)
 from lagbench.references.shipped import shipped
 from lagbench.scoring.boards import find_board
 from lagbench.scoring.references import sizes_with_test_files
@@ -159,6 +165,8 @@ def check_command(
             got="no --predictions",
             fix="give --predictions FILE as well",
         )
+    for path in predictions or ():
+        check_regular(path)
     sizes: Sequence[Size] = ()
     if root and not predictions:
         sizes = _sizes_to_measure(root, split, size)

@@ -133,6 +133,7 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),
         (["leaderboard", "check"], 2, "--board FOLDER"),
+        (["leaderboard", "check", "--predictions", "none.nc"], 3, "none.nc"),
         (["leaderboard", "show"], 2, "no leaderboard here"),
         (["leaderboard", "reproduce", "--all"], 2, "no leaderboard here"),
         (["leaderboard", "shift", "--all"], 2, "no leaderboard here"),

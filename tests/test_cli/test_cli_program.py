@@ -163,6 +163,33 @@ def test_an_interruption_says_to_leave_out_what_deletes_the_work(
     assert f"without {option}" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("line", "advice"),
+    [
+        ("leaderboard reproduce --all", "goes on where it stopped"),
+        ("leaderboard check", "begins anew"),
+        ("score predictions.nc", "begins anew"),
+        ("predict weights.pt", "begins anew"),
+        ("season run winter", "goes on where it stopped"),
+        ("season show winter", "begins anew"),
+    ],
+)
+def test_an_interruption_says_what_the_same_command_does(
+    line: str, advice: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some commands keep what they have done, the others begin anew."""
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    words = line.split()
+    monkeypatch.setattr("typer.core.TyperCommand.invoke", interrupt)
+    monkeypatch.setattr("sys.argv", ["lagbench", *words])
+    result = run(*words)
+    assert result.exit_code == 130
+    assert f"the same command {advice}" in result.stderr
+
+
 @pytest.mark.parametrize("words", [("--help",), ("list",), ("list", "--json")])
 def test_a_closed_pipe_ends_in_silence(words: tuple[str, ...]) -> None:
     """Text, tables and help end as the shell's commands do when nobody reads them."""
