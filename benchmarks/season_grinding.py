@@ -20,7 +20,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.board.build import collect
+from lagbench.board.build import Scope, collect
+from lagbench.board.folder import Folder
 from lagbench.board.model import Tab
 from lagbench.figures.tables import markdown
 from lagbench.references.shipped import shipped
@@ -100,11 +101,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
 
+    data_sets = set()
+    for split, size in Folder(options.board).data_sets():
+        if size == options.size:
+            data_sets.add((split, size))
+    ranking_only = Scope(metrics=(), intervals=(), has_pictures=False)
     gains = []
     swaps = []
-    for tab in collect(options.board).tabs:
-        if tab.size.name != options.size:
-            continue
+    for tab in collect(options.board, only=data_sets, scope=ranking_only).tabs:
         metric = tab.ranking
         base = naive_values(tab, metric)
         if base is None:
@@ -121,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         skills = 1.0 - means / base_means
         mean_skill = float(np.mean(skills))
         deviation = float(np.std(skills))
-        cells = [f"{mean_skill:.3f}", f"{deviation:.3f}"]
+        cells = [f"{mean_skill:.3f} ± {deviation:.3f}"]
         for tries in options.tries[1:]:
             best_skill = expected_best(skills, tries)
             gain = best_skill - mean_skill
@@ -143,12 +147,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 cells.append(f"{probability:.3f}")
             swaps.append((place, method, next_method, *cells))
 
-    gain_head = ["data set", "leader", "skill", "deviation of a redraw"]
+    gain_head = ["data set", "leading entry", "skill of a draw ± standard deviation"]
     for tries in options.tries[1:]:
-        gain_head.append(f"gain, best of {tries}")
-    swap_head = ["data set", "leader", "next", "lead in skill"]
+        gain_head.append(f"gain, best of {tries:,}")
+    swap_head = ["data set", "leading entry", "second entry", "lead in skill"]
     for tries in options.tries:
-        swap_head.append(f"next wins, best of {tries}")
+        swap_head.append(f"second leads, best of {tries:,}")
     gain_table = markdown(gain_head, gains)
     swap_table = markdown(swap_head, swaps)
     sys.stdout.write(f"{gain_table}\n\n")
