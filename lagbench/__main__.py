@@ -32,6 +32,7 @@ from .cli.typed_settings import (
     advise_on_baselines,
     advise_on_lists,
     advise_on_settings,
+    advise_on_splits,
     shorten_word,
 )
 from .errors import (
@@ -489,6 +490,7 @@ def _extra_words_error(
             advise_on_lists(sys.argv)
             or advise_on_settings(sys.argv)
             or advise_on_baselines(sys.argv)
+            or advise_on_splits(sys.argv)
             or "leave them out, or put quotes around a text with blanks; "
             f"`{command} --help`"
         )

@@ -134,6 +134,20 @@ def advise_on_baselines(words: Sequence[str]) -> str | None:
     return None
 
 
+def advise_on_splits(words: Sequence[str]) -> str | None:
+    """Return how to name the split of a bench that was typed without its option.
+
+    >>> advise_on_splits(["lagbench", "bench", "solver", "cavity"])
+    'name the split by an option: --split cavity'
+    """
+    if list(words[1:3]) != ["bench", "solver"]:
+        return None
+    for word in words[3:4]:
+        if not word.startswith("-"):
+            return f"name the split by an option: --split {shorten_word(word)}"
+    return None
+
+
 def check_typed_settings(words: Sequence[str]) -> None:
     """Refuse a setting without its =: its value was taken for the argument SPLIT.
 

@@ -165,10 +165,14 @@ def parse_ids(
     """
     ids: list[int] = []
     issue = None
+    fix = f"write {noun}s in ascending order, each once"
     for part in str(text).replace(" ", "").split(","):
         match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
         if match is None:
             issue = f"{part!r} is no {noun} and no range"
+            other_range = re.fullmatch(r"(\d{1,4})(?:\.+|:|_|to)(\d{1,4})", part)
+            if other_range is not None:
+                fix = f"a range has a hyphen: {other_range[1]}-{other_range[2]}"
             break
         first = int(match[1])
         last = int(match[2] or match[1])
@@ -184,7 +188,7 @@ def parse_ids(
             where=where,
             expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
             got=issue,
-            fix=f"write {noun}s in ascending order, each once",
+            fix=fix,
         )
     return tuple(ids)
 
