@@ -404,14 +404,18 @@ def suggest_name(name: str, known_names: Iterable[str], *, prefix: str = "") -> 
     "did you mean 'cavity'? known: cavity, fluid"
     >>> suggest_name("latant", ["latent"], prefix="model.")
     "did you mean 'model.latent'? known: model.latent"
+    >>> suggest_name("density", ["denstiy", "density_coupling"])[:23]
+    "did you mean 'denstiy'?"
     >>> suggest_name("rate", ["learning_rate", "patience"])
     "did you mean 'learning_rate'? known: learning_rate, patience"
     """
     names = sorted(known_names)
     close_names = difflib.get_close_matches(name, names, n=5, cutoff=0.5)
-    # a whole word of a known name is nearer than a few letters in common
+    # a whole word of a known name is nearer than a few letters in common, but not than
+    # a slip of the pen
+    has_slip = bool(difflib.get_close_matches(name, names, cutoff=0.8))
     containing = [known for known in names if name in known.split("_")]
-    if len(containing) == 1:
+    if len(containing) == 1 and not has_slip:
         others = [close for close in close_names if close not in containing]
         close_names = [*containing, *others]
     words = [f"{prefix}{known}" for known in names]
