@@ -308,11 +308,16 @@ class ReferenceFullBox:
         for axis, end in enumerate(ends):
             if end is None:
                 continue
-            edge, next_ghost, far_ghost = (1, 0, -1)
+            low_ghost = 0
+            high_ghost = -1
+            near_ghost = low_ghost
+            far_ghost = high_ghost
+            node[axis] = 1
             if end == 1:
-                edge, next_ghost, far_ghost = (-2, -1, 0)
-            node[axis] = edge
-            ghost[axis] = next_ghost
+                near_ghost = high_ghost
+                far_ghost = low_ghost
+                node[axis] = -2
+            ghost[axis] = near_ghost
             if self.box.periodic[axis]:
                 ghost[axis] = far_ghost
         return tuple(node), tuple(ghost)

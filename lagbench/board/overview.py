@@ -238,7 +238,10 @@ class Conclusion:
     @property
     def slowdown(self) -> float | None:
         """Time of a frame of the model over that of the simulator; None if unknown."""
-        return slowdown_of(self.row)
+        cost = cost_of(self.row)
+        if cost is None or cost.speed_up is None:
+            return None
+        return 1.0 / cost.speed_up
 
     @property
     def learned_verdict(self) -> LearningVerdict | None:
@@ -246,14 +249,6 @@ class Conclusion:
         if self.learned is None:
             return None
         return _verdict_on(self.learned.against_classical)
-
-
-def slowdown_of(row: BoardRow) -> float | None:
-    """Return the time of a frame over that of the simulator; None if unknown."""
-    cost = cost_of(row)
-    if cost is None or cost.speed_up is None:
-        return None
-    return 1.0 / cost.speed_up
 
 
 def judge(tab: Tab) -> Conclusion | None:

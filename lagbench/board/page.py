@@ -50,6 +50,7 @@ from .model import Board, BoardRow, ReferenceRow, Tab
 from .overview import (
     ANSWERS,
     Conclusion,
+    LearningVerdict,
     MethodOverview,
     SizeOverview,
     conclude,
@@ -484,27 +485,15 @@ def _verdict_table(overview: SizeOverview) -> Markup:
     headings = [tag("th", heading, scope="col") for heading in VERDICT_HEADINGS]
     rows = [_verdict_row(conclusion) for conclusion in conclusions]
     caption = f"Where learning pays at size {overview.size}"
-    table = tag(
-        "table",
-        tag("caption", caption, class_="unseen"),
-        tag("thead", tag("tr", *headings)),
-        tag("tbody", *rows),
-        class_="board answers",
-    )
-    return tag(
-        "div",
-        table,
-        class_="scroll",
-        role="region",
-        aria_label=caption,
-        tabindex=0,
+    return _scrolled_table(
+        caption, headings, [tag("tbody", *rows)], class_="board answers"
     )
 
 
 def _verdict_row(conclusion: Conclusion) -> Markup:
     """Return the line of a data set; entries in it are links."""
     tab = conclusion.tab
-    answer = ANSWERS[conclusion.verdict]
+    pays = conclusion.verdict is LearningVerdict.PAYS
     row = conclusion.row
     model: list[Markup | str] = [_entry_link(tab, row)]
     if conclusion.better_has_no_cost:
@@ -515,7 +504,7 @@ def _verdict_row(conclusion: Conclusion) -> Markup:
     learned = conclusion.learned
     cells = [
         tag("th", tag("a", tab.size.split, href=f"#{tab.id}"), scope="row"),
-        tag("td", answer, class_="best" if answer == "yes" else None),
+        tag("td", ANSWERS[conclusion.verdict], class_="best" if pays else None),
         tag("td", *model),
         tag("td", str(row.entry.kind)),
         tag("td", format_comparison(row)),
@@ -569,12 +558,23 @@ def _overview_table(overview: SizeOverview) -> Markup:
         )
         bodies.append(tag("tbody", tag("tr", heading), *incomplete))
     caption = f"All data sets of size {overview.size}"
+    return _scrolled_table(caption, headings, bodies, class_="board across")
+
+
+def _scrolled_table(
+    caption: str,
+    headings: Sequence[Markup],
+    bodies: Sequence[Markup],
+    *,
+    class_: str,
+) -> Markup:
+    """Return a table that scrolls sideways where the page is narrow."""
     table = tag(
         "table",
         tag("caption", caption, class_="unseen"),
         tag("thead", tag("tr", *headings)),
         *bodies,
-        class_="board across",
+        class_=class_,
     )
     return tag(
         "div",

@@ -140,12 +140,12 @@ def advise_on_splits(words: Sequence[str]) -> str | None:
     >>> advise_on_splits(["lagbench", "bench", "solver", "cavity"])
     'name the split by an option: --split cavity'
     """
-    if list(words[1:3]) != ["bench", "solver"]:
+    if list(words[1:3]) != ["bench", "solver"] or len(words) == 3:
         return None
-    for word in words[3:4]:
-        if not word.startswith("-"):
-            return f"name the split by an option: --split {shorten_word(word)}"
-    return None
+    word = words[3]
+    if word.startswith("-"):
+        return None
+    return f"name the split by an option: --split {shorten_word(word)}"
 
 
 def check_typed_settings(words: Sequence[str]) -> None:
