@@ -35,6 +35,15 @@ ANSWERS = {
 }
 """Whether learning pays, in the table of the data sets of a size."""
 
+OTHER_VERDICTS = {
+    LearningVerdict.DOES_NOT_PAY: "Learning does not pay on",
+    LearningVerdict.OPEN: "Whether learning pays is open on",
+    LearningVerdict.NO_SOLVER: (
+        "No classical solver is as cheap as the most accurate model on"
+    ),
+}
+"""Beginnings of the sentences about data sets where learning does not clearly pay."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MethodOverview:
@@ -493,43 +502,64 @@ def summarise(overview: SizeOverview) -> list[str]:
 
 def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
     """Return on how many data sets learning pays, by which models, at which cost."""
-    if not conclusions:
-        return []
+    total = len(conclusions)
+    verdicts = [conclusion.verdict for conclusion in conclusions]
     winners = []
     for conclusion in conclusions:
         if conclusion.verdict is LearningVerdict.PAYS:
             winners.append(conclusion)
-    count = len(conclusions)
-    if not winners:
-        return [f"Learning pays on none of {count} data sets."]
-    hybrid_count = sum(winner.is_hybrid for winner in winners)
-    slower_count = 0
+    sentences = []
+    if winners:
+        sentences.append(
+            f"Learning pays on {_share(len(winners), total)}: there the most accurate "
+            "model has less error than every classical solver of lagbench that costs "
+            "no more per frame."
+        )
+        sentences += _describe_winners(winners)
+    for verdict, statement in OTHER_VERDICTS.items():
+        count = verdicts.count(verdict)
+        if count:
+            sentences.append(f"{statement} {_share(count, total)}.")
+
+    learned_verdicts = []
+    for conclusion in conclusions:
+        if conclusion.learned_verdict is not None:
+            learned_verdicts.append(conclusion.learned_verdict)
+    if learned_verdicts and any(winner.is_hybrid for winner in winners):
+        win_count = learned_verdicts.count(LearningVerdict.PAYS)
+        open_count = learned_verdicts.count(LearningVerdict.OPEN)
+        sentences.append(
+            f"Purely learned models beat the solvers of their cost on {win_count} of "
+            f"{len(learned_verdicts)}; on {open_count} the question is open."
+        )
+    return sentences
+
+
+def _describe_winners(winners: Sequence[Conclusion]) -> list[str]:
+    """Return how many models by which learning pays are hybrids, and how many slow."""
+    hybrid_count = 0
+    slow_count = 0
     for winner in winners:
+        hybrid_count += winner.is_hybrid
         if winner.slowdown is not None and winner.slowdown > 1.0:
-            slower_count += 1
-    sentences = [
-        f"Learning pays on {len(winners)} of {count} data sets: there the most "
-        "accurate model has less error than every classical solver of lagbench that "
-        "costs no more per frame."
-    ]
+            slow_count += 1
+    sentences = []
     if hybrid_count:
         models = _count_models(hybrid_count, len(winners))
         sentences.append(
             f"{models} hybrid: a classical solver with a few learned numbers."
         )
-    if slower_count:
-        models = _count_models(slower_count, len(winners))
+    if slow_count:
+        models = _count_models(slow_count, len(winners))
         sentences.append(f"{models} slower than the simulator that made the data.")
-    learned_verdicts = [conclusion.learned_verdict for conclusion in conclusions]
-    learned_count = len(learned_verdicts) - learned_verdicts.count(None)
-    if hybrid_count and learned_count:
-        wins = learned_verdicts.count(LearningVerdict.PAYS)
-        open_count = learned_verdicts.count(LearningVerdict.OPEN)
-        sentences.append(
-            f"Purely learned models beat the solvers of their cost on {wins} of "
-            f"{learned_count}; on {open_count} the question is open."
-        )
     return sentences
+
+
+def _share(count: int, total: int) -> str:
+    """Return how many of the data sets, in words."""
+    if total == 1:
+        return "the only data set"
+    return f"{count} of {total} data sets"
 
 
 def _count_models(count: int, total: int) -> str:
