@@ -9,9 +9,11 @@ compresses away because two entries are alike. Every fifth has three seeds, some
 superseded, withdrawn or flagged, and their texts hold markup. The same call gives the
 same bytes. Exit code 1 if `lagbench leaderboard check` finds anything, a page built
 again with other bytes included, if the page of 150 entries has more than 2 MB, or if
-`build`, `show` or `check` takes more than 500 MB of memory or too much processor time:
-10 s with 150 entries and 60 s with 1,000, three times as much for `check`, which forms
-all scores of all entries again. Child processes count in the time, not in the memory.
+`build`, `show` or `check` takes more than 500 MB of memory or too much time: 10 s with
+150 entries and 60 s with 1,000, three times as much for `check`, which forms all scores
+of all entries again. It is the time that a user waits, so leave the machine idle. The
+processor time stands beside it, with that of child processes. The memory is that of the
+largest process.
 """
 
 from __future__ import annotations
@@ -65,7 +67,7 @@ from lagbench.submission.task_checks import frames_to_predict
 MOST_BYTES = 2_000_000
 MOST_ENTRIES_OF_A_PAGE = 150  # more may make a longer page
 MOST_MEMORY = 500_000_000  # of a command [bytes]
-# processor time of a command [s], up to that many entries and beyond
+# time of a command [s], up to that many entries and beyond
 MOST_SECONDS = 10.0
 MOST_SECONDS_BEYOND = 60.0
 MOST_TIMES_AS_LONG = {"build": 1.0, "show": 1.0, "check": 3.0}
@@ -73,14 +75,16 @@ MOST_TIMES_AS_LONG = {"build": 1.0, "show": 1.0, "check": 3.0}
 # The greatest memory that the system counts for children contains that of this process
 # before the child's program began, so the child states its own.
 COMMAND_WITH_MEMORY = """
-import re, runpy, sys
+import re, resource, runpy, sys
 from pathlib import Path
 
 try:
     runpy.run_module("lagbench", run_name="__main__", alter_sys=True)
 finally:
     status = Path("/proc/self/status").read_text()
-    print(re.search(r"Vm(?:HWM|RSS):\\s+(\\d+) kB", status)[1], file=sys.stderr)
+    own = int(re.search(r"Vm(?:HWM|RSS):\\s+(\\d+) kB", status)[1])
+    of_workers = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    print(max(own, of_workers), file=sys.stderr)
 """
 SEEDS = 3
 FIRST_DATE = datetime.date(2026, 1, 1)
@@ -147,11 +151,11 @@ def _measure(target: Path, entries: int, tabs: int | None) -> int:
     is_fast = True
     for command, (cpu, wall) in times.items():
         limit = MOST_TIMES_AS_LONG[command] * most_seconds
-        if cpu > limit:
+        if wall > limit:
             is_fast = False
         print(
-            f"{command:12s} {cpu:.1f} s of processor time (limit {limit:.0f} s), "
-            f"{wall:.1f} s, {format_bytes(memory[command])}"
+            f"{command:12s} {wall:.1f} s (limit {limit:.0f} s), {cpu:.1f} s of "
+            f"processor time, {format_bytes(memory[command])}"
         )
     print(f"memory       limit {format_bytes(MOST_MEMORY)}")
     print(f"findings     {len(findings)}")

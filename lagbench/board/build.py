@@ -53,6 +53,9 @@ from lagbench.scoring.skill import (
     seconds_where_measured,
 )
 from lagbench.submission.task_checks import frames_to_predict
+from lagbench.work.machine import available_cores
+from lagbench.work.pool import Report
+from lagbench.work.run import run_all
 
 from .columns import PRESETS
 from .entry import Entry, EntryCost, Status, Verification
@@ -132,6 +135,11 @@ CURVE_FRAMES = 60  # most frames of a curve
 MAP_FRAMES = 4  # most frames of vorticity maps and histograms
 MAP_NODES = 20  # most nodes of a map, a side
 RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
+
+FEWEST_FOR_WORKERS = 40
+"""Entries from which on tabs are formed in worker processes: a worker takes a second to
+start, an entry a tenth to form.
+"""
 
 PICTURED_METHODS = 80
 """Most methods on all tabs together that have maps, histograms and a film: two thirds
@@ -249,34 +257,31 @@ def collect(
     verified = read_verified(board)
     failed_gates = read_failed_gates(board)
     shift = read_shift(board)
-    tabs: list[Tab] = []
-    empty = []
+    sources = {}
     for split, description in full_registry.splits.items():
         for name in description.sizes:
             data_set = (split, name)
             if only is not None and data_set not in only:
                 continue
-            size = full_registry.size(split, name)
-            methods, truth = _read_methods(
-                board, paths.get(data_set, ()), full_registry, scope
+            sources[data_set] = TabSource(
+                board=board,
+                paths=tuple(paths.get(data_set, ())),
+                size=full_registry.size(split, name),
+                title=description.title,
+                registry=full_registry,
+                scope=scope,
+                verified=verified,
+                failed_gates=failed_gates,
+                shift=shift,
             )
-            if truth is not None:
-                tab = _make_tab(
-                    size,
-                    description.title,
-                    methods=methods,
-                    truth=truth,
-                    scope=scope,
-                    references=read_references(board, size),
-                    verified=verified,
-                    failed_gates=failed_gates,
-                    shift=shift,
-                )
-                # Pictures are let go tab by tab: those of all entries take more memory
-                # than everything else.
-                tabs = picture_first([*tabs, tab], PICTURED_METHODS)
-            elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
-                empty.append(data_set)
+    formed = _form_tabs(sources)
+    tabs = picture_first(list(formed.values()), PICTURED_METHODS)
+    empty = []
+    for data_set, source in sources.items():
+        is_for_trial = source.size.name == TRIAL
+        is_ranked = len(source.size.subsets["test"]) >= FEWEST_SCENARIOS
+        if data_set not in formed and is_ranked and not is_for_trial:
+            empty.append(data_set)
 
     shown: set[str] = set()
     for tab in tabs:
@@ -287,6 +292,68 @@ def collect(
         if name in shown:
             metrics[name] = metric
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TabSource:
+    """Where the tab of a data set comes from."""
+
+    board: Folder
+    paths: Sequence[Path]  # entries, in the leaderboard's folder
+    size: Size
+    title: str
+    registry: Registry
+    scope: Scope
+    verified: Mapping[str, Verification]
+    failed_gates: Mapping[str, tuple[str, ...]]
+    shift: Mapping[str, ShiftScores]
+
+
+def _form_tabs(
+    sources: Mapping[tuple[str, str], TabSource],
+) -> dict[tuple[str, str], Tab]:
+    """Return the tabs of all data sets with entries of this task.
+
+    The tabs of a large leaderboard are formed side by side, one per core.
+    """
+    jobs = {}
+    for data_set, source in sources.items():
+        if source.paths:
+            jobs["/".join(data_set)] = source
+    entry_count = sum(len(source.paths) for source in jobs.values())
+    workers = 1
+    if entry_count >= FEWEST_FOR_WORKERS:
+        workers = available_cores()
+    tabs = {}
+    formed = run_all(_form_tab, jobs, workers=workers)
+    for source, tab in zip(jobs.values(), formed, strict=True):
+        if tab is not None:
+            tabs[source.size.split, source.size.name] = tab
+    return tabs
+
+
+def _form_tab(source: TabSource, _report: Report) -> Tab | None:
+    """Return the tab of a data set; None where no entry has scores of this task."""
+    methods, truth = _read_methods(
+        source.board, source.paths, source.registry, source.scope
+    )
+    if truth is None:
+        return None
+    tab = _make_tab(
+        source.size,
+        source.title,
+        methods=methods,
+        truth=truth,
+        scope=source.scope,
+        references=read_references(source.board, source.size),
+        verified=source.verified,
+        failed_gates=source.failed_gates,
+        shift=source.shift,
+    )
+    # Pictures are let go tab by tab: those of all entries take more memory than
+    # everything else.
+    (pictured,) = picture_first([tab], PICTURED_METHODS)
+    return pictured
 
 
 def _require_described(

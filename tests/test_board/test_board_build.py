@@ -19,6 +19,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from sample_boards import make_entry
 
+from lagbench.board import build as board_build
 from lagbench.board.build import (
     CURVE_FRAMES,
     RESIDUAL_BINS,
@@ -53,6 +54,8 @@ from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.score_layout import SUBMISSION
+
+COMMITTED = Path(__file__).parents[2] / "leaderboard"
 
 
 @pytest.fixture(scope="module")
@@ -415,6 +418,48 @@ def test_variants_follow_from_names() -> None:
         "gns-without-noise": "gns",
         "gns-wide-2": "gns",
     }
+
+
+TWO_DATA_SETS = ("poiseuille", "decaying-vortices")
+
+
+@pytest.fixture
+def two_tabs(tmp_path: Path) -> Path:
+    """A copy of two data sets of the committed leaderboard."""
+    for folder in ("submissions", "scores"):
+        for split in TWO_DATA_SETS:
+            shutil.copytree(COMMITTED / folder / split, tmp_path / folder / split)
+    return tmp_path
+
+
+def test_workers_form_the_same_page(
+    two_tabs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tabs of worker processes give the bytes of those that are formed here."""
+    here = build(two_tabs)
+    page_of_here = here.page.read_bytes()
+    here.page.unlink()
+    started = []
+    monkeypatch.setattr(board_build, "FEWEST_FOR_WORKERS", 1)
+    monkeypatch.setattr(board_build, "available_cores", lambda: started.append(2) or 2)
+    by_workers = build(two_tabs)
+    assert started
+    assert by_workers.tabs == len(TWO_DATA_SETS)
+    assert by_workers.page.read_bytes() == page_of_here
+
+
+def test_a_worker_names_a_damaged_score_file(
+    two_tabs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error in a worker process is that of this process."""
+    damaged = next(two_tabs.glob("scores/poiseuille/*/*.nc"))
+    damaged.write_bytes(damaged.read_bytes()[:5000])
+    monkeypatch.setattr(board_build, "FEWEST_FOR_WORKERS", 1)
+    monkeypatch.setattr(board_build, "available_cores", lambda: 2)
+    with pytest.raises(UnreadableFileError) as caught:
+        build(two_tabs)
+    assert caught.value.where == str(damaged)
+    assert not (two_tabs / "index.html").exists()
 
 
 def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
