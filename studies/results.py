@@ -92,10 +92,13 @@ HOW_TO_READ = """\
   ([references](references.md)).
 - **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
   perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
-- **Cells** have the mean over the test scenarios, with a 95 % bootstrap interval over
-  scenarios. If a model has several seeds, the number after ± is the standard
-  deviation over the seeds. The leaderboard resamples the seeds too, so its intervals
-  are wider for a model with few seeds.
+- **Tables of scores** contain models and reference predictors. A cell has the mean over
+  the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
+  several seeds, the number after ± is the standard deviation over the seeds. The
+  leaderboard resamples the seeds too, so its intervals are wider for a model with few
+  seeds. "1440 undefined" means that the metric is undefined in 1440 frames. The column
+  `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
+  seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
   and seeds. Two models may use the same weights, for example with and without mirror
@@ -179,9 +182,10 @@ lagbench submit predictions.nc --from meta.yaml
 and figures of a size. If you interrupt the command, the same command continues.
 `lagbench submit` makes entries from the trained models.
 
-Some results have no entry. They come from two files in a folder that `--studies` or
-`--runs` names, in its subfolder `<split>/<size>/`. `python -m studies.thesis` writes
-`mlp_studies.json` into the folder of runs. `var_protocol.json` is the output of
+Some results have no entry. They come from two files in the subfolder `<split>/<size>/`
+of a folder. The option `--studies` or `--runs` names this folder.
+`python -m studies.thesis` writes `mlp_studies.json` into the folder of runs.
+`var_protocol.json` is the output of
 `python -m studies.thesis.var_protocol --size mini --json`. Neither file is committed,
 so this page does not show such results.
 
