@@ -66,9 +66,9 @@ trainings, and one chapter per data set. A chapter has all models, with the numb
 the thesis beside ours."""
 
 SUMMARY_NOTE = """\
-A row compares the best learned model, or the best hybrid, of a data set with the best
-predictors that are not trained. A hybrid is a solver with a learned part. A lower score
-is better.
+Each row compares the best learned model, or the best hybrid, of a data set with the
+best predictors that are not trained. A hybrid is a solver with a learned part. A lower
+score is better.
 
 - The time in brackets after a score is the processor time of one frame on one core, on
   the machine of the reference predictors. Learned models were measured on another
@@ -77,11 +77,12 @@ is better.
   other machine.
 - `skill` is 1 - (score of the model) / (score of the best naive baseline).
 - `against_classical` is (score of the model) / (score of the best classical solver that
-  costs no more per frame). The brackets contain the 95 % interval. The name of the
-  solver follows. If the whole interval is below 1, [learning pays](glossary.md).
-- Some runs timed the model and the solvers together (`leaderboard/verified.yaml`). If
-  there is such a run, `against_classical` uses its times. The leaderboard uses the same
-  times."""
+  costs no more per frame than the model). The brackets contain the 95 % interval. The
+  name of the solver follows. If the whole interval is below 1,
+  [learning pays](glossary.md).
+- If one run timed the model and the solvers together (`leaderboard/verified.yaml`),
+  `against_classical` uses the times of this run, as the leaderboard does. They may
+  differ from the times in brackets."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -91,10 +92,13 @@ HOW_TO_READ = """\
   ([references](references.md)).
 - **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
   perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
-- **Cells** have the mean over the test scenarios, with a 95 % bootstrap interval over
-  scenarios. If a model has several seeds, the number after ± is the standard
-  deviation over the seeds. The leaderboard resamples the seeds too, so its intervals
-  are wider for a model with few seeds.
+- **Tables of scores** contain models and reference predictors. A cell has the mean over
+  the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
+  several seeds, the number after ± is the standard deviation over the seeds. The
+  leaderboard resamples the seeds too, so its intervals are wider for a model with few
+  seeds. "1440 undefined" means that the metric is undefined in 1440 frames. The column
+  `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
+  seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
   and seeds. Two models may use the same weights, for example with and without mirror
@@ -107,22 +111,26 @@ HOW_TO_READ = """\
   along an axis. So at `mini` compare only the order of the models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
   lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
-- **Comparisons** have two models. `means` and `seeds` have two numbers, first that of
-  the first model. `lead` is the difference of the means in the units of the metric. It
-  is positive if the first model is better. `won` is the number of scenarios in which
-  the first model is better.
+- **Comparisons** have two models, *first* and *second*. `where` is the data set. The
+  first number of `means` and of `seeds` belongs to the first model, the second number
+  to the second model. `lead` is the difference of the means in the units of the
+  metric. It is positive if the first model is better. `won` is the number of scenarios
+  in which the first model is better. The last column states whether the first model is
+  better or worse.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
 
 CLAIMS_NOTE = """\
-The table has one question per row, and one answer per data set. The answers use the
-ranking metric over the horizon:
+The table has one question per row, and one answer per data set. Tables, figures and
+sections in the questions are those of the thesis. The answers use the ranking metric
+over the horizon:
 
 - "Yes" and "better" mean significantly better at 5 %. "No" and "worse" mean
   significantly worse. "Open" means that the test finds no difference.
 - "Ahead of 3 of 5" means that the mean is better than the means of three of five
-  models.
+  models. "Better than 2, worse than 1" counts the significant differences.
+- "3 of 5 compared" means that two of the five other models have no entry that counts.
 - "These weights" means that a model has fewer than three trainings. Then the answer is
   about these weights, not about the methods. For a fit without random numbers one
   training is enough.
@@ -132,6 +140,10 @@ The answers compare two models over the seeds that both have, or else over all s
 They leave out models that fail a [gate](baselines.md#gates), and superseded and
 withdrawn entries. If an operator has an entry with the recipe `pushforward`, the
 answers use this entry."""
+
+MISSING_NOTE = """\
+These models are missing on this page. Semicolons separate their names. If a line has a
+command, this command trains the models. Then `lagbench submit` makes the entries."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer
@@ -143,16 +155,17 @@ The three validation columns show the first seed. They have the lowest validatio
 in the first quarter, the first half and all of the steps. `validated` is the metric of
 this error. The last column shows how much the error decreased in the second half of the
 steps. If it decreased by more than 2 %, the training has not converged. Hours do not
-include validations. (The first trainings of NeuralMPM are an exception.) If a training
-started from the weights of earlier trainings, steps, epochs and hours include these."""
+include validations, except in the first trainings of NeuralMPM. If a training started
+from the weights of earlier trainings, its steps, epochs and hours include the earlier
+trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
-from the recipe. `none` means that no option differs. If the seeds have different
-values, a slash separates the values, in the order of the seeds. If there is no record
-of the training, `recipe` and `changed` come from the entry. The speed-up is the time of
-our solver for a frame, on one core, divided by the time of the model on the same
-machine. Hours do not include validations."""
+from the recipe. `none` means that no option differs. If the seeds of a model have
+different values, slashes separate the values, in the order of the seeds. If there is
+no record of the training, `recipe` and `changed` come from the entry. The speed-up is
+the time of our solver for a frame, on one core, divided by the time of the model on the
+same machine. Hours do not include validations."""
 
 COMMANDS = """\
 ## How to make these results again
@@ -166,14 +179,15 @@ lagbench submit predictions.nc --from meta.yaml
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
-and figures of a size. If you interrupt it, the same command continues.
-`lagbench submit` makes entries from its runs.
+and figures of a size. If you interrupt the command, the same command continues.
+`lagbench submit` makes entries from the trained models.
 
-Results without an entry come from two files in `<split>/<size>/` of a folder.
-`--studies` or `--runs` names this folder. `python -m studies.thesis` writes
-`mlp_studies.json` into the folder of runs. `var_protocol.json` is the output of
-`python -m studies.thesis.var_protocol --size mini --json`. None of these files is
-committed, so this page does not show such results.
+Some results have no entry. They come from two files in the subfolder `<split>/<size>/`
+of a folder. The option `--studies` or `--runs` names this folder.
+`python -m studies.thesis` writes `mlp_studies.json` into the folder of runs.
+`var_protocol.json` is the output of
+`python -m studies.thesis.var_protocol --size mini --json`. Neither file is committed,
+so this page does not show such results.
 
 A variant is a model with other options, with another recipe, or with another way of
 prediction:"""
@@ -216,6 +230,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
         COMMANDS,
         "\n".join(variants),
         "## Missing",
+        MISSING_NOTE,
         "\n".join(missing) or "Nothing.",
     ]
     return "\n\n".join(parts) + "\n"
@@ -360,17 +375,17 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
             missing.append(label(name))
 
     if unscored:
-        names = ", ".join(unscored)
+        names = "; ".join(unscored)
         yield (
-            f"- {results.where}: {names} were trained, but have no active entry "
-            "([reason](baselines.md#gates))."
+            f"- {results.where}: trained, but without an active entry "
+            f"([reason](baselines.md#gates)): {names}."
         )
     if missing:
-        names = ", ".join(missing)
+        names = "; ".join(missing)
         if len(missing) == len(expected):
             names = "all models of the thesis, and NeuralMPM trained at this size"
         command = f"python -m studies.thesis --size {results.size.name} --split {split}"
-        yield f"- {results.where}: {names}: `{command}`, then `lagbench submit`."
+        yield f"- {results.where}: without an entry, `{command}`: {names}."
     if results.stale:
         count = len(results.stale)
         yield f"- {results.where}: {count} score files belong to other data."

@@ -202,7 +202,7 @@ LEADERBOARD_COMMANDS = (
     CommandEntry(
         name="shift",
         target="leaderboard:shift_command",
-        summary="Score the models of entries on shift, which lies outside train.",
+        summary="Score models of entries on shift, scenarios unlike those of train.",
         example="leaderboard shift cavity/mini/gns",
     ),
     CommandEntry(

@@ -40,16 +40,16 @@ def export_command(
         bool | None,
         option(
             "--from-walls/--unit-box",
-            "For lagrangebench-h5: measure positions from the lower walls (the default "
-            "for full boxes), or from the corner of the unit box.",
+            "For lagrangebench-h5: measure positions from the lower walls or from the "
+            "corner of the unit box. Default in full boxes: the lower walls.",
         ),
     ] = None,
     wall_particles: Annotated[
         bool,
         option(
             "--wall-particles",
-            "Add particles that move with the walls; only for splits with four walls "
-            "in two dimensions that fluid fills.",
+            "Add particles that move with the walls; only for two-dimensional full "
+            "boxes with four walls.",
         ),
     ] = False,
     overwrite: Annotated[

@@ -302,7 +302,7 @@ def reproduce_command(
     ] = False,
     no_costs: Annotated[bool, option("--no-costs", "Measure no costs.")] = False,
     again: Annotated[
-        bool, option("--again", "Run models again that have a recorded result.")
+        bool, option("--again", "Also run models that have a recorded result.")
     ] = False,
     recording: Annotated[
         bool, option("--record/--no-record", "Write the result to verified.yaml.")
@@ -427,7 +427,7 @@ def shift_command(
         str | None, option("--size NAME", "With --all: entries of this size only.")
     ] = None,
     again: Annotated[
-        bool, option("--again", "Run models again that have a recorded result.")
+        bool, option("--again", "Also run models that have a recorded result.")
     ] = False,
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
@@ -437,7 +437,7 @@ def shift_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Score the models of entries on shift, which lies outside train.
+    """Score models of entries on shift, scenarios unlike those of train.
 
     The models predict the subset, and the scores go to shift.yaml.
 

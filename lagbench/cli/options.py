@@ -96,11 +96,14 @@ FoundBoardOption = Annotated[
     Path | None,
     option(
         "--board FOLDER",
-        "Folder of the leaderboard; by default leaderboard here, or else in the clone.",
+        "Folder of the leaderboard; by default ./leaderboard, or else the clone's.",
     ),
 ]
 ScoredSubsetOption = Annotated[
-    str, option("--subset NAME", "test, or shift, which lies outside train.")
+    str,
+    option(
+        "--subset NAME", "test, or shift, whose scenarios are unlike those of train."
+    ),
 ]
 OverwriteFlag = Annotated[bool, option("--overwrite", "Replace a file of that name.")]
 JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]

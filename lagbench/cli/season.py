@@ -69,8 +69,8 @@ def close_command(
         float | None,
         option(
             "--budget SECONDS",
-            "Limit of the processor time of one model on one data set, estimated from "
-            "its entry. Dearer models predict fewer scenarios, but at least four.",
+            "Greatest processor time of one model on one data set, estimated from its "
+            "entry. A slower model predicts fewer scenarios, at least four.",
             min=0.0,
         ),
     ] = None,
@@ -181,7 +181,7 @@ def _commands_after_close(name: str, board: Path) -> str:
 def run_command(
     name: SeasonArgument,
     again: Annotated[
-        bool, option("--again", "Run models again that an earlier run has scored.")
+        bool, option("--again", "Also run models that an earlier run has scored.")
     ] = False,
     check: Annotated[
         bool,

@@ -37,7 +37,7 @@ def submit_command(
         option(
             "--from FILE",
             "YAML file that describes the method, see docs/submitting.md; other "
-            "options win.",
+            "options override it.",
         ),
     ] = None,
     method: Annotated[

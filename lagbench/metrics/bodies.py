@@ -176,7 +176,7 @@ METRICS = (
     ),
     *_body_metrics(
         connectivity,
-        "Share of first neighbours within twice their distance",
+        "Share of first neighbours that stay within twice their distance",
         unit="1",
         direction=Direction.HIGHER,
         perfect=1.0,

@@ -62,7 +62,7 @@ def energy_predicted(pair: FramePair) -> float:
     of=ENERGIES,
 )
 def energy_ratio(predicted: Floats, true: Floats) -> Floats:
-    """Predicted over true kinetic energy where the truth has 1 % of its peak.
+    """Predicted / true kinetic energy, in frames with at least 1 % of the true peak.
 
     Undefined in other frames: beside a truth at rest any motion is a ratio without
     bounds, and one such frame, before a dam breaks or after all has settled, would
@@ -75,13 +75,13 @@ def energy_ratio(predicted: Floats, true: Floats) -> Floats:
 
 @metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention(pair: FramePair) -> float:
-    """Kinetic energy of the prediction over that of the last given frame."""
+    """Kinetic energy of the prediction, divided by that of the last given frame."""
     return _retained_share(pair.prediction)
 
 
 @metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention_true(pair: FramePair) -> float:
-    """Kinetic energy of the truth over that of the last given frame."""
+    """Kinetic energy of the truth, divided by that of the last given frame."""
     return _retained_share(pair.truth)
 
 
@@ -95,7 +95,8 @@ def _retained_share(snapshot: Snapshot) -> float:
 
 @_error(source="Eq. 5.11", of=ENERGIES)
 def energy_error(predicted: Floats, true: Floats) -> Floats:
-    """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
+    """Absolute error of kinetic energy, divided by the larger of true energy and 1e-3
+    of its peak.
 
     NaN where the truth rests in all frames. It forgives a flow that is wrong but as
     fast.
@@ -140,13 +141,15 @@ def momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length/frame", source="section 5.2", least=0.0)
 def momentum_scale(pair: FramePair) -> float:
-    """The truth's sum of speeds that scales momentum_error."""
+    """Sum of the true speeds; divides the error in momentum_error."""
     return float(pair.truth.speeds.sum())
 
 
 @_error(source="section 5.2", of=("momentum_gap", "momentum_scale"))
 def momentum_error(gap: Floats, scale: Floats) -> Floats:
-    """Error of total momentum over its scale (at least 1e-3 of its greatest)."""
+    """Error of total momentum, divided by the larger of momentum_scale and 1e-3 of its
+    peak.
+    """
     return scaled_error(gap, scale)
 
 
@@ -159,7 +162,7 @@ def angular_momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_scale(pair: FramePair) -> float:
-    """The truth's sum of arm times speed that scales angular_momentum_error."""
+    """Sum of true arm times speed; divides the error in angular_momentum_error."""
     return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)
 
 
@@ -168,7 +171,9 @@ def angular_momentum_scale(pair: FramePair) -> float:
     of=("angular_momentum_gap", "angular_momentum_scale"),
 )
 def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
-    """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
+    """Error of angular momentum, divided by the larger of angular_momentum_scale and
+    1e-3 of its peak.
+    """
     return scaled_error(gap, scale)
 
 

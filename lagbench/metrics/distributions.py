@@ -104,7 +104,7 @@ _distance = partial(metric, unit="nat", direction=Direction.LOWER, defined=has_r
 
 @_distance(source="Eqs. 5.23-5.25")
 def vorticity_kl(pair: FramePair) -> float:
-    """Divergence of vorticity magnitudes per node.
+    """Kullback-Leibler divergence of vorticity magnitudes over the nodes.
 
     The thesis's models range from 0.128 to 0.391 at frame 54 of the cavity (Table 5.5).
     """
@@ -113,13 +113,13 @@ def vorticity_kl(pair: FramePair) -> float:
 
 @_distance(source="Fig. 5.12")
 def vorticity_kl_hist(pair: FramePair) -> float:
-    """Divergence of vorticity histograms, 64 bins."""
+    """Kullback-Leibler divergence of vorticity histograms, 64 bins."""
     return _histogram_kl(pair.true_vorticity, pair.predicted_vorticity)
 
 
 @_distance(source="Fig. 5.12")
 def vorticity_kl_hist_abs(pair: FramePair) -> float:
-    """Divergence of the histograms of vorticity magnitudes."""
+    """Kullback-Leibler divergence of the histograms of vorticity magnitudes."""
     return _histogram_kl(np.abs(pair.true_vorticity), np.abs(pair.predicted_vorticity))
 
 
@@ -220,7 +220,7 @@ def _at_slow_frames_of_full_box(pair: FramePair) -> bool:
     defined=enough_nodes,
 )
 def spectrum_error(pair: FramePair) -> float:
-    """RMS over shells of wave numbers of log10 of predicted over true kinetic energy.
+    """RMS of log10(predicted / true kinetic energy) over shells of wave numbers.
 
     Decades: 0.3 is a factor of two in every shell. Blind to where the eddies are; sees
     smoothing and noise at once. A ratio counts at most :data:`DECADES`, a prediction at

@@ -103,8 +103,8 @@ def at_cloud_frames(pair: FramePair) -> bool:
 
 @_error(source="Bonneel et al. 2015, J. Math. Imaging Vis. 51", applies=at_cloud_frames)
 def cloud_distance(pair: FramePair) -> float:
-    """Sliced W2 of each material's cloud, by its share of particles, at every tenth
-    active frame.
+    """Sliced W2 of each material's cloud, weighted by particles, at every tenth active
+    frame.
 
     The identity of a particle does not count, its material does. A cloud that is
     shifted by s is |s| / sqrt(2) off; where the truth has come to rest nothing is
@@ -148,7 +148,7 @@ def sliced_w2(pair: FramePair) -> float:
     module="ot",
 )
 def sinkhorn_pot(pair: FramePair) -> float:
-    """Sinkhorn divergence by POT, regularisation 0.1: blurred and slow, optional."""
+    """Sinkhorn divergence by the library POT; regularisation 0.1 blurs it; optional."""
     box = pair.scenario.config.box
     return sinkhorn_divergence(pair.truth.position, pair.prediction.position, box)
 

@@ -134,8 +134,8 @@ def vorticity_square_true(pair: FramePair) -> float:
     over_frames=root_mean_square,
 )
 def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
-    """Vorticity RMSE over the scenario's RMS vorticity: no scenario counts more for
-    being faster.
+    """Vorticity RMSE divided by the RMS vorticity of the scenario; so fast scenarios
+    do not count more.
 
     Per scenario ``sqrt(sum_f MSE(omega) / sum_f mean(omega_true^2))``. 0 is perfect, 1
     the error of a prediction at rest, sqrt(2) that of an unrelated flow of the same

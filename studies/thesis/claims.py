@@ -48,17 +48,18 @@ class Claim:
 
 
 _CLAIMS = {
-    "Does SuperGAT come first among the operators (Table 5.4: on the cavity "
-    "it does)?": Claim(
+    "Is SuperGAT the most accurate operator? (On the cavity it is, in Table "
+    "5.4.)": Claim(
         "supergat",
         tuple(name for name in OPERATORS if name != "supergat"),
         at_key_frame=("vorticity_mse",),
     ),
-    "Does SuperGAT's link loss help, at the same start and seeds?": Claim(
+    "Does the link loss of SuperGAT help, with the same initial weights and "
+    "seeds?": Claim(
         "supergat", ("supergat-unlinked",), at_key_frame=("vorticity_pearson",)
     ),
-    "Does the vorticity loss help (Fig. 5.5: it does), at the same budget "
-    "and seeds?": Claim(
+    "Does the vorticity loss help, with the same budget and seeds? (In Fig. 5.5 it "
+    "does.)": Claim(
         "gns",
         ("gns-novorticity",),
         metrics=("position_rmse", "energy_error"),
@@ -67,29 +68,28 @@ _CLAIMS = {
     "Is SuperGAT better with summed messages than without?": Claim(
         "supergat", ("supergat-unsummed",)
     ),
-    "Is MX attention better than SD (Eq. 5.27 has both)?": Claim(
-        "supergat", ("supergat-sd",)
-    ),
+    "Is SuperGAT better with MX attention than with scaled dot products (SD)? (Eq. "
+    "5.27 has both.)": Claim("supergat", ("supergat-sd",)),
     "Is acceleration a better target than velocity (section 5.9.3)?": Claim(
         "gns", ("gns-velocity",), at_key_frame=("vorticity_pearson",)
     ),
-    "Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?": Claim(
+    "Is L2 better than L1 as the norm of the loss? (The thesis chooses L2.)": Claim(
         "gns", ("gns-l1",)
     ),
-    "Does a weight of the vorticity loss ten times as large help?": Claim(
+    "Does a vorticity loss with ten times the weight help?": Claim(
         "gns-tenfold", ("gns",), at_key_frame=("vorticity_pearson",)
     ),
-    "Does a loss over three unrolled steps help (section 6.2), at the same "
+    "Does a loss over three unrolled steps help (section 6.2), with the same "
     "processor time?": Claim("gns-unrolled", ("gns",)),
-    "Graph or grid: is NeuralMPM better than every operator?": Claim(
+    "Is NeuralMPM, a network on a grid, better than every graph network?": Claim(
         "neuralmpm", OPERATORS
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials, with as many steps "
-    "or fewer?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
-    "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the "
-    "first frames?": Claim("neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")),
+    "Does NeuralMPM gain by one velocity grid for all materials, with no more "
+    "training steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
+    "Does NeuralMPM gain by conserved momentum, shorter bundles and more windows of "
+    "the first frames?": Claim("neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")),
     "Does NeuralMPM gain by shape matching and density projection?": Claim(
         "neuralmpm-projected", ("neuralmpm-conserving",)
     ),
@@ -100,16 +100,18 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does NeuralMPM with shape matching gain by grids for shape and density as fine "
-    "as those of the size full?": Claim(
+    "Does NeuralMPM with shape matching gain if its grids for shape and density are "
+    "as fine as at full?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),
-    "Does LSTM + MLP come first among the frame models (Table 4.8: it does)?": Claim(
+    "Is LSTM + MLP the most accurate frame model? (In Table 4.8 it is.)": Claim(
         "lstm-mlp", tuple(name for name in FRAME_MODELS if name != "lstm-mlp")
     ),
-    "Is standing still better than VAR(1) (section 4.8.3: its forecast "
-    "diverges)?": Claim("persistence", ("var",), metrics=("mse_end",)),
+    "Is persistence, in which nothing moves, better than VAR(1)? (In section 4.8.3 "
+    "the forecast of VAR(1) diverges.)": Claim(
+        "persistence", ("var",), metrics=("mse_end",)
+    ),
     "Is the best naive baseline better than the learned models?": Claim(""),
 }
 
