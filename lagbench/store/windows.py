@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.data.box import parse_obstacle
-from lagbench.data.contents import check_contents, registered_hash
+from lagbench.data.contents import check_contents
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
@@ -266,7 +266,7 @@ class FrameStore:
             frames=size.frame_count(scenario),
         )
         content_hash = _read_text(file, "content_sha256")
-        recorded_hash = registered_hash(size, scenario)
+        recorded_hash = size.registered_hash(scenario)
         if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
                 "a scenario file is not that of the registry",
