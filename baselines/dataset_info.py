@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lagbench.data.box import parse_obstacle
 from lagbench.data.layout import dataset_folder
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError

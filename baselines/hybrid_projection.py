@@ -36,8 +36,7 @@ from pydantic import Field
 from scipy.optimize import minimize
 from torch import Tensor
 
-from lagbench.data.box import Box
-from lagbench.data.obstacle import keep_outside
+from lagbench.data.box import Box, keep_outside
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UsageError

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lagbench.data.box import parse_obstacle
 from lagbench.data.local import locate
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError

@@ -10,6 +10,8 @@ content hash of a scenario is built from its values alone, in two levels::
 so that variables can be hashed side by side while frames arrive, and a damaged one can
 be named. Values are little-endian, in C order, with one zero and one NaN. The full
 definition is in docs/format.md.
+
+The file ``.verified.json`` of a data set notes the hashes that this machine computed.
 """
 
 from __future__ import annotations
@@ -17,14 +19,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.errors import DataError
+from lagbench.atomic import write_atomically
+from lagbench.errors import (
+    DataError,
+    UnreadableFileError,
+    WorkFailedError,
+    check_regular,
+)
+
+from .layout import NOTES_NAME
 
 HASHED_SUBSETS = ("train", "valid", "test")
 """Subsets that the data set hash covers."""
@@ -266,3 +277,134 @@ def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) 
     hashed = {subset: subsets[subset] for subset in HASHED_SUBSETS}
     whole = {"split": split, "size": size, "major": major, "subsets": hashed}
     return hashlib.sha256(canonical_json(whole)).hexdigest()
+
+
+# --- hashes that this machine has computed --------------------------------------------
+
+# Hashing the values of a large file takes seconds, and a manifest is a claim of whoever
+# wrote it. So this machine notes the files whose values it has hashed. A note counts
+# for that very file alone: nobody can set the time of its last change of any kind
+# (ctime), so notes that came with a copied or downloaded folder count for nothing.
+
+NOTES_LIMIT = 64 << 20
+"""Longest file of notes that is read [bytes]."""
+
+
+class _HashNote(NamedTuple):
+    """A file whose values were hashed."""
+
+    bytes: int
+    modified: int  # time of the last change of its bytes [ns]
+    changed: int  # time of the last change of any kind [ns]
+    file_sha256: str
+    content_sha256: str
+
+    @property
+    def stamp(self) -> tuple[int, int, int]:
+        """Length and times of the file."""
+        return self.bytes, self.modified, self.changed
+
+    def says(self, stamp: tuple[int, int, int], content_sha256: str) -> bool:
+        """Tell whether this is the note of a file with that stamp and content."""
+        return self.stamp == stamp and self.content_sha256 == content_sha256
+
+
+_read_in_process: dict[Path, _HashNote] = {}
+"""Files whose bytes this process has read.
+
+They are not read again while their times stay.
+"""
+
+
+def record_hashes(
+    folder: Path,
+    contents: Mapping[Path, str],
+    *,
+    file_hashes: Mapping[Path, str] | None = None,
+) -> None:
+    """Note content hashes of files that this machine has just hashed or written.
+
+    Where the folder cannot be written to, nothing is noted.
+
+    Args:
+        folder: folder of the data set.
+        contents: content hashes by path.
+        file_hashes: SHA-256 of the files' bytes by path, if they are known from before
+            the values were read. The bytes of all other files are read here.
+    """
+    if not contents:
+        return
+    known_file_hashes = file_hashes or {}
+    old_notes = _read_hash_notes(folder)
+    new_notes = {}
+    for path, content in contents.items():
+        stamp = _file_stamp(path)
+        name = _relative_name(path, folder)
+        old_note = old_notes.get(name)
+        if old_note is not None and old_note.says(stamp, content):
+            continue
+        # The stamp is from before the bytes are read: if the file changes meanwhile,
+        # its new stamp is not that of its note.
+        if path in known_file_hashes:
+            note = _HashNote(*stamp, known_file_hashes[path], content)
+        else:
+            note = _HashNote(*stamp, file_sha256(path), content)
+            _read_in_process[path] = note
+        new_notes[name] = note
+    if new_notes:
+        text = json.dumps(old_notes | new_notes, indent=1) + "\n"
+        with suppress(WorkFailedError):
+            write_atomically(folder / NOTES_NAME, text.encode())
+
+
+def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
+    """Return a function from a file to its noted content hash and SHA-256.
+
+    The function returns None for a file that was not hashed here or has changed since.
+    It reads the bytes once in a process; values are not unpacked.
+    """
+    notes = _read_hash_notes(folder)
+
+    def find_hashes(path: Path) -> tuple[str, str] | None:
+        note = notes.get(_relative_name(path, folder))
+        if note is None or note.stamp != _file_stamp(path):
+            return None
+        if _read_in_process.get(path) != note:
+            if file_sha256(path) != note.file_sha256:
+                return None
+            _read_in_process[path] = note
+        return note.content_sha256, note.file_sha256
+
+    return find_hashes
+
+
+def _read_hash_notes(folder: Path) -> dict[str, _HashNote]:
+    """Return the notes of ``.verified.json`` by the files' relative names.
+
+    A file that is missing or damaged has no notes: that costs another hashing only.
+    """
+    path = folder / NOTES_NAME
+    notes = {}
+    try:
+        check_regular(path, longest=NOTES_LIMIT)
+        for name, row in json.loads(path.read_bytes()).items():
+            notes[name] = _HashNote(*row)
+    except (
+        UnreadableFileError,
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ):
+        return {}
+    return notes
+
+
+def _file_stamp(path: Path) -> tuple[int, int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _relative_name(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix()

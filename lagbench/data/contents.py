@@ -7,9 +7,10 @@ from pathlib import Path
 
 from lagbench.errors import DataError
 
+from .checksums import load_recorded_hashes, record_hashes
 from .layout import quote_root
 from .local import suggest_repair
-from .manifest import Manifest, load_recorded_hashes, read_or_empty, record_hashes
+from .manifest import Manifest, read_or_empty
 from .registry import Size
 from .scenario import check_scenario
 
@@ -53,13 +54,6 @@ def check_contents(size: Size, root: Path, scenarios: Iterable[int]) -> None:
     record_hashes(folder, new_hashes)
 
 
-def registered_hash(size: Size, scenario: int) -> str:
-    """Return the content hash in datasets.yaml or its first digits, or nothing."""
-    if size.measured is None:
-        return ""
-    return size.measured.scenario_sha256.get(scenario, "")
-
-
 def _content_hash(
     path: Path,
     noted_hash: Callable[[Path], tuple[str, str] | None],
@@ -99,7 +93,7 @@ def _expected_hash(size: Size, scenario: int, manifest: Manifest | None) -> str:
         entry = manifest.entry(scenario)
         if entry is not None:
             return entry.content_sha256
-    return registered_hash(size, scenario)
+    return size.registered_hash(scenario)
 
 
 def _hint_for_damage(size: Size, root: Path, subset: str) -> str:

@@ -2,18 +2,15 @@
 
 It stands beside the subsets, is written last, and is itself not hashed. A generation of
 some scenarios leaves ``complete: false``; a later one merges its files into it.
-
-``.verified.json`` beside it: the hashes that this machine computed.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import (
     BaseModel,
@@ -26,25 +23,20 @@ from pydantic import (
 )
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import (
-    DataError,
-    UnreadableFileError,
-    WorkFailedError,
-    check_regular,
-)
+from lagbench.errors import DataError, UnreadableFileError, check_regular
 from lagbench.work.machine import may_differ
 
 from .checksums import (
     HASHED_SUBSETS,
     dataset_hash,
     file_sha256,
+    record_hashes,
     round_digits,
     subset_hash,
 )
 from .field_errors import describe_expectation, describe_input
 from .layout import (
     MANIFEST_NAME,
-    NOTES_NAME,
     ScenarioKey,
     dataset_folder,
     major_of,
@@ -361,81 +353,6 @@ def write_manifest(root: Path, manifest: Manifest) -> Path:
     return path
 
 
-# --- hashes that this machine has computed --------------------------------------------
-
-# Hashing the values of a large file takes seconds, and a manifest is a claim of whoever
-# wrote it. So this machine notes the files whose values it has hashed. A note counts
-# for that very file alone: nobody can set the time of its last change of any kind
-# (ctime), so notes that came with a copied or downloaded folder count for nothing.
-
-
-class _HashNote(NamedTuple):
-    """A file whose values were hashed."""
-
-    bytes: int
-    modified: int  # time of the last change of its bytes [ns]
-    changed: int  # time of the last change of any kind [ns]
-    file_sha256: str
-    content_sha256: str
-
-    @property
-    def stamp(self) -> tuple[int, int, int]:
-        """Length and times of the file."""
-        return self.bytes, self.modified, self.changed
-
-    def says(self, stamp: tuple[int, int, int], content_sha256: str) -> bool:
-        """Tell whether this is the note of a file with that stamp and content."""
-        return self.stamp == stamp and self.content_sha256 == content_sha256
-
-
-_read_in_process: dict[Path, _HashNote] = {}
-"""Files whose bytes this process has read.
-
-They are not read again while their times stay.
-"""
-
-
-def record_hashes(
-    folder: Path,
-    contents: Mapping[Path, str],
-    *,
-    file_hashes: Mapping[Path, str] | None = None,
-) -> None:
-    """Note content hashes of files that this machine has just hashed or written.
-
-    Where the folder cannot be written to, nothing is noted.
-
-    Args:
-        folder: folder of the data set.
-        contents: content hashes by path.
-        file_hashes: SHA-256 of the files' bytes by path, if they are known from before
-            the values were read. The bytes of all other files are read here.
-    """
-    if not contents:
-        return
-    known_file_hashes = file_hashes or {}
-    old_notes = _read_hash_notes(folder)
-    new_notes = {}
-    for path, content in contents.items():
-        stamp = _file_stamp(path)
-        name = _relative_name(path, folder)
-        old_note = old_notes.get(name)
-        if old_note is not None and old_note.says(stamp, content):
-            continue
-        # The stamp is from before the bytes are read: if the file changes meanwhile,
-        # its new stamp is not that of its note.
-        if path in known_file_hashes:
-            note = _HashNote(*stamp, known_file_hashes[path], content)
-        else:
-            note = _HashNote(*stamp, file_sha256(path), content)
-            _read_in_process[path] = note
-        new_notes[name] = note
-    if new_notes:
-        text = json.dumps(old_notes | new_notes, indent=1) + "\n"
-        with suppress(WorkFailedError):
-            write_atomically(folder / NOTES_NAME, text.encode())
-
-
 def record_entry_hashes(folder: Path, entries: Iterable[FileEntry]) -> None:
     """Note files by their entries, which this machine has just made from them."""
     contents = {}
@@ -445,56 +362,3 @@ def record_entry_hashes(folder: Path, entries: Iterable[FileEntry]) -> None:
         contents[path] = entry.content_sha256
         file_hashes[path] = entry.file_sha256
     record_hashes(folder, contents, file_hashes=file_hashes)
-
-
-def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
-    """Return a function from a file to its noted content hash and SHA-256.
-
-    The function returns None for a file that was not hashed here or has changed since.
-    It reads the bytes once in a process; values are not unpacked.
-    """
-    notes = _read_hash_notes(folder)
-
-    def find_hashes(path: Path) -> tuple[str, str] | None:
-        note = notes.get(_relative_name(path, folder))
-        if note is None or note.stamp != _file_stamp(path):
-            return None
-        if _read_in_process.get(path) != note:
-            if file_sha256(path) != note.file_sha256:
-                return None
-            _read_in_process[path] = note
-        return note.content_sha256, note.file_sha256
-
-    return find_hashes
-
-
-def _read_hash_notes(folder: Path) -> dict[str, _HashNote]:
-    """Return the notes of ``.verified.json`` by the files' relative names.
-
-    A file that is missing or damaged has no notes: that costs another hashing only.
-    """
-    path = folder / NOTES_NAME
-    notes = {}
-    try:
-        check_regular(path, longest=MANIFEST_LIMIT)
-        for name, row in json.loads(path.read_bytes()).items():
-            notes[name] = _HashNote(*row)
-    except (
-        UnreadableFileError,
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ):
-        return {}
-    return notes
-
-
-def _file_stamp(path: Path) -> tuple[int, int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns
-
-
-def _relative_name(path: Path, folder: Path) -> str:
-    return path.relative_to(folder).as_posix()

@@ -422,6 +422,12 @@ class Size(BaseModel):
         """Return the file of a scenario below a root folder."""
         return scenario_path(root, self.key(scenario))
 
+    def registered_hash(self, scenario: int) -> str:
+        """Return the content hash in datasets.yaml or its first digits, or nothing."""
+        if self.measured is None:
+            return ""
+        return self.measured.scenario_sha256.get(scenario, "")
+
     def frame_count(self, scenario: int) -> int:
         """Return how many frames a scenario records."""
         if isinstance(self.frames, int):

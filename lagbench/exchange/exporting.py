@@ -464,9 +464,7 @@ def _frames_by_subset(size: Size, root: Path) -> dict[str, dict[Path, int]]:
     for scenario, path in sorted(scenario_files(size, root, HASHED_SUBSETS).items()):
         with read_scenario(path) as file:
             header = file.header
-        expected_hash = ""
-        if size.measured:
-            expected_hash = size.measured.scenario_sha256.get(scenario, "")
+        expected_hash = size.registered_hash(scenario)
         is_right_scenario = (
             header.key.major == size.major and header.key.scenario == scenario
         )

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
+from lagbench.data.box import parse_obstacle
 from lagbench.data.local import load_rooted_registry
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256, to_plain
+from lagbench.data.checksums import file_sha256, load_recorded_hashes, to_plain
 from lagbench.data.layout import (
     PICTURES,
     format_ids,
@@ -28,7 +28,6 @@ from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
-    load_recorded_hashes,
 )
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario

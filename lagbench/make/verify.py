@@ -19,11 +19,12 @@ from lagbench.data.checksums import (
     HASHED_SUBSETS,
     dataset_hash,
     file_sha256,
+    record_hashes,
     subset_hash,
 )
 from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, suggest_repair
-from lagbench.data.manifest import Manifest, read_manifest, record_hashes
+from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob

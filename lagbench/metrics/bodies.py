@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from .frame import ELASTIC, Floats, FramePair, Snapshot
-from .metric import Direction, Metric
+from .metric import Direction, Metric, has_material
 
 
 def rigid_residual(truth: Floats, prediction: Floats) -> float:
@@ -117,17 +118,13 @@ class OverBodies:
     statistic: Callable[[FramePair, str], float]
     materials: tuple[str, ...]  # of the bodies that count
 
-    def _present(self, pair: FramePair) -> list[str]:
-        return [name for name in self.materials if name in pair.scenario.members]
-
     def __call__(self, pair: FramePair) -> float:
         """Return the mean over the bodies of one frame pair."""
-        values = [self.statistic(pair, name) for name in self._present(pair)]
+        values = []
+        for material in self.materials:
+            if material in pair.scenario.members:
+                values.append(self.statistic(pair, material))
         return float(np.mean(values))
-
-    def applies(self, pair: FramePair) -> bool:
-        """Return whether the scenario has such a body."""
-        return bool(self._present(pair))
 
 
 def _body_metrics(
@@ -150,7 +147,6 @@ def _body_metrics(
             materials = (material,)
             bodies = material
 
-        over_bodies = OverBodies(statistic, materials)
         yield Metric(
             name=f"{statistic.__name__}{suffix}",
             family="bodies",
@@ -161,8 +157,8 @@ def _body_metrics(
             greatest=greatest,
             source="section 4.8.2",
             summary=f"{summary}, {bodies}",
-            statistic=over_bodies,
-            applies=over_bodies.applies,
+            statistic=OverBodies(statistic, materials),
+            applies=partial(has_material, materials=materials),
         )
 
 

@@ -57,6 +57,11 @@ def has_rotation(pair: FramePair) -> bool:
     return enough_nodes(pair) and pair.truth_rotates
 
 
+def has_material(pair: FramePair, materials: tuple[str, ...]) -> bool:
+    """Return whether the scenario has particles of one of some materials."""
+    return any(material in pair.scenario.members for material in materials)
+
+
 def identity(values: Floats) -> Floats:
     """Return a series as it is."""
     return values

@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.box import Box
-from lagbench.data.obstacle import keep_outside, parse_obstacle
+from lagbench.data.box import Box, keep_outside, parse_obstacle
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 

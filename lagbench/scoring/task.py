@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
+from lagbench.data.box import parse_obstacle
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError

@@ -12,10 +12,9 @@ import xarray as xr
 
 from lagbench.arguments import check_arguments
 from lagbench.data import registry
-from lagbench.data.box import AXES
+from lagbench.data.box import AXES, parse_obstacle
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
 from lagbench.errors import DataError
 

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.arguments import check_arguments
-from lagbench.data.contents import check_contents, registered_hash
+from lagbench.data.box import parse_obstacle
+from lagbench.data.contents import check_contents
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
-from lagbench.data.obstacle import parse_obstacle
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
 from lagbench.data.summary import summarise_arrays
@@ -266,7 +266,7 @@ class FrameStore:
             frames=size.frame_count(scenario),
         )
         content_hash = _read_text(file, "content_sha256")
-        recorded_hash = registered_hash(size, scenario)
+        recorded_hash = size.registered_hash(scenario)
         if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
                 "a scenario file is not that of the registry",

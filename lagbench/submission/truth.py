@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.contents import check_contents, registered_hash
+from lagbench.data.contents import check_contents
 from lagbench.data.layout import format_ids
 from lagbench.data.local import suggest_repair
 from lagbench.data.registry import Size
@@ -94,7 +94,7 @@ class Truth:
             header.key.scenario,
         )
         expected_identity = (key.split, key.size, key.major, scenario)
-        expected_hash = registered_hash(self.size, scenario)
+        expected_hash = self.size.registered_hash(scenario)
         if identity == expected_identity and header.content_sha256.startswith(
             expected_hash
         ):

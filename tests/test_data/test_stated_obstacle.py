@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lagbench.data.obstacle import keep_outside, parse_obstacle
+from lagbench.data.box import keep_outside, parse_obstacle
 from lagbench.errors import DataError
 
 STATED = {"obstacle_x": 0.25, "obstacle_y": 0.5, "obstacle_diameter": 0.125}
