@@ -234,11 +234,13 @@ In this table both sides are seeds of the same method. So the test should find a
 difference in at most 5 % of the draws. A share of 5 % has a statistical error of 1.4
 percentage points (95 % interval).
 
-With one seed on each side the test is the sign-flip test over scenarios. For the two
-trained models its answer is correct. For the two methods its answer is often wrong, as
-the column "1 seed each" shows. Therefore the leaderboard speaks of "these weights", not
-of methods, if one side has only one seed. It does so even if the other side has several
-seeds, because the scatter between the seeds of the first side is still unknown.
+With one seed on each side the test is the sign-flip test over scenarios. The two seeds
+are two sets of weights. One of them may really be better than the other, and then the
+test is right to find a difference between them. But this difference is no difference
+between methods. The column "1 seed each" shows how often the test finds it. Therefore
+the leaderboard speaks of "these weights", not of methods, if one side has only one
+seed. It does so even if the other side has several seeds, because the scatter between
+the seeds of the first side is still unknown.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|

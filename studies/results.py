@@ -136,8 +136,9 @@ over the horizon:
   training is enough.
 - A dash means that an entry is missing.
 
-The answers compare two models over the seeds that both have, or else over all seeds.
-They leave out models that fail a [gate](baselines.md#gates), and superseded and
+The answers compare two models over the seeds that both have. If there are no such
+seeds, or if one of the models draws no random numbers, the answers use all seeds of
+both. They leave out models that fail a [gate](baselines.md#gates), and superseded and
 withdrawn entries. If an operator has an entry with the recipe `pushforward`, the
 answers use this entry."""
 

@@ -167,8 +167,8 @@ stable_frames = Metric(
     direction=Direction.HIGHER,
     least=0.0,
     source="Kochkov et al. 2021, PNAS 118(21)",
-    summary=f"Defined frames before vorticity_pearson first falls below "
-    f"{STABLE_PEARSON:g}",
+    summary=f"Frames before vorticity_pearson first falls below {STABLE_PEARSON:g}; "
+    "frames in which it is undefined do not count",
     of=("vorticity_pearson",),
     over_frames=frames_before_fall,
     per_frame=False,
