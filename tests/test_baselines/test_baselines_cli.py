@@ -23,10 +23,10 @@ from hostile_onnx import straight_on
 from turns import of_this_turn
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.model_options import data_option
+from lagbench.cli.program import app
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
