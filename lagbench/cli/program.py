@@ -432,7 +432,7 @@ def _missing_parameter_error(error: Any, command: str) -> UsageError:  # noqa: A
 def _bad_parameter_error(error: Any, command: str) -> LagbenchError:  # noqa: ANN401
     """Return the error for a value that does not fit, or for a file without access."""
     # The help of a group shall load no other module.
-    from .data.field_errors import describe_expectation
+    from lagbench.data.field_errors import describe_expectation
 
     unreadable_path = _UNREADABLE_PATH.search(str(error.format_message()))
     if unreadable_path is not None:
