@@ -23,7 +23,7 @@ def choose_data_sets(
 ) -> tuple[tuple[str, str], ...]:
     """Return the data sets with entries; only those of a split or size, if given.
 
-    A data set is a pair (split, size). The folder of the leaderboard is for the message.
+    A data set is a pair (split, size). ``board`` is for the message.
 
     Raises:
         UsageError: a split or size is given that has no entries.

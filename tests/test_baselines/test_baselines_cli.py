@@ -203,10 +203,13 @@ def test_mistakes_of_train(
     code: int,
     message: str,
 ) -> None:
-    """Every mistake has its exit code, and a message that says how to mend it."""
+    """Every mistake has its exit code, and a message that says how to mend it. None
+    leaves a folder.
+    """
     result = lagbench("train", *words)
     assert result.exit_code == code
     assert message in result.stderr
+    assert not Path("runs").exists()
 
 
 def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:

@@ -281,6 +281,7 @@ def test_a_changed_value_of_train_stops_the_training(
     with pytest.raises(DataError) as caught:
         run(*command, root=tmp_path / "data")
     assert str(path) in str(caught.value.where)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) -> None:

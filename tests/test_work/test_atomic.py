@@ -48,14 +48,22 @@ def test_an_error_keeps_the_old_file(
 
 
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
-    """A usable folder is made and left empty. The error for an unusable one names its
-    option, before the work and during it.
+    """A usable folder is neither made nor changed. The error for an unusable one names
+    its option, before the work and during it.
     """
     check_writable(tmp_path / "deep" / "folder")
-    assert list((tmp_path / "deep" / "folder").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()
     file = tmp_path / "file"
-    for folder in (file, file / "below", Path("/proc/self")):
+    lost = tmp_path / "lost"
+    lost.symlink_to(tmp_path / "nowhere")
+    for folder in (
+        file,
+        file / "below",
+        lost,
+        tmp_path / ("x" * 300),
+        Path("/proc/self"),
+    ):
         with pytest.raises(WorkFailedError) as caught:
             check_writable(folder, option="--output")
         assert caught.value.where.startswith(str(folder.parent))
