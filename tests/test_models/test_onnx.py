@@ -465,7 +465,12 @@ def test_an_entry_carries_an_onnx_model(
         root=generated.root,
     )
     assert prediction.method == "lines"
-    for output, fix in ((path, "another file"), (predictions, "--overwrite")):
+    refused = {
+        path: "another file",
+        predictions: "--overwrite",
+        tmp_path / "new.pt": "new.nc",
+    }
+    for output, fix in refused.items():
         with pytest.raises(UsageError) as caught:
             predict_onnx(
                 path, output, split=SIZE.split, size=SIZE.name, root=generated.root
