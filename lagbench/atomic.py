@@ -16,6 +16,9 @@ from .errors import LagbenchError, UsageError, WorkFailedError
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
 
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""What the operating system says of a disk, a quota or a file that is full."""
+
 SIGNED_BYTES = 4 << 20
 """How much of a file is read to learn its kind [bytes]."""
 
@@ -207,7 +210,9 @@ def _process_token() -> str:
 
 
 def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
-    hint = "free disk space"
+    hint = "see that the disk is there and can be written to"
+    if error.errno in DISK_FULL_ERRORS:
+        hint = "free disk space"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "a file is where a folder has to be: move it"
     if isinstance(error, IsADirectoryError):

@@ -21,6 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from lagbench.addresses import REPOSITORY, describe
+from lagbench.atomic import DISK_FULL_ERRORS
 from lagbench.errors import (
     LagbenchError,
     UnreadableFileError,
@@ -74,8 +75,6 @@ COMMANDS_WITHOUT_SIZE = {
     "lagbench submit",
 }
 """Commands that read the size of the data set from predictions or scores."""
-
-DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 VANISHED_ERRORS = {
     errno.ENOENT,
@@ -630,7 +629,7 @@ def _output_errors() -> Iterator[None]:
         if isinstance(error, PermissionError) and error.filename is not None:
             raise WorkFailedError(
                 "no permission",
-                where=str(error.filename),
+                where=os.fsdecode(error.filename),
                 expected="a file or folder that you may read or write",
                 got=error.strerror,
                 fix="see who owns it, or name another",
@@ -638,7 +637,7 @@ def _output_errors() -> Iterator[None]:
         if error.errno in VANISHED_ERRORS:
             raise WorkFailedError(
                 "cannot read or write there",
-                where=str(error.filename or "the working folder"),
+                where=os.fsdecode(error.filename or "the working folder"),
                 expected="a disk and a folder that stay there while lagbench works",
                 got=error.strerror,
                 fix="see that they are there and can be written to, then repeat the "

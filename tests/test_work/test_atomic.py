@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -71,6 +73,28 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(WorkFailedError) as caught:
         write_atomically(file / "in-the-way", b"")
     assert caught.value.where.endswith("file/in-the-way")
+
+
+@pytest.mark.parametrize(
+    ("code", "hint"),
+    [
+        (errno.ENOSPC, "free disk space"),
+        (errno.EROFS, "can be written to"),
+        (errno.ENOENT, "can be written to"),
+        (errno.EIO, "can be written to"),
+    ],
+)
+def test_a_full_disk_and_a_vanished_one_have_their_own_advice(
+    code: int, hint: str, tmp_path: Path
+) -> None:
+    with (
+        pytest.raises(WorkFailedError) as caught,
+        atomic_path(tmp_path / "file", option="--output"),
+    ):
+        raise OSError(code, os.strerror(code))
+    assert hint in caught.value.fix
+    assert "--output" in caught.value.fix
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:
