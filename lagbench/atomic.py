@@ -11,13 +11,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import LagbenchError, UsageError, WorkFailedError
+from .errors import DISK_FULL_ERRORS, LagbenchError, UsageError, WorkFailedError
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
-
-DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""What the operating system says of a disk, a quota or a file that is full."""
 
 SIGNED_BYTES = 4 << 20
 """How much of a file is read to learn its kind [bytes]."""

@@ -21,8 +21,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from lagbench.addresses import REPOSITORY, describe
-from lagbench.atomic import DISK_FULL_ERRORS
 from lagbench.errors import (
+    DISK_FULL_ERRORS,
     LagbenchError,
     UnreadableFileError,
     UsageError,
