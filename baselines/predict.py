@@ -22,8 +22,7 @@ from lagbench.atomic import check_output_file, write_atomically
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.submission.format import PREDICTIONS_SIGNS
-from lagbench.submission.writer import PredictionsWriter
+from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
 
@@ -361,20 +360,11 @@ def check_outputs(output: Path, *, overwrite: bool) -> None:
     """Refuse to write predictions and their costs over files of another kind.
 
     Raises:
-        UsageError: the output is a folder, a JSON file, or a file of another kind, or
-            there is such a file.
+        UsageError: the output is a folder or a file of another kind, there is such a
+            file, or its name has the ending of another format.
     """
-    check_output_file(output, overwrite=overwrite, signs=PREDICTIONS_SIGNS)
+    check_predictions_output(output, overwrite=overwrite)
     costs = output.with_suffix(".json")
-    if output == costs:
-        raise UsageError(
-            "predictions are no JSON",
-            where="--output",
-            expected="a name that ends in .nc",
-            got=str(output),
-            fix=f"name it {output.with_suffix('.nc').name}: the costs of the "
-            f"predictions go to {costs.name}",
-        )
     # costs belong to the predictions beside them, and go when these go
     check_output_file(costs, overwrite=True, signs=(b"seconds_without_search",))
 

@@ -128,7 +128,7 @@ class TrainingLoop:
         if self.fabric.is_global_zero:
             self._tensorboard = SummaryWriter(str(self.job.folder.tensorboard))
         try:
-            with self._interrupts.listen():
+            with self._interrupts.listen(), _silence_writer():
                 self.job.meter.begin(
                     "training", total=steps, scenarios=steps, done=step
                 )
@@ -317,6 +317,25 @@ class TrainingLoop:
             windows=self.windows,
         )
         self.job.folder.write_log(log)
+
+
+@contextmanager
+def _silence_writer() -> Iterator[None]:
+    """Keep tracebacks of TensorBoard's thread from users, as where a disk vanishes.
+
+    The training meets the same error as it gives the thread its next number.
+    """
+    show = threading.excepthook
+
+    def show_others(details: threading.ExceptHookArgs) -> None:
+        if not isinstance(details.exc_value, OSError):
+            show(details)
+
+    threading.excepthook = show_others
+    try:
+        yield
+    finally:
+        threading.excepthook = show
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from types import FrameType
 from import_graph import import_graph, longest_chains, package_modules
 
 import lagbench
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 
 CLONE = Path(lagbench.__file__).parents[1]
 MODULES = package_modules(CLONE)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import LagbenchError, UsageError, WorkFailedError
+from .errors import DISK_FULL_ERRORS, LagbenchError, UsageError, WorkFailedError
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
@@ -143,7 +143,10 @@ def _has_signs(path: Path, signs: Sequence[bytes]) -> bool:
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
-    """Make a folder and check, before the work, that its result can be written there.
+    """Check, before the work, that its result can be written in a folder.
+
+    A folder that is not there is not made: a command that is refused later would leave
+    it empty. The folder above, in which it will be made, is checked instead.
 
     Args:
         folder: the folder.
@@ -152,14 +155,33 @@ def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
     Raises:
         WorkFailedError: the operating system refused.
     """
-    probe = temporary_name(folder / "probe")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
+        present_folder = _find_present(folder)
+        probe = temporary_name(present_folder / "probe")
+        try:
+            probe.touch()
+        finally:
+            _discard(probe)
     except OSError as error:
         raise _write_error(folder, option, error) from error
-    finally:
-        _discard(probe)
+
+
+def _find_present(folder: Path) -> Path:
+    """Return a folder, or the nearest one above it that is there.
+
+    Raises:
+        OSError: no folder can be made below the nearest place.
+    """
+    for place in (folder, *folder.parents):
+        try:
+            place.lstat()
+        except FileNotFoundError:
+            continue
+        if not place.is_dir():
+            code = errno.ENOTDIR
+            raise NotADirectoryError(code, os.strerror(code), str(place))
+        return place
+    return folder
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
@@ -185,7 +207,9 @@ def _process_token() -> str:
 
 
 def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
-    hint = "free disk space"
+    hint = "see that the disk is there and can be written to"
+    if error.errno in DISK_FULL_ERRORS:
+        hint = "free disk space"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "a file is where a folder has to be: move it"
     if isinstance(error, IsADirectoryError):

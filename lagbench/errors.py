@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import importlib
 import importlib.util
 import itertools
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
+
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""What the operating system says of a disk, a quota or a file that is full."""
 
 _WORD = re.compile(r"\S+")
 _DIGITS = re.compile(r"[0-9]+")

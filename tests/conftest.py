@@ -28,7 +28,7 @@ from score_bench import ScoreBench, bench_of
 from turns import leave_out_slow_tests
 from typer.main import get_command
 
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import PICTURES
 from lagbench.data.registry import Registry, Size, load

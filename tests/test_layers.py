@@ -249,7 +249,7 @@ for step in json.loads(sys.argv[1]):
         exec(step)
     else:
         from typer.testing import CliRunner
-        from lagbench.__main__ import app
+        from lagbench.cli.program import app
         for line in step.split("; "):
             assert CliRunner().invoke(app, line.split()).exit_code == 0, line
     loaded.append(sorted(sys.modules))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
@@ -14,11 +15,15 @@ from .folder import Folder
 
 
 def choose_data_sets(
-    known: Collection[tuple[str, str]], split: str | None, size: str | None
+    known: Collection[tuple[str, str]],
+    split: str | None,
+    size: str | None,
+    *,
+    board: Path,
 ) -> tuple[tuple[str, str], ...]:
     """Return the data sets with entries; only those of a split or size, if given.
 
-    A data set is a pair (split, size).
+    A data set is a pair (split, size). ``board`` is for the message.
 
     Raises:
         UsageError: a split or size is given that has no entries.
@@ -37,7 +42,7 @@ def choose_data_sets(
     raise UsageError(
         "no entries there",
         where="--split, --size",
-        expected="a data set with entries",
+        expected=f"a data set with entries in {board}",
         got=ascii(request),
         fix=fix,
     )
@@ -98,7 +103,7 @@ def choose_entries(
             chosen.append(entry)
         return chosen
 
-    choose_data_sets(folder.data_sets(), split, size)
+    choose_data_sets(folder.data_sets(), split, size, board=folder.path)
     chosen = []
     for path in known.values():
         _, entry_split, entry_size, _ = path.parts

@@ -53,7 +53,10 @@ def export_command(
         ),
     ] = False,
     overwrite: Annotated[
-        bool, option("--overwrite --force", "Replace an earlier export.")
+        bool,
+        option(
+            "--overwrite --force", "Replace an earlier export, or write beside others."
+        ),
     ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,

@@ -31,17 +31,19 @@ COLUMNS = (
     "scenarios",
     "particles",
     "frames",
-    "disk <=",
+    "disk",
     "time",
     "here",
 )
 """Columns of a table of sizes."""
 
+TEXT_WIDTH = 79  # characters of a line of text
+
 LEGEND = (
     "scenarios: of train/valid/test, then of extra and shift",
     "particles: of one scenario; frames: of all scenarios",
-    "disk <=: space that the scenarios need at most",
-    "here: whether the scenarios are on this machine",
+    "disk: space that the scenarios need at most",
+    "here: whether the scenarios are on this machine, or how many of them are",
 )
 """Lines that say what the columns mean."""
 
@@ -129,7 +131,7 @@ def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Ov
 
 
 def _describe_times(overviews: Sequence[Overview]) -> list[str]:
-    """Return the line that says where the times of a table come from, if it has any."""
+    """Return lines that say where the times of a table come from, if it has any."""
     estimated_splits: list[str] = []
     has_measured = False
     for entry in overviews:
@@ -147,7 +149,8 @@ def _describe_times(overviews: Sequence[Overview]) -> list[str]:
     subject = "time"
     if has_measured:
         subject = f"time of {', '.join(estimated_splits)}"
-    return [f"{subject}: estimated; measured after the first generate"]
+    line = f"{subject}: estimated; measured after the first generate"
+    return textwrap.wrap(line, TEXT_WIDTH, break_on_hyphens=False)
 
 
 def _format_row(entry: Overview) -> tuple[object, ...]:
@@ -191,7 +194,7 @@ def info_command(
         print_json({"split": name, **_split_as_json(entry), "sizes": sizes})
         return
 
-    description = textwrap.fill(entry.description, 79, break_on_hyphens=False)
+    description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
     print_line(f"{entry.title} ({name} {entry.version}, {entry.licence})")
     print_line(f"{description}\n")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))

@@ -60,12 +60,11 @@ from .output import (
     format_bytes,
     print_json,
     print_line,
-    print_note,
     print_result,
     print_tables,
     print_warning,
 )
-from .progress import progress_bar
+from .progress import note_at_start, progress_bar
 from .solver_bench import bench_in_own_process
 
 REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
@@ -270,7 +269,9 @@ def picture_command(
     folder = find_board(board, reads=True)
     if not shipped(tier):
         # without references the picture of no entry would be empty
-        choose_data_sets(Folder(folder).data_sets(), tier.split, tier.name)
+        choose_data_sets(
+            Folder(folder).data_sets(), tier.split, tier.name, board=folder
+        )
     model = collect(folder, only=[(tier.split, tier.name)])
     svg = picture(model, tier)
     write_atomically(output, svg.encode(), option="--output")
@@ -341,9 +342,9 @@ def reproduce_command(
             fix="leave one of the options out, or ask for one scenario or more",
         )
     folder = find_board(board)
-    if recording and not quiet:
-        print_note(f"results go to {folder}")
     with progress_bar(quiet=quiet or as_json) as progress:
+        if recording and not quiet:
+            progress = note_at_start(f"results go to {folder}", progress)
         result = reproduce(
             folder,
             entries or (),
@@ -456,9 +457,9 @@ def shift_command(
             fix="lagbench leaderboard shift cavity/mini/gns",
         )
     folder = find_board(board)
-    if not quiet:
-        print_note(f"results go to {folder}")
     with progress_bar(quiet=quiet or as_json) as progress:
+        if not quiet:
+            progress = note_at_start(f"results go to {folder}", progress)
         result = score_on_shift(
             folder,
             entries or (),
@@ -520,10 +521,11 @@ def show_command(
         split = choose_split(split_argument, split_option)
     folder = find_board(board, reads=True)
     data_sets = Folder(folder).data_sets()
+    chosen = choose_data_sets(data_sets, split, size, board=folder)
     scope = scope_of_tables(metric or (), wide=wide)
     if as_json:
         scope = SCOPE_OF_JSON
-    model = collect(folder, only=choose_data_sets(data_sets, split, size), scope=scope)
+    model = collect(folder, only=chosen, scope=scope)
     if as_json:
         print_json(to_plain(model))
         return

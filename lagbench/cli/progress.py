@@ -20,7 +20,7 @@ from rich.progress import Progress as ProgressDisplay
 from lagbench.store.copy import silence_fetching
 from lagbench.work.progress import Progress, watched
 
-from .output import format_seconds
+from .output import format_seconds, print_note
 
 SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
 
@@ -75,6 +75,28 @@ def progress_bar(
             )
 
         yield update_bar
+
+
+def note_at_start(note: str, listener: Listener | None) -> Listener:
+    """Return a listener that prints a note before the first progress.
+
+    Work that is refused makes no progress, so its user reads the error alone.
+
+    Args:
+        note: what the command says as its work begins.
+        listener: shows all progress, the first one too; may be None.
+    """
+    has_begun = False
+
+    def show_progress(progress: Progress) -> None:
+        nonlocal has_begun
+        if not has_begun:
+            has_begun = True
+            print_note(note)
+        if listener is not None:
+            listener(progress)
+
+    return show_progress
 
 
 def _print_lines(unit: str, seconds_per_line: float) -> Listener:

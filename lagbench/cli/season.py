@@ -42,8 +42,8 @@ from .options import (
     RootOption,
     option,
 )
-from .output import print_json, print_line, print_note, print_result, print_tables
-from .progress import progress_bar
+from .output import print_json, print_line, print_result, print_tables
+from .progress import note_at_start, progress_bar
 
 SeasonArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="Name of the season.")
@@ -207,9 +207,9 @@ def run_command(
     5: out of memory or disk
     """
     board = find_board(board, reads=check)
-    if not check and not quiet:
-        print_note(f"results go to {board}")
     with progress_bar(quiet=quiet or as_json) as progress:
+        if not check and not quiet:
+            progress = note_at_start(f"results go to {board}", progress)
         result = run_season(
             board,
             name,

@@ -297,13 +297,7 @@ def read_scenario(path: Path) -> ScenarioFile:
         DataError: the file is missing, damaged, or no scenario.
     """
     if not path.is_file():
-        raise DataError(
-            "a scenario file is missing",
-            where=str(path),
-            expected="a readable file",
-            got="nothing",
-            fix=_repair_hint(path),
-        )
+        raise _missing_error(path, _repair_hint(path))
     with _damage_errors(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
         stack.callback(file.close)
@@ -479,11 +473,16 @@ def _damage_errors(path: Path, variable: str | None = None) -> Iterator[None]:
 def damage_error(
     path: Path, got: str, variable: str | None = None, *, fix: str | None = None
 ) -> DataError:
-    """Return the error that a file, or one of its variables, is damaged."""
+    """Return the error that a file, or one of its variables, is damaged.
+
+    A file that vanished while it was read, or may not be read, is not called damaged.
+    """
+    if not os.path.exists(path):
+        return _missing_error(path, fix or _repair_hint(path))
     where = str(path)
     if variable is not None:
         where = f"{path}, variable {variable!r}"
-    if path.exists() and not os.access(path, os.R_OK):
+    if not os.access(path, os.R_OK):
         return DataError(
             "a scenario file may not be read",
             where=where,
@@ -497,6 +496,16 @@ def damage_error(
         expected="a file that lagbench writes",
         got=got,
         fix=fix or _repair_hint(path),
+    )
+
+
+def _missing_error(path: Path, fix: str) -> DataError:
+    return DataError(
+        "a scenario file is missing",
+        where=str(path),
+        expected="a readable file",
+        got="nothing",
+        fix=fix,
     )
 
 

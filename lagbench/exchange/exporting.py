@@ -104,13 +104,13 @@ def export(
         wall_particles: full boxes of two dimensions with four walls only: add
             particles beside the walls that move along with them, since neither
             format has wall velocities.
-        overwrite: whether to replace an earlier export.
+        overwrite: whether to replace an earlier export, or to write beside other files.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size or format, files are there already, or a
-            ``force.py`` is, which the program that reads lagrangebench-h5 would run; or
+        UsageError: unknown split, size or format, the folder holds files, or a
+            ``force.py``, which the program that reads lagrangebench-h5 would run; or
             there are no walls.
         DataError: scenarios are missing or damaged, or their statistics are recorded
             nowhere.
@@ -261,6 +261,17 @@ def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> No
             got=", ".join(existing),
             fix="replace them: --overwrite; or name another folder: --output",
         )
+    if folder.is_dir() and not overwrite:
+        others = sorted(path.name for path in folder.iterdir())
+        if others:
+            raise UsageError(
+                "the folder holds other files",
+                where=str(folder),
+                expected="an empty folder, or a new one",
+                got=", ".join(others[:5]),
+                fix="name another folder: --output; or write beside these files: "
+                "--overwrite",
+            )
 
 
 def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> None:

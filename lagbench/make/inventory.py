@@ -71,13 +71,13 @@ class Overview:
 
     @property
     def state(self) -> str:
-        """Whether it is on this machine: "yes", "no" or how much of it."""
+        """Whether it is on this machine: "yes", "no" or a count as in "3/5"."""
         present_count = sum(self.present.values())
         total_count = sum(self.scenarios.values())
         if present_count == total_count:
             return "yes"
         if present_count:
-            return f"{present_count} of {total_count}"
+            return f"{present_count}/{total_count}"
         return "no"
 
 

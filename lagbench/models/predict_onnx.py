@@ -6,12 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.atomic import check_output_file
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.store.copy import scenario_files
-from lagbench.submission.format import PREDICTIONS_SIGNS
-from lagbench.submission.writer import PredictionsWriter
+from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress
 
@@ -74,7 +72,7 @@ def predict_onnx(
         DataError: the subset is missing.
         WorkFailedError: the model needs more time or memory than allowed.
     """
-    check_output_file(Path(output), overwrite=overwrite, signs=PREDICTIONS_SIGNS)
+    check_predictions_output(Path(output), overwrite=overwrite)
     any_tier, folder, known = locate(split, size, root=root, registry=registry)
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))

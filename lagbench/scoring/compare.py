@@ -297,7 +297,8 @@ def compare(
 
     Raises:
         UsageError: an unknown metric, reference, entry or split, no leaderboard where
-            one is named, or the two belong to different splits or sizes.
+            one is named, or the two belong to different splits or sizes, or are the
+            same files.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
@@ -316,6 +317,7 @@ def compare(
     _check_files(first)
     if not is_bare:
         _check_files(second)
+        _check_different(first, second)
 
     def require_second(split: str, size: str) -> None:
         if is_bare:
@@ -491,6 +493,21 @@ def _check_files(source: str | Path) -> None:
     """Refuse a method of which some file is no regular one."""
     for path in _seed_files(Path(source)):
         check_regular(path)
+
+
+def _check_different(first: str | Path, second: str | Path) -> None:
+    """Refuse to compare files with themselves, by whatever paths they are named."""
+    first_files = {os.path.realpath(path) for path in _seed_files(Path(first))}
+    second_files = {os.path.realpath(path) for path in _seed_files(Path(second))}
+    if first_files == second_files:
+        raise UsageError(
+            "a method cannot be compared with itself",
+            where="A and B",
+            expected="the files of two methods",
+            got=f"{first} and {second}, which are the same",
+            fix="name another file, a reference predictor or an entry of the "
+            "leaderboard as B",
+        )
 
 
 def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -> None:
@@ -833,6 +850,7 @@ def _load_entry(
     place = (one.identity["split"], one.identity["size"], name)
     if place not in entries:
         raise _no_such_name(one, first, name, entries)
+    _check_different(first, entries[place])
     return _load_contestant(entries[place], scoring)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from .format import (
     FORMAT,
     NEVER,
     OPTIONAL,
+    PREDICTIONS_SIGNS,
     require_valid_attribute,
 )
 from .issues import quote
@@ -49,6 +51,17 @@ CHUNK_CACHE_BYTES = 1 << 20
 
 MAX_REASON = 200
 """Longest reason that a message repeats [characters]."""
+
+OTHER_ENDINGS = frozenset(
+    {
+        *(".pt", ".pth", ".ckpt", ".safetensors", ".onnx", ".pkl", ".pickle"),
+        *(".json", ".yaml", ".yml", ".toml", ".csv", ".txt", ".md", ".html"),
+        *(".h5", ".hdf5", ".npz", ".npy", ".zarr", ".parquet", ".mat", ".vtk"),
+        *(".png", ".jpg", ".svg", ".pdf", ".gif", ".mp4"),
+        *(".zip", ".tar", ".gz", ".py", ".ipynb"),
+    }
+)
+"""Endings of names that no netCDF file has."""
 
 Label = str | int | float
 """Value of an optional attribute."""
@@ -601,6 +614,29 @@ class TemplateResult:
     bytes: int
 
 
+def check_predictions_output(output: Path, *, overwrite: bool) -> None:
+    """Refuse, before the work, a file that predictions must not be written to.
+
+    Args:
+        output: the file that ``--output`` names.
+        overwrite: whether the user allows to replace predictions of that name.
+
+    Raises:
+        UsageError: it is a folder or a file of another kind, there are such
+            predictions, or its name has the ending of another format.
+    """
+    check_output_file(output, overwrite=overwrite, signs=PREDICTIONS_SIGNS)
+    ending = output.suffix
+    if ending.lower() in OTHER_ENDINGS:
+        raise UsageError(
+            "the name has the ending of another format",
+            where="--output",
+            expected="netCDF: a name that ends in .nc or has no ending",
+            got=str(output),
+            fix=f"-o {shlex.quote(str(output.with_suffix('.nc')))}",
+        )
+
+
 @check_arguments
 def template(
     split: str | Path,
@@ -632,7 +668,7 @@ def template(
     """
     any_size, folder, splits = locate(split, size, root=root, registry=registry)
     entry = any_size.scored_on(subset)
-    check_output_file(Path(output), overwrite=overwrite)
+    check_predictions_output(Path(output), overwrite=overwrite)
     update_working_copy(entry, folder, entry.subsets[subset])
     truth = Truth(entry, folder)
     truth.require()

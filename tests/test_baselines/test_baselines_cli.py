@@ -23,10 +23,10 @@ from hostile_onnx import straight_on
 from turns import of_this_turn
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
 from lagbench.cli.model_options import data_option
+from lagbench.cli.program import app
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
@@ -203,10 +203,13 @@ def test_mistakes_of_train(
     code: int,
     message: str,
 ) -> None:
-    """Every mistake has its exit code, and a message that says how to mend it."""
+    """Every mistake has its exit code, and a message that says how to mend it. None
+    leaves a folder.
+    """
     result = lagbench("train", *words)
     assert result.exit_code == code
     assert message in result.stderr
+    assert not Path("runs").exists()
 
 
 def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:

@@ -667,7 +667,15 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"],
+    [
+        "weights.pt",
+        "training.nc",
+        ".",
+        "predictions.json",
+        "new.h5",
+        "taken.nc",
+        "scenario.nc",
+    ],
 )
 def test_only_predictions_are_replaced(
     run: Predict,

@@ -281,6 +281,7 @@ def test_a_changed_value_of_train_stops_the_training(
     with pytest.raises(DataError) as caught:
         run(*command, root=tmp_path / "data")
     assert str(path) in str(caught.value.where)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) -> None:
@@ -617,6 +618,21 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
     names = {file.name for file in path.parent.iterdir() if file.is_file()}
     assert names == {"checkpoint.pt", "training.json", "weights.pt"}
     assert path.read_bytes() == content
+
+
+def test_a_folder_that_vanishes_ends_the_training_without_a_traceback(
+    run: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """TensorBoard writes in a thread of its own, which meets the error first."""
+
+    def remove_folder(progress: Progress) -> None:
+        if progress.done == 3:
+            shutil.rmtree(tmp_path / "run", ignore_errors=True)
+            (tmp_path / "run").touch()
+
+    with pytest.raises((OSError, WorkFailedError)):
+        run("drift", "steps=40", "log_every=1", progress=remove_folder)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

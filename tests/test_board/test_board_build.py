@@ -539,7 +539,7 @@ def test_json_has_the_numbers_of_the_board(board: Board) -> None:
 def test_unknown_names_are_refused(board: Board) -> None:
     """The nearest known name is in the message."""
     with pytest.raises(UsageError) as caught:
-        choose_data_sets([("cavity", "tiny")], "cavity", "tyni")
+        choose_data_sets([("cavity", "tiny")], "cavity", "tyni", board=Path("b"))
     assert "cavity tiny" in str(caught.value.fix)
     with pytest.raises(UsageError) as caught:
         list(tables(board, ["position_rmsee"]))
@@ -558,7 +558,7 @@ def test_boards_without_an_entry_are_named(
     empty = collect(tmp_path, registry=bench.registry)
     assert empty.tabs == ()
     assert set(board.empty) <= set(empty.empty)
-    assert choose_data_sets([], None, None) == ()
+    assert choose_data_sets([], None, None, board=Path("b")) == ()
     result = build(tmp_path, registry=bench.registry)
     assert result.rows == 0
 

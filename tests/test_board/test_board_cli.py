@@ -199,6 +199,7 @@ def test_the_board_of_the_clone_is_found_elsewhere(
         assert none.exit_code == 2
         assert "no entries there" in none.stderr
         assert str(clone_board) in none.stderr.replace("\n", "")
+        assert "results go to" not in none.stderr
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lagbench.cli.leaderboard.shipped", lambda _: None)
         picture = run("leaderboard", "picture", "cavity", "--size", "mini")

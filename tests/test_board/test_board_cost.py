@@ -16,10 +16,10 @@ import pytest
 from sample_boards import make_board
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
 from lagbench.board.cost import CostPoint, draw, find_front, points_of
 from lagbench.board.entry import MeasuredCost, Verification
 from lagbench.board.model import Tab
+from lagbench.cli.program import app
 from lagbench.data.registry import load
 from lagbench.figures.chart import close_logarithmic
 from lagbench.references import shipped, solver_seconds

@@ -264,6 +264,7 @@ def test_contradictory_options_are_refused_before_any_work(
         assert result.exit_code == 2
     result = run(*command, "curl-noise/tiny/nobody", *board, "--json")
     assert result.exit_code == 2
+    assert "results go to" not in result.stderr
 
 
 @pytest.mark.slow
@@ -276,9 +277,12 @@ def test_a_recorded_result_is_shown_with_the_option_that_runs_it_again(
     command = ["leaderboard", "reproduce", NAME, "--no-costs"]
     where = ["--board", own.folder, "--root", own.root]
     printed = []
+    notes = []
     for options in (["--again"], [], ["--again"]):
         result = run(*command, *options, *where)
         assert result.exit_code == 0, result.output
         printed.append(result.stdout)
+        notes.append(result.stderr.count(f"results go to {own.folder}"))
+    assert notes == [1, 0, 1]
     told = ["--again runs it now" in text for text in printed]
     assert told == [False, True, False]

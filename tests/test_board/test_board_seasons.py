@@ -305,6 +305,7 @@ def test_the_run_says_which_gaps_are_not_recorded(
         *("--board", own.folder, "--root", own.root),
     )
     assert result.exit_code == 0, result.output
+    assert result.stderr.count(f"results go to {own.folder}") == 1
     assert f"not in verified.yaml: {NAME};" in result.stdout
     assert "scored before" not in result.stdout
 
@@ -435,6 +436,7 @@ def test_the_commands_say_what_is_wrong(
     ):
         result = run(*words, *board)
         assert result.exit_code == 2, words
+        assert "results go to" not in result.stderr
     shown = run("season", "show", SEASON, "--markdown", "--board", own.folder)
     assert shown.exit_code == 0
     assert "gns" in shown.stdout

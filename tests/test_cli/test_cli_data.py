@@ -58,6 +58,25 @@ def test_list_shows_every_size(run: Run, generated: GenerationResult) -> None:
     assert len(rows) == size_count
 
 
+def test_list_fits_a_narrow_terminal(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The longest row is that of a data set that is there in part."""
+    monkeypatch.delenv("LAGBENCH_REGISTRY")
+    monkeypatch.setenv("COLUMNS", "80")
+    for split_name, split in load().splits.items():
+        for size_name in split.sizes:
+            size = load().size(split_name, size_name)
+            for scenario in size.scenarios[:-1]:
+                path = size.path(tmp_path, scenario)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.touch()
+    lines = run("list", "--root", tmp_path).stdout.splitlines()
+    assert any("55/56" in line for line in lines)
+    for line in lines[:-1]:  # the last one names the folder
+        assert len(line) <= 80, line
+
+
 def test_list_has_counts_bytes_time_and_local_data_as_json(
     run: Run, generated: GenerationResult
 ) -> None:

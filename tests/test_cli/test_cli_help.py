@@ -12,13 +12,13 @@ from collections.abc import Callable
 import pytest
 from typer.testing import CliRunner, Result
 
-from lagbench.__main__ import app
 from lagbench.cli.commands import (
     COMMANDS,
     LEADERBOARD_COMMANDS,
     SEASON_COMMANDS,
     CommandEntry,
 )
+from lagbench.cli.program import app
 
 Run = Callable[..., Result]
 
@@ -26,7 +26,7 @@ ENTRIES = (*COMMANDS, *LEADERBOARD_COMMANDS, *SEASON_COMMANDS)
 LOADED_MODULES = """
 import sys
 from typer.testing import CliRunner
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 for words in {calls}:
     assert CliRunner().invoke(app, words).exit_code == 0
 print(*(name for name in sys.modules if name.startswith("lagbench.")))
@@ -70,7 +70,7 @@ def test_the_help_lists_all_commands_in_the_order_of_use(run: Run) -> None:
 def test_the_help_of_a_group_loads_no_command() -> None:
     modules = loaded_modules([["--help"], ["leaderboard", "--help"], ["season", "-h"]])
     assert modules <= {
-        "lagbench.__main__",
+        "lagbench.cli.program",
         "lagbench.addresses",
         "lagbench.cli",
         "lagbench.cli.commands",

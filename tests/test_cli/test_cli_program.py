@@ -14,10 +14,10 @@ from score_bench import ScoreBench, still
 from typer.testing import CliRunner, Result
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.cli.output import print_table
+from lagbench.cli.program import app
 from lagbench.data.registry import default_path
 
 Run = Callable[..., Result]

@@ -19,7 +19,7 @@ from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenar
 
 from lagbench.data import MATERIALS
 from lagbench.data.checksums import ContentHasher, file_sha256
-from lagbench.data.scenario import check_scenario, read_scenario, rehash
+from lagbench.data.scenario import check_scenario, damage_error, read_scenario, rehash
 from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.generators.split import Material
@@ -325,6 +325,18 @@ def test_a_truncated_file_is_damage(written: Written, share: float) -> None:
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     assert_refused(tmp_path / "0000.nc", "missing", check=read_scenario)
+
+
+def test_a_file_that_vanishes_while_it_is_read_is_not_called_damaged(
+    tmp_path: Path,
+) -> None:
+    """The disk was taken away after the file was found."""
+    path = tmp_path / "0001.nc"
+    error = damage_error(path, "FileNotFoundError: no such file", "position")
+    assert "missing" in error.what
+    assert error.where == str(path)
+    path.write_bytes(b"x")
+    assert "damaged" in damage_error(path, "OSError: no signature").what
 
 
 def test_other_netcdf_files_are_refused(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from scenario_factory import make_key
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.data.layout import dataset_folder, scenario_path
 from lagbench.data.local import (
     is_split_name,

@@ -23,9 +23,9 @@ from turns import PROGRAMS
 from typer.main import get_command
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
+from lagbench.cli.program import app
 from lagbench.data import registry
 from lagbench.data.yamlfile import read_yaml
 from lagbench.make.generate import GenerationResult, generate

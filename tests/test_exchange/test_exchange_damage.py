@@ -22,7 +22,7 @@ from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, import_split, trajectory
 from lagbench.exchange.local_split import LocalSplit

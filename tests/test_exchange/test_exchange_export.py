@@ -338,6 +338,22 @@ def test_the_same_data_give_the_same_bytes(
     )
 
 
+def test_an_export_mixes_with_other_files_only_on_request(
+    mixed: LocalSplit, tmp_path: Path
+) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError) as caught:
+        export(str(mixed.folder), format="gns-npz", output=folder)
+    assert caught.value.where == str(folder)
+    assert "notes.txt" in str(caught.value.got)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    export(str(mixed.folder), format="gns-npz", output=folder, overwrite=True)
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert (folder / "metadata.json").is_file()
+
+
 class _Names(pickle.Unpickler):
     """Notes what a pickle names."""
 

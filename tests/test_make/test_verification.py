@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rewritten_files import forge, mend_manifest
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario

@@ -24,12 +24,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from lagbench.__main__ import app
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board
 from lagbench.board.entry import Level, Meta
 from lagbench.board.reproduce import reproduce
 from lagbench.board.submit import submit
+from lagbench.cli.program import app
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import (
@@ -465,7 +465,12 @@ def test_an_entry_carries_an_onnx_model(
         root=generated.root,
     )
     assert prediction.method == "lines"
-    for output, fix in ((path, "another file"), (predictions, "--overwrite")):
+    refused = {
+        path: "another file",
+        predictions: "--overwrite",
+        tmp_path / "new.pt": "new.nc",
+    }
+    for output, fix in refused.items():
         with pytest.raises(UsageError) as caught:
             predict_onnx(
                 path, output, split=SIZE.split, size=SIZE.name, root=generated.root

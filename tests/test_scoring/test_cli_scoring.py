@@ -19,7 +19,7 @@ from typer.testing import Result
 
 import lagbench
 from lagbench import submission
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score

@@ -290,9 +290,24 @@ def test_folders_files_and_predictions_give_the_same_result(
     assert by_predictions.as_json() == expected
 
 
-def test_a_submission_equals_itself(scored: Folders) -> None:
-    result = compare(scored["still"], scored["still"])
+def test_a_copy_of_a_submission_has_the_same_predictions(
+    scored: Folders, tmp_path: Path
+) -> None:
+    copy = shutil.copytree(scored["still"], tmp_path / "copy")
+    result = compare(scored["still"], copy)
     assert result.verdict == "both hold the same predictions"
+
+
+@pytest.mark.parametrize("name", ["", "scores.json", "predictions.nc"])
+def test_a_submission_is_not_compared_with_itself(
+    name: str, scored: Folders, tmp_path: Path
+) -> None:
+    """Not by another path either, and before predictions are scored."""
+    (tmp_path / "link").symlink_to(scored["still"])
+    with pytest.raises(UsageError) as caught:
+        compare(scored["still"] / name, tmp_path / "link" / name)
+    assert caught.value.got is not None
+    assert str(tmp_path / "link") in caught.value.got
 
 
 def test_the_short_table_leads_with_the_ranking_metric(
@@ -363,6 +378,8 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     swapped = compare(name, scored["still"], board=entries)
     metric = swapped.metrics[swapped.ranking]
     assert metric.side == "better"
+    with pytest.raises(UsageError, match="with itself"):
+        compare(name, "moving", board=entries)
     with pytest.raises(UsageError, match=name):
         compare("moving", "persistence", board=entries)
     with pytest.raises(UsageError, match="no such entry") as caught:
@@ -484,7 +501,8 @@ def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
     assert side_of(a, b) == "better"
     assert side_of(b, a) == "worse"
     assert side_of(a, c) == "better?"
-    assert side_of(a, a) == "same"
+    d = publish(tmp_path, ONES, method="d")
+    assert side_of(a, d) == "same"
 
 
 def test_rounding_makes_no_method_better(tmp_path: Path) -> None:
@@ -786,14 +804,15 @@ def test_json_deeper_than_pythons_stack_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "scores.json"
     path.write_text("[" * 100_000)
     with pytest.raises(UnreadableFileError) as caught:
-        compare(path, path)
+        compare(path, "persistence")
     assert caught.value.where == str(path)
 
 
 def test_rows_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
     path = publish(tmp_path, [1.0], method="a", ranking_metric="vorticity_rmse")
+    other = publish(tmp_path, TWOS, method="b")
     with pytest.raises(UnreadableFileError):
-        compare(path, path)
+        compare(path, other)
 
 
 def test_references_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
@@ -969,7 +988,8 @@ def test_metrics_that_cannot_be_loaded(
     source = "raise KeyError('mine\\x1b[2J')\n"
     package("metrics", "broken_metric:METRICS", source)
     scores = publish(tmp_path, ONES, method="a")
-    result = run("compare", scores, scores)
+    others = publish(tmp_path, TWOS, method="b")
+    result = run("compare", scores, others)
     assert result.exit_code == 0
     assert "package mine adds no metric" in result.stderr
     assert "broken_metric:METRICS" in result.stderr
@@ -979,7 +999,7 @@ def test_metrics_that_cannot_be_loaded(
 def assert_unreadable(path: Path) -> None:
     """Assert that a file is refused, and that the error names it."""
     with pytest.raises(UnreadableFileError) as caught:
-        compare(path, path)
+        compare(path, "persistence")
     assert caught.value.where == str(path)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import locate
 from lagbench.errors import WorkFailedError

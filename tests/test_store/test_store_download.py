@@ -18,7 +18,7 @@ from object_stores import Store, holding
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit

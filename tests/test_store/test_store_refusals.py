@@ -16,7 +16,7 @@ from object_stores import CREDENTIALS, files, machine
 from typer.testing import CliRunner
 
 import lagbench
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 from lagbench.data.layout import CACHE_VARIABLE
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.exchange import download

@@ -45,6 +45,7 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.submission import PredictionsWriter, open_predictions, template, write
+from lagbench.submission.writer import check_predictions_output
 
 SHAPE = (HORIZON, PARTICLES, 2)
 RIGHT = {scenario: truth(scenario) for scenario in TESTS}
@@ -152,6 +153,28 @@ def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
     assert caught.value.where == "--output"
     assert str(output) in str(caught.value)
     assert output.read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("name", ["x.pt", "x.JSON", "x.h5", "x.npz", "a.b.onnx"])
+def test_a_name_with_the_ending_of_another_format_is_refused(
+    bench: Bench, tmp_path: Path, name: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        template(
+            "cavity",
+            "tiny",
+            output=tmp_path / name,
+            root=bench.root,
+            registry=bench.registry,
+        )
+    assert caught.value.where == "--output"
+    assert ".nc" in str(caught.value.fix)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["x", "x.v2", "run-0.5", "x.nc4", "x.NC"])
+def test_predictions_need_no_ending(tmp_path: Path, name: str) -> None:
+    check_predictions_output(tmp_path / name, overwrite=False)
 
 
 def test_without_a_recorded_hash_one_must_be_given(

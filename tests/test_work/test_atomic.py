@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -48,14 +50,22 @@ def test_an_error_keeps_the_old_file(
 
 
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
-    """A usable folder is made and left empty. The error for an unusable one names its
-    option, before the work and during it.
+    """A usable folder is neither made nor changed. The error for an unusable one names
+    its option, before the work and during it.
     """
     check_writable(tmp_path / "deep" / "folder")
-    assert list((tmp_path / "deep" / "folder").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()
     file = tmp_path / "file"
-    for folder in (file, file / "below", Path("/proc/self")):
+    lost = tmp_path / "lost"
+    lost.symlink_to(tmp_path / "nowhere")
+    for folder in (
+        file,
+        file / "below",
+        lost,
+        tmp_path / ("x" * 300),
+        Path("/proc/self"),
+    ):
         with pytest.raises(WorkFailedError) as caught:
             check_writable(folder, option="--output")
         assert caught.value.where.startswith(str(folder.parent))
@@ -63,6 +73,28 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(WorkFailedError) as caught:
         write_atomically(file / "in-the-way", b"")
     assert caught.value.where.endswith("file/in-the-way")
+
+
+@pytest.mark.parametrize(
+    ("code", "hint"),
+    [
+        (errno.ENOSPC, "free disk space"),
+        (errno.EROFS, "can be written to"),
+        (errno.ENOENT, "can be written to"),
+        (errno.EIO, "can be written to"),
+    ],
+)
+def test_a_full_disk_and_a_vanished_one_have_their_own_advice(
+    code: int, hint: str, tmp_path: Path
+) -> None:
+    with (
+        pytest.raises(WorkFailedError) as caught,
+        atomic_path(tmp_path / "file", option="--output"),
+    ):
+        raise OSError(code, os.strerror(code))
+    assert hint in caught.value.fix
+    assert "--output" in caught.value.fix
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ os.open = no_folders
 COMMANDS = """
 import sys
 from typer.testing import CliRunner
-from lagbench.__main__ import app
+from lagbench.cli.program import app
 for line in sys.stdin.read().splitlines():
     done = CliRunner().invoke(app, line.split())
     assert done.exit_code == 0, (line, done.output)

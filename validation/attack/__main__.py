@@ -115,10 +115,10 @@ def _import_libraries() -> None:
     import onnxruntime  # noqa: F401
     import torch
 
-    import lagbench.__main__
     import lagbench.baselines.predict
     import lagbench.board.build
     import lagbench.board.check
+    import lagbench.cli.program
     import lagbench.scoring.score  # noqa: F401
 
     torch.set_num_threads(1)

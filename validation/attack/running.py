@@ -116,7 +116,7 @@ def _become_command(arguments: Sequence[str], folder: Path, logs: Path) -> None:
         null_device = os.open(os.devnull, os.O_RDONLY)
         os.dup2(null_device, 0)
         sys.argv = ["lagbench", *arguments]
-        from lagbench.__main__ import app
+        from lagbench.cli.program import app
 
         app(args=list(arguments), prog_name="lagbench")
         code = 0

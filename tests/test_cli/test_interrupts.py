@@ -1,0 +1,61 @@
+"""Ctrl-C ends a command with one line, from the first module that is imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+CONSOLE_COMMAND = "from lagbench.__main__ import app; sys.exit(app())"
+MODULE_COMMAND = "runpy.run_module('lagbench', run_name='__main__', alter_sys=True)"
+
+SEND_AT_IMPORT = """
+import os, runpy, signal, sys
+
+# The background jobs of a shell ignore the signal.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def interrupt(event, details):
+    if event == "import" and details[0] == {module!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+
+sys.addaudithook(interrupt)
+{call}
+"""
+"""A program that gets SIGINT as it begins to import a module."""
+
+
+def interrupt_import(call: str, module: str) -> subprocess.CompletedProcess[str]:
+    """Run `lagbench list`, with a Ctrl-C at the import of a module."""
+    return subprocess.run(
+        [sys.executable, "-c", SEND_AT_IMPORT.format(call=call, module=module), "list"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize("call", [CONSOLE_COMMAND, MODULE_COMMAND])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "lagbench.cli.program",
+        "importlib.metadata",
+        "typer",
+        "lagbench.errors",
+        "typer.completion",
+        "lagbench.data.layout",
+        "rich",
+    ],
+)
+def test_an_interrupt_of_the_first_imports_ends_with_one_line(
+    call: str, module: str
+) -> None:
+    done = interrupt_import(call, module)
+    assert done.returncode == 130, done.stderr
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("lagbench: interrupted")
