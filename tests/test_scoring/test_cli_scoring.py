@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import netCDF4
 import pytest
 import typer
 from conftest import SIZE, SPLIT
@@ -103,12 +104,24 @@ def test_a_template_replaces_predictions_only_on_request(
     run: Run, predictions: Path
 ) -> None:
     """The default size is the only one that is on the disk."""
-    predictions.write_bytes(b"the work of a week")
+    with netCDF4.Dataset(predictions, "a") as file:
+        file.setncattr("method", "the-work-of-a-week")
+    before = predictions.read_bytes()
     arguments = ("template", SPLIT, "-o", predictions)
     assert run(*arguments).exit_code == 2
-    assert predictions.read_bytes() == b"the work of a week"
+    assert predictions.read_bytes() == before
     assert run(*arguments, "--overwrite").exit_code == 0
+    assert predictions.read_bytes() != before
     assert run("validate", predictions).exit_code == 0
+
+
+def test_a_template_never_replaces_a_file_of_another_kind(
+    run: Run, predictions: Path
+) -> None:
+    predictions.write_bytes(b"the work of a week")
+    arguments = ("template", SPLIT, "-o", predictions, "--overwrite")
+    assert run(*arguments).exit_code == 2
+    assert predictions.read_bytes() == b"the work of a week"
 
 
 def test_a_template_is_no_folder(run: Run, tmp_path: Path) -> None:
