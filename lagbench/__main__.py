@@ -35,8 +35,10 @@ def _end_at_once(*_signal: object) -> NoReturn:
 
     An exception would not do: some modules catch what is raised as they are imported.
     """
-    os.write(2, MESSAGE)
-    os._exit(INTERRUPTED)
+    try:
+        os.write(2, MESSAGE)
+    finally:  # stderr may be closed, or a full disk
+        os._exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

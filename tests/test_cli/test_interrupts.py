@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -26,11 +28,14 @@ sys.addaudithook(interrupt)
 """A program that gets SIGINT as it begins to import a module."""
 
 
-def interrupt_import(call: str, module: str) -> subprocess.CompletedProcess[str]:
+def interrupt_import(
+    call: str, module: str, *, stderr: int | IO[str] = subprocess.PIPE
+) -> subprocess.CompletedProcess[str]:
     """Run `lagbench list`, with a Ctrl-C at the import of a module."""
     return subprocess.run(
         [sys.executable, "-c", SEND_AT_IMPORT.format(call=call, module=module), "list"],
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
         text=True,
         check=False,
         timeout=60,
@@ -59,3 +64,9 @@ def test_an_interrupt_of_the_first_imports_ends_with_one_line(
     lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("lagbench: interrupted")
+
+
+def test_an_interrupt_ends_with_its_code_where_stderr_is_full() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = interrupt_import(CONSOLE_COMMAND, "typer", stderr=full)
+    assert done.returncode == 130
