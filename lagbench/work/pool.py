@@ -25,7 +25,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TextIO
 
 from lagbench.errors import (
     LagbenchError,
@@ -323,12 +323,13 @@ def _forward_warnings(channel: Connection) -> None:
         category: type[Warning],
         filename: str,
         lineno: int,
-        *place: Any,  # noqa: ANN401
+        file: TextIO | None = None,
+        line: str | None = None,
     ) -> None:
         if category.__module__.startswith("lagbench."):
             channel.send(("warning", (message, category, filename, lineno)))
         else:
-            show_here(message, category, filename, lineno, *place)
+            show_here(message, category, filename, lineno, file, line)
 
     warnings.showwarning = forward
 
