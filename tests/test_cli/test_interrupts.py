@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO
 
@@ -70,3 +71,27 @@ def test_an_interrupt_ends_with_its_code_where_stderr_is_full() -> None:
     with Path("/dev/full").open("w") as full:
         done = interrupt_import(CONSOLE_COMMAND, "typer", stderr=full)
     assert done.returncode == 130
+
+
+IN_A_THREAD = """
+import sys, threading
+from lagbench.__main__ import app
+
+sys.argv = ["lagbench", "--version"]
+thread = threading.Thread(target=app)
+thread.start()
+thread.join()
+"""
+
+
+def test_the_program_runs_in_any_thread() -> None:
+    """Only the main thread may set what Ctrl-C does."""
+    done = subprocess.run(
+        [sys.executable, "-c", IN_A_THREAD],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.strip() == version("lagbench")
+    assert done.stderr == ""
