@@ -348,11 +348,24 @@ def _describe_hardware(machine: str) -> str:
     return f"{found_hardware['processor']}, {threads} {unit}"
 
 
+def costs_path(output: Path) -> Path:
+    """Return the file with the costs of predictions: .json in place of .nc.
+
+    Another ending is kept, so that run-0.5 and run-0.6 have costs of their own.
+
+    >>> costs_path(Path("predictions.nc")).name, costs_path(Path("run-0.5")).name
+    ('predictions.json', 'run-0.5.json')
+    """
+    if output.suffix.lower() == ".nc":
+        return output.with_suffix(".json")
+    return output.with_name(f"{output.name}.json")
+
+
 def _write_costs(result: PredictionResult) -> None:
     """Write the result as JSON beside the predictions."""
     values = {**asdict(result), "path": result.path.name}
     text = json.dumps(values, indent=2, sort_keys=True)
-    path = result.path.with_suffix(".json")
+    path = costs_path(result.path)
     write_atomically(path, text.encode() + b"\n", option="--output")
 
 
@@ -364,7 +377,7 @@ def check_outputs(output: Path, *, overwrite: bool) -> None:
             file, or its name has the ending of another format.
     """
     check_predictions_output(output, overwrite=overwrite)
-    costs = output.with_suffix(".json")
+    costs = costs_path(output)
     # costs belong to the predictions beside them, and go when these go
     check_output_file(costs, overwrite=True, signs=(b"seconds_without_search",))
 

@@ -748,7 +748,10 @@ def _shipped_predictor(own: Predictors) -> Attempt:
 
 
 def _barycentre(library: Library) -> Attempt:
-    """Return the attempt that matches all clouds again and again: fewer at once."""
+    """Return the attempt that matches clouds anew at each measured frame.
+
+    That takes long, so fewer particles are matched together than in other attempts.
+    """
     own = Predictors(library, most_together=MATCHED_TOGETHER)
     return Attempt(
         name="barycentre",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from typing import NoReturn
 
 MESSAGE = b"lagbench: interrupted before it began\n"
@@ -13,8 +14,7 @@ INTERRUPTED = 130
 def app() -> None:
     """Run the program with the words of the command line; ends with its exit code."""
     try:
-        # A shell's background jobs ignore the signal.
-        is_heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        is_heard = _is_interruptible()
         if is_heard:
             signal.signal(signal.SIGINT, _end_at_once)
         from .cli.program import app as program
@@ -26,8 +26,19 @@ def app() -> None:
         _end_at_once()
     finally:
         # All is written; Python's own end shall print no traceback.
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        if _is_interruptible():
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _is_interruptible() -> bool:
+    """Tell whether Ctrl-C raises KeyboardInterrupt in this thread.
+
+    A shell's background jobs ignore the signal. Only the main thread gets it, and only
+    there a handler can be set.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return False
+    return signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def _end_at_once(*_signal: object) -> NoReturn:
@@ -35,8 +46,10 @@ def _end_at_once(*_signal: object) -> NoReturn:
 
     An exception would not do: some modules catch what is raised as they are imported.
     """
-    os.write(2, MESSAGE)
-    os._exit(INTERRUPTED)
+    try:
+        os.write(2, MESSAGE)
+    finally:  # stderr may be closed, or a full disk
+        os._exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -227,13 +227,11 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
 
     variants = [_variant_line(model) for model in ROSTER.values() if model.variant_of]
     missing = [line for results in thesis_results for line in _missing_lines(results)]
-    parts += [
-        COMMANDS,
-        "\n".join(variants),
-        "## Missing",
-        MISSING_NOTE,
-        "\n".join(missing) or "Nothing.",
-    ]
+    parts += [COMMANDS, "\n".join(variants), "## Missing"]
+    if missing:
+        parts += [MISSING_NOTE, "\n".join(missing)]
+    else:
+        parts.append("Nothing.")
     return "\n\n".join(parts) + "\n"
 
 

@@ -6,8 +6,10 @@ import atexit
 import os
 import signal
 import time
+import warnings
 from pathlib import Path
 
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import DataError
 from lagbench.work.pool import Report
 
@@ -53,3 +55,9 @@ def sleep_long(marker: Path, report: Report) -> None:
 def leave_a_note(marker: Path, report: Report) -> None:
     """Write a file when the worker's interpreter exits by itself."""
     atexit.register(marker.write_text, "left in peace")
+
+
+def warn(report: Report) -> None:
+    """Give a warning of lagbench and one of Python."""
+    warnings.warn("package mine adds no metric", PluginWarning, stacklevel=1)
+    warnings.warn("a mean of nothing", RuntimeWarning, stacklevel=1)

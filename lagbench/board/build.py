@@ -350,8 +350,8 @@ def _form_tab(source: TabSource, _report: Report) -> Tab | None:
         failed_gates=source.failed_gates,
         shift=source.shift,
     )
-    # Pictures are let go tab by tab: those of all entries take more memory than
-    # everything else.
+    # No page shows more pictures of one tab. The pictures of all entries take more
+    # memory than everything else.
     (pictured,) = picture_first([tab], PICTURED_METHODS)
     return pictured
 

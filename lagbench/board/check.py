@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, Size, load
-from lagbench.errors import LagbenchError
+from lagbench.errors import LagbenchError, WorkFailedError
 from lagbench.references.shipped import shipped_path
 from lagbench.scoring.references import remeasure
 from lagbench.scoring.score import score
@@ -98,6 +98,7 @@ def check_board(
 
     Raises:
         UsageError: no leaderboard, or ``base`` is no revision of its repository.
+        WorkFailedError: a worker that forms the page was lost.
     """
     folder = Folder(board)
     full_registry = registry or load()
@@ -192,6 +193,8 @@ def _check_page(folder: Folder, registry: Registry) -> list[ValidationIssue]:
     """Return the issue of a page that is not what the entries give, if it is one."""
     try:
         build(folder.path, check=True, registry=registry)
+    except WorkFailedError:  # this machine failed, so nothing is known of the page
+        raise
     except LagbenchError as error:
         return [issue_from_error("page", error, error.where)]
     return []

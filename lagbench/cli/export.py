@@ -55,7 +55,8 @@ def export_command(
     overwrite: Annotated[
         bool,
         option(
-            "--overwrite --force", "Replace an earlier export, or write beside others."
+            "--overwrite --force",
+            "Replace an earlier export, or write beside other files.",
         ),
     ] = False,
     as_json: JsonFlag = False,

@@ -133,9 +133,10 @@ def _seconds_left(progress: Progress) -> float:
 
 
 def _format_rate(progress: Progress, unit: str) -> str:
-    """Return the count, and the rate: below one a second the time of one.
+    """Return how many units are done, and the rate.
 
-    Nothing where the work has none of the unit.
+    A rate below one unit a second is shown as the time of one unit. An empty text where
+    the work has no such units.
     """
     if not progress.scenarios and not progress.scenarios_done:
         return ""

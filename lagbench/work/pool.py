@@ -21,10 +21,11 @@ import subprocess
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TextIO
 
 from lagbench.errors import (
     LagbenchError,
@@ -45,6 +46,9 @@ ATTEMPTS = 3
 
 Report = Callable[[int], None]
 """Function that an item calls with the units of work done since its last call."""
+
+_shown_warnings: dict[Any, Any] = {}
+"""Warnings of workers that were shown: several workers may give the same one."""
 
 _FAREWELL = b""
 _PATIENCE = 20.0  # how long a worker may take to end by itself [s]
@@ -149,7 +153,9 @@ class Pool:
             ready_channels = wait([worker.channel for worker in busy_workers])
             for worker in busy_workers:
                 if worker.channel in ready_channels and worker.attempt is not None:
-                    yield self._receive(worker, worker.attempt)
+                    event = self._receive(worker, worker.attempt)
+                    if event is not None:
+                        yield event
 
     def _assign_queued(self) -> None:
         """Give queued items to idle workers; start workers up to the size."""
@@ -216,11 +222,18 @@ class Pool:
         self._workers.append(worker)
         return worker
 
-    def _receive(self, worker: _Worker, attempt: _Attempt) -> Event:
+    def _receive(self, worker: _Worker, attempt: _Attempt) -> Event | None:
+        """Return the news that a worker sent; None after it sent a warning."""
         try:
             kind, value = worker.channel.recv()
         except (EOFError, OSError):
             return self._bury(worker, attempt)
+        if kind == "warning":
+            message, category, file, line = value
+            warnings.warn_explicit(
+                message, category, file, line, registry=_shown_warnings
+            )
+            return None
         if kind == "progress":
             worker.progress += value
             return Event(item=attempt.item, kind=kind, value=value)
@@ -245,7 +258,8 @@ class Pool:
                 where=attempt.item.name,
                 expected="a worker that lives as long as the work",
                 got=cause,
-                fix="free memory or take fewer workers: --workers 1",
+                fix="free memory; where the command has the option --workers, take "
+                "fewer of them",
             )
         self._enqueue(next_attempt)
         return Event(item=attempt.item, kind="lost", value=worker.progress)
@@ -277,6 +291,7 @@ def serve(descriptor: int) -> None:
     """Run the items that arrive on a socket until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(descriptor)
+    _forward_warnings(channel)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def listen() -> None:
@@ -297,6 +312,26 @@ def serve(descriptor: int) -> None:
     if taichi is not None:
         with contextlib.suppress(Exception):
             taichi.reset()
+
+
+def _forward_warnings(channel: Connection) -> None:
+    """Send warnings of ours to the parent, which shows them as its own."""
+    show_here = warnings.showwarning
+
+    def forward(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if category.__module__.startswith("lagbench."):
+            channel.send(("warning", (message, category, filename, lineno)))
+        else:
+            show_here(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = forward
 
 
 def _run_item(message: bytes, channel: Connection) -> tuple[str, Any]:

@@ -710,6 +710,15 @@ def test_the_current_folder_is_not_replaced(
         check_outputs(Path(), overwrite=True)
 
 
+def test_predictions_without_an_ending_have_costs_of_their_own(
+    run: Predict, tmp_path: Path
+) -> None:
+    run(name="run-0.5", method="mine")
+    run(name="run-0.6", method="other")
+    names = {path.name for path in tmp_path.glob("run-*")}
+    assert names == {"run-0.5", "run-0.5.json", "run-0.6", "run-0.6.json"}
+
+
 def test_predictions_are_replaced_on_request_while_their_cost_is_beside_them(
     run: Predict, tmp_path: Path
 ) -> None:

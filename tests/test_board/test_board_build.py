@@ -6,8 +6,11 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shutil
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,7 @@ from lagbench.board.build import (
     make_curve,
     residual_histograms,
 )
+from lagbench.board.check import check_board
 from lagbench.board.columns import SKILL, value_of
 from lagbench.board.entry import Weights
 from lagbench.board.folder import Folder
@@ -39,13 +43,14 @@ from lagbench.board.ranking import combine
 from lagbench.board.selection import choose_data_sets
 from lagbench.board.show import tables, to_plain
 from lagbench.board.variants import find_variants
-from lagbench.data.registry import Registry
+from lagbench.data.registry import PluginWarning, Registry
 from lagbench.errors import (
     ChecksFailedError,
     DataError,
     LagbenchError,
     UnreadableFileError,
     UsageError,
+    WorkFailedError,
 )
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.predictor import Kind
@@ -426,12 +431,14 @@ TWO_DATA_SETS = ("poiseuille", "decaying-vortices")
 @pytest.fixture
 def two_tabs(tmp_path: Path) -> Path:
     """A copy of two data sets of the committed leaderboard."""
-    for folder in ("submissions", "scores"):
+    board = tmp_path / "board"
+    for folder in ("submissions", "scores", "weights"):
         for split in TWO_DATA_SETS:
-            shutil.copytree(COMMITTED / folder / split, tmp_path / folder / split)
-    return tmp_path
+            shutil.copytree(COMMITTED / folder / split, board / folder / split)
+    return board
 
 
+@pytest.mark.slow
 def test_workers_form_the_same_page(
     two_tabs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -448,18 +455,49 @@ def test_workers_form_the_same_page(
     assert by_workers.page.read_bytes() == page_of_here
 
 
-def test_a_worker_names_a_damaged_score_file(
-    two_tabs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def two_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boards of any size are formed by two workers."""
+    monkeypatch.setattr(board_build, "FEWEST_FOR_WORKERS", 1)
+    monkeypatch.setattr(board_build, "available_cores", lambda: 2)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("two_workers")
+def test_a_worker_names_a_damaged_score_file(two_tabs: Path) -> None:
     """An error in a worker process is that of this process."""
     damaged = next(two_tabs.glob("scores/poiseuille/*/*.nc"))
     damaged.write_bytes(damaged.read_bytes()[:5000])
-    monkeypatch.setattr(board_build, "FEWEST_FOR_WORKERS", 1)
-    monkeypatch.setattr(board_build, "available_cores", lambda: 2)
     with pytest.raises(UnreadableFileError) as caught:
         build(two_tabs)
     assert caught.value.where == str(damaged)
     assert not (two_tabs / "index.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("two_workers")
+def test_workers_name_a_broken_package_once(
+    two_tabs: Path, package: Callable[..., Path]
+) -> None:
+    package("metrics", "broken_metric:METRICS", "raise KeyError('mine')\n")
+    with warnings.catch_warnings(record=True, action="default") as caught:
+        build(two_tabs)
+    (warning,) = caught
+    assert warning.category is PluginWarning
+    assert "mine adds no metric" in str(warning.message)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("two_workers")
+def test_a_lost_worker_is_no_finding_of_the_check(
+    two_tabs: Path, package: Callable[..., Path]
+) -> None:
+    """Where the machine fails, nothing is known of the page."""
+    build(two_tabs)
+    deadly = f"import os\nif os.getpid() != {os.getpid()}:\n    os._exit(9)\n"
+    package("metrics", "deadly_metric:METRICS", f"{deadly}METRICS = ()\n")
+    with pytest.raises(WorkFailedError, match="died"):
+        check_board(two_tabs, page=True, isolated=False)
 
 
 def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:

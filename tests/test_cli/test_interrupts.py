@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -26,11 +29,14 @@ sys.addaudithook(interrupt)
 """A program that gets SIGINT as it begins to import a module."""
 
 
-def interrupt_import(call: str, module: str) -> subprocess.CompletedProcess[str]:
+def interrupt_import(
+    call: str, module: str, *, stderr: int | IO[str] = subprocess.PIPE
+) -> subprocess.CompletedProcess[str]:
     """Run `lagbench list`, with a Ctrl-C at the import of a module."""
     return subprocess.run(
         [sys.executable, "-c", SEND_AT_IMPORT.format(call=call, module=module), "list"],
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
         text=True,
         check=False,
         timeout=60,
@@ -59,3 +65,33 @@ def test_an_interrupt_of_the_first_imports_ends_with_one_line(
     lines = done.stderr.splitlines()
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("lagbench: interrupted")
+
+
+def test_an_interrupt_ends_with_its_code_where_stderr_is_full() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = interrupt_import(CONSOLE_COMMAND, "typer", stderr=full)
+    assert done.returncode == 130
+
+
+IN_A_THREAD = """
+import sys, threading
+from lagbench.__main__ import app
+
+sys.argv = ["lagbench", "--version"]
+thread = threading.Thread(target=app)
+thread.start()
+thread.join()
+"""
+
+
+def test_the_program_runs_in_any_thread() -> None:
+    """Only the main thread may set what Ctrl-C does."""
+    done = subprocess.run(
+        [sys.executable, "-c", IN_A_THREAD],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.strip() == version("lagbench")
+    assert done.stderr == ""

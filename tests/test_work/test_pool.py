@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pool_tasks
 import pytest
 from cluster_bench import gone
 
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.work.machine import available_cores, worker_count
 from lagbench.work.pool import ATTEMPTS, Pool, WorkItem
@@ -104,6 +106,22 @@ def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
     assert f"died {ATTEMPTS} times" in text
     assert "cavity tiny, scenario 3" in text
     assert "SIGKILL" in text
+
+
+def test_a_warning_of_ours_is_given_once_by_the_parent(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The filters of the parent count for it. Each worker would print its own."""
+    with Pool(2) as pool:
+        for name in ("a", "b"):
+            pool.submit(WorkItem(name=name, function=pool_tasks.warn))
+        with warnings.catch_warnings(record=True, action="default") as caught:
+            assert [event.kind for event in pool.events()] == ["done", "done"]
+    (warning,) = caught
+    assert warning.category is PluginWarning
+    stderr = capfd.readouterr().err
+    assert "PluginWarning" not in stderr
+    assert "a mean of nothing" in stderr
 
 
 def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:

@@ -90,9 +90,9 @@ def write_report(
 
 
 def check_folder(folder: str | Path) -> None:
-    """Make the folder of a report; refuse one that holds another page.
+    """Refuse, before the work, a folder in which no report can be written.
 
-    It is made before the work, so that the work is not lost.
+    The folder is not made here. A page of another kind in it is not replaced.
 
     Raises:
         UsageError: the folder holds an index.html that is no report.
