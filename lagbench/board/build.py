@@ -141,6 +141,9 @@ FEWEST_FOR_WORKERS = 40
 start, an entry a tenth to form.
 """
 
+MOST_WORKERS = 8
+"""Most of these processes, each of which takes some 150 MB of memory."""
+
 PICTURED_METHODS = 80
 """Most methods on all tabs together that have maps, histograms and a film: two thirds
 of a page of 150 entries would be theirs.
@@ -314,7 +317,7 @@ def _form_tabs(
 ) -> dict[tuple[str, str], Tab]:
     """Return the tabs of all data sets with entries of this task.
 
-    The tabs of a large leaderboard are formed side by side, one per core.
+    The tabs of a large leaderboard are formed in several processes side by side.
     """
     jobs = {}
     for data_set, source in sources.items():
@@ -323,7 +326,7 @@ def _form_tabs(
     entry_count = sum(len(source.paths) for source in jobs.values())
     workers = 1
     if entry_count >= FEWEST_FOR_WORKERS:
-        workers = available_cores()
+        workers = min(available_cores(), MOST_WORKERS)
     tabs = {}
     formed = run_all(_form_tab, jobs, workers=workers)
     for source, tab in zip(jobs.values(), formed, strict=True):
