@@ -597,12 +597,12 @@ def _name_leader(overview: SizeOverview) -> str:
             ranked.append(method)
     data_sets = count_data_sets(overview)
     if not ranked:
-        return f"No method has a skill on {data_sets} of size {overview.size}."
+        return f"No method was run on {data_sets} of size {overview.size}."
     leader = ranked[0]
     skill = text(leader.mean_skill)
     if len(ranked) == 1:
         return (
-            f"{leader.name} is the only method with a skill on {data_sets}. Its mean "
+            f"{leader.name} is the only method that was run on {data_sets}. Its mean "
             f"skill is {skill}."
         )
     second = ranked[1]

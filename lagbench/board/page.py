@@ -145,7 +145,8 @@ FOOT = (
 OVERVIEW_WORDS = (
     "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
     "prediction. “0.9×” is the error beside that of the best classical solver that "
-    "costs no more per frame: below 1, learning pays. The question is open where the "
+    "costs no more per frame than the model: below 1, learning pays. So two models of "
+    "one data set may stand beside different solvers. The question is open where the "
     "95 % interval contains 1. The error is the metric that ranks on the data set: "
     "that of vorticity in boxes full of fluid, the distance of particle clouds on free "
     "surfaces. The cost is the processor time of a frame on one core. Size mini is "
@@ -334,10 +335,11 @@ def draw_intro(board: Board) -> Markup:
     evidence = escaped(
         f"{entries} on {data_sets} that every x86-64 Linux CPU regenerates bit for "
         "bit. Every score follows from committed score files. "
-        f"{_describe_levels(rows)} {_describe_costs(rows)} "
+        f"{_describe_levels(rows)} {_describe_costs(rows)}"
     )
-    link = tag("a", "Take part", href="#take-part")
-    paragraphs.append(tag("p", evidence, link, class_="facts"))
+    paragraphs.append(tag("p", evidence, class_="facts"))
+    link = tag("a", "Take part", href="#take-part", class_="plain")
+    paragraphs.append(tag("p", link))
     return join(paragraphs)
 
 
@@ -373,7 +375,7 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
         clauses.append(f"scored the predictions of {predictions} again")
     if not clauses:
         return "All entries stand as submitted: nobody has scored them again yet."
-    sentence = f"The maintainers {' and '.join(clauses)}"
+    sentence = f"The maintainers of this leaderboard {' and '.join(clauses)}"
     if machines:
         sentence += f"; machine: {', '.join(sorted(machines))}"
     if counts[Level.AS_SUBMITTED]:
@@ -500,7 +502,8 @@ def _verdict_row(conclusion: Conclusion) -> Markup:
         model.append(tag("span", f" {conclusion.model}", class_="ci"))
     time = "unknown"
     if conclusion.slowdown is not None:
-        time = f"{text(conclusion.slowdown, 2)}×"
+        word = "slower" if conclusion.slowdown > 1.0 else "faster"
+        time = f"{text(conclusion.slowdown, 2)}×, {word}"
     learned = conclusion.learned
     cells = [
         tag("th", tag("a", tab.size.split, href=f"#{tab.id}"), scope="row"),

@@ -157,12 +157,16 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
             if not set(missing).isdisjoint(size.subsets[subset]):
                 incomplete_subsets.append(subset)
         names = ",".join(incomplete_subsets)
+        options = [f"--subset {names}"]
+        if "train" in incomplete_subsets:
+            # whoever trains will need the other subsets too
+            options = []
         raise DataError(
             f"{len(missing)} of {len(paths)} scenarios are not there",
             where=str(size.folder(root)),
             expected="all scenarios of these subsets",
             got=f"missing: {format_ids(missing)} of {names}",
-            fix=suggest_repair(size, f"--subset {names}", root=root),
+            fix=suggest_repair(size, *options, root=root),
         )
     return paths
 

@@ -924,6 +924,25 @@ def test_options_without_data_are_refused(
         WindowDataset(**all_options)
 
 
+@pytest.mark.parametrize(
+    ("subset", "advice"),
+    [
+        (
+            "valid",
+            "lagbench generate --split cavity --size tiny --subset valid --root ",
+        ),
+        ("train", "lagbench generate --split cavity --size tiny --root "),
+    ],
+)
+def test_whoever_trains_is_advised_to_generate_all_subsets(
+    tmp_path: Path, subset: str, advice: str
+) -> None:
+    """A training needs train, and later valid and test."""
+    with pytest.raises(DataError) as caught:
+        WindowDataset("cavity", "tiny", subset=subset, history=6, root=tmp_path)
+    assert str(caught.value.fix).startswith(advice)
+
+
 @pytest.mark.parametrize("limit", [0, 1e9, math.inf, np.float32(2.0**20)])
 def test_a_cache_has_any_number_of_bytes(location: Location, limit: float) -> None:
     """``1e9`` and infinity were refused, with advice for a text in quotes."""
