@@ -446,7 +446,7 @@ def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
     assert (
         "beat the solvers of their cost on 0 of 1; on 1 the question is open" in shown
     )
-    winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×"
+    winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×, slower"
     assert f"cavityyes{winner_cells}Net0.90× (0.80 to 1.1)" in shown
     paragraphs = read_html(page_of(board, tab)).named("p")
     ledes = [one for one in paragraphs if one.attributes.get("class") == "lede"]
