@@ -8,6 +8,7 @@ from pathlib import Path
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, suggest_name
+from lagbench.scoring.boards import suggest_board
 
 from .entry import DataSet, Entry, Status
 from .entry_file import read_entry
@@ -84,12 +85,13 @@ def choose_entries(
         for name in names:
             key = name.removesuffix(".yaml").rpartition("submissions/")[2]
             if key not in known:
+                in_other_board = suggest_board(key, searched=folder.path)
                 raise UsageError(
                     "no such entry",
                     where=str(folder.path),
                     expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
                     got=name,
-                    fix=_suggest_entry(key, known),
+                    fix=in_other_board or _suggest_entry(key, known),
                 )
             entry = read_entry(folder.path / known[key])
             if not has_models(entry):

@@ -39,7 +39,7 @@ from lagbench.references.table import REFERENCES, references_of
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
 
-from .boards import find_board, no_board
+from .boards import find_board, find_boards_here, no_board, suggest_board
 from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
@@ -476,16 +476,17 @@ def _no_such_entry(
     place: Place, board: Path | None, entries: Mapping[Place, Path]
 ) -> UsageError:
     """Return the error for the name of an entry that the leaderboard does not have."""
-    if board is None:
-        return no_board()
     name = "/".join(place)
+    in_other_board = suggest_board(name, searched=board)
+    if board is None:
+        return no_board(fix=in_other_board, offered=find_boards_here())
     names = ["/".join(known) for known in entries if known[0] == place[0]]
     return UsageError(
         "no such entry",
         where=str(board),
         expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
         got=ascii(name),
-        fix=suggest_name(name, names),
+        fix=in_other_board or suggest_name(name, names),
     )
 
 
@@ -518,7 +519,10 @@ def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -
     methods = [place[2] for place in entries if place[:2] == (size.split, size.name)]
     others = [" ".join(place[:2]) for place in entries if place[2] == name]
     fix = suggest_name(name, {*methods, *references})
-    if name in REFERENCES:
+    in_other_board = suggest_board(f"{size.split}/{size.name}/{name}")
+    if in_other_board is not None:
+        fix = in_other_board
+    elif name in REFERENCES:
         fix = f"{name} is a reference of other data sets; {fix}"
     elif others:
         fix = f"{name} is an entry of {', '.join(others)}; {fix}"
