@@ -11,6 +11,7 @@ import difflib
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -38,8 +39,15 @@ from lagbench.metrics.significance import compare as compare_scores
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
+from lagbench.submission.other_files import refuse_other_files
 
-from .boards import find_board, find_boards_here, no_board, suggest_board
+from .boards import (
+    find_board,
+    find_boards_here,
+    is_board,
+    no_board,
+    suggest_board,
+)
 from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
@@ -493,6 +501,7 @@ def _no_such_entry(
 def _check_files(source: str | Path) -> None:
     """Refuse a method of which some file is no regular one."""
     for path in _seed_files(Path(source)):
+        refuse_other_files(path)
         check_regular(path)
 
 
@@ -753,13 +762,20 @@ def _seed_files(path: Path) -> list[Path]:
             files += _score_files(folder)[:1]
         if files:
             return files
+    fix = "`lagbench score` writes them; or name a predictions.nc"
+    if is_board(path):
+        option = f"--board {shlex.quote(str(path))}"
+        fix = (
+            f"it is a leaderboard: name an entry as SPLIT/SIZE/METHOD, with {option}; "
+            f"to list them: lagbench leaderboard show {option}"
+        )
     raise UnreadableFileError(
         "no scores in the folder",
         where=str(path),
         expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
         f"method's seeds",
         got=", ".join(sorted(inner.name for inner in path.iterdir())[:5]) or "nothing",
-        fix="`lagbench score` writes them; or name a predictions.nc",
+        fix=fix,
     )
 
 
