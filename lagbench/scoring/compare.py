@@ -603,6 +603,9 @@ def _no_such_name(
     hint = ""
     if names:
         hint = f"{suggest_name(second, names)}; or "
+    in_other_board = suggest_board(f"{split}/{size}/{second}")
+    if in_other_board is not None:
+        hint = f"{in_other_board}; or "
     return UsageError(
         "neither a reference, nor an entry of the leaderboard, nor a file",
         where=f"{split} {size}",
@@ -769,12 +772,14 @@ def _seed_files(path: Path) -> list[Path]:
             f"it is a leaderboard: name an entry as SPLIT/SIZE/METHOD, with {option}; "
             f"to list them: lagbench leaderboard show {option}"
         )
+    names = sorted(inner.name for inner in path.iterdir())
+    visible_names = [name for name in names if not name.startswith(".")]
     raise UnreadableFileError(
         "no scores in the folder",
         where=str(path),
         expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
         f"method's seeds",
-        got=", ".join(sorted(inner.name for inner in path.iterdir())[:5]) or "nothing",
+        got=", ".join(visible_names[:5]) or "nothing",
         fix=fix,
     )
 
