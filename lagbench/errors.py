@@ -351,11 +351,11 @@ def check_regular(
 
 
 def _name_files_in(folder: Path) -> str:
-    """Return a hint that names the first files of a folder."""
+    """Return a hint that names the first files of a folder, without hidden ones."""
     names = []
     with contextlib.suppress(OSError):
         for file in sorted(folder.iterdir()):
-            if file.is_file():
+            if file.is_file() and not file.name.startswith("."):
                 names.append(ascii(file.name)[1:-1])
     if not names:
         return "name a file"

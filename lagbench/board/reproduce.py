@@ -49,7 +49,7 @@ from .entry_file import is_unchanged
 from .folder import Folder
 from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
 from .scores_compared import compare, sample_scenarios
-from .selection import choose_entries
+from .selection import choose_entries, name_submit_command
 from .verified import read_verified, record, verification_of
 
 
@@ -218,7 +218,8 @@ def open_model(
             where=str(entry.yaml_path),
             expected="a model of every seed beside the entry",
             got="none",
-            fix="its submitter may add one: lagbench submit --weights",
+            fix="its submitter may add one: "
+            f"{name_submit_command(entry.yaml_path, folder.path)}",
         )
     path = folder.path / prediction.weights.path
     place = Path(prediction.weights.path)

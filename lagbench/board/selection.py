@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, suggest_name
+from lagbench.scoring.boards import DEFAULT_BOARDS, suggest_board
 
 from .entry import DataSet, Entry, Status
 from .entry_file import read_entry
@@ -84,12 +86,13 @@ def choose_entries(
         for name in names:
             key = name.removesuffix(".yaml").rpartition("submissions/")[2]
             if key not in known:
+                in_other_board = suggest_board(key, searched=folder.path)
                 raise UsageError(
                     "no such entry",
                     where=str(folder.path),
                     expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
                     got=name,
-                    fix=_suggest_entry(key, known),
+                    fix=in_other_board or _suggest_entry(key, known),
                 )
             entry = read_entry(folder.path / known[key])
             if not has_models(entry):
@@ -98,7 +101,8 @@ def choose_entries(
                     where=key,
                     expected="weights.pt, safetensors or ONNX of each seed",
                     got="predictions only",
-                    fix="its submitter may add one: lagbench submit --weights",
+                    fix="its submitter may add one: "
+                    f"{name_submit_command(entry.yaml_path, folder.path)}",
                 )
             chosen.append(entry)
         return chosen
@@ -114,6 +118,27 @@ def choose_entries(
         if entry.status is Status.ACTIVE and has_models(entry) and is_present:
             chosen.append(entry)
     return chosen
+
+
+def name_submit_command(entry_path: PurePath, board: Path) -> str:
+    """Return the command that replaces an entry by one with a model.
+
+    Args:
+        entry_path: YAML file of the entry in the folder of the leaderboard.
+        board: that folder.
+
+    >>> path = PurePath("submissions/cavity/mini/gns.yaml")
+    >>> name_submit_command(path, Path("trial"))  # doctest: +NORMALIZE_WHITESPACE
+    'lagbench submit PREDICTIONS.nc --from meta.yaml --method gns --weights FILE
+    --replace --board trial'
+    """
+    board_option = ""
+    if board.resolve() != DEFAULT_BOARDS[0].resolve():
+        board_option = f" --board {shlex.quote(str(board))}"
+    return (
+        f"lagbench submit PREDICTIONS.nc --from meta.yaml --method {entry_path.stem} "
+        f"--weights FILE --replace{board_option}"
+    )
 
 
 def is_current(dataset: DataSet, size: Size) -> bool:

@@ -19,6 +19,7 @@ from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.checks import outside_share
 from lagbench.submission.format import WRITE
 from lagbench.submission.issues import ValidationResult
+from lagbench.submission.other_files import refuse_other_files
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
@@ -200,6 +201,7 @@ def _require_keys(meta: Meta) -> None:
 
 def _require_files(paths: Sequence[Path]) -> None:
     for path in paths:
+        refuse_other_files(path)
         check_file(path, fix=WRITE)
     if not paths:
         what = "no predictions"

@@ -52,6 +52,8 @@ OPTIONAL_LIBRARIES = {
     "distributed": "cluster",
     "s3fs": "s3",
     "pot": "transport",
+    "onnx": "onnx",
+    "onnxruntime": "onnx",
 }
 """Libraries of our extras, each with the name of its extra."""
 
@@ -62,6 +64,7 @@ PURPOSES = {
     "cluster": "work on a Dask cluster",
     "s3": "keep data in S3",
     "transport": "measure the Sinkhorn divergence",
+    "onnx": "export models to ONNX and predict with them",
 }
 """What each extra is for."""
 

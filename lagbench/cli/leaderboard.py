@@ -6,7 +6,7 @@ They are build, check, picture, reproduce, shift and show.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated
 
 import typer
@@ -18,7 +18,7 @@ from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
 from lagbench.board.measured_cost import TIMED_FRAMES
 from lagbench.board.reproduce import ReproduceResult, reproduce
-from lagbench.board.selection import choose_data_sets
+from lagbench.board.selection import choose_data_sets, name_submit_command
 from lagbench.board.shift import scores_of_seeds
 from lagbench.board.shift_run import ShiftResult, score_on_shift
 from lagbench.board.show import (
@@ -397,6 +397,8 @@ def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterat
                 f"({seed_result.difference:.1e} relative, {seed_result.scenarios} "
                 f"of {seed_result.of} scenarios){remark}"
             )
+        if path in result.differing:
+            yield _name_fix_of_difference(PurePath(path), result.folder)
         if verification.cost is not None and with_costs:
             cost = verification.cost
             yield (
@@ -408,6 +410,17 @@ def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterat
         f"{result.folder}: {format_count(len(result.lines), 'entry')}, "
         f"{format_count(len(result.differing), 'difference')}, "
         f"{format_count(len(result.failures), 'failure')}"
+    )
+
+
+def _name_fix_of_difference(entry_path: PurePath, board: Path) -> str:
+    """Return the line that follows an entry whose model gives other scores."""
+    _, split, size, _ = entry_path.parts
+    submit = name_submit_command(entry_path, board)
+    return (
+        "  fix: if the predictions are of other weights, predict again with these and "
+        f"replace the entry: lagbench predict FILE --split {split} --size {size} "
+        f"-o PREDICTIONS.nc; {submit}"
     )
 
 

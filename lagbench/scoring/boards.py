@@ -43,9 +43,9 @@ def find_board(board: str | Path | None = None, *, reads: bool = False) -> Path:
     if board is not None:
         if is_board(Path(board)):
             return Path(board)
-        raise no_board(Path(board), offered=defaults if reads else ())
+        raise no_board(Path(board), offered=defaults[:1] if reads else ())
     if not defaults:
-        raise no_board()
+        raise no_board(offered=find_boards_here())
     return defaults[0]
 
 
@@ -90,7 +90,7 @@ def no_board(
         offered: leaderboards to offer where none has a similar name.
     """
     fix = fix or "run it from the root of the clone, or name it: --board FOLDER"
-    boards = find_boards_near(folder) or offered[:1]
+    boards = find_boards_near(folder) or offered[:MOST_BOARDS]
     if boards:
         names = ", ".join(map(str, boards))
         fix = f"there is a leaderboard in {names}: name it; or {fix}"
@@ -116,3 +116,37 @@ def find_boards_near(folder: Path) -> list[Path]:
         similar_names = get_close_matches(folder.name, names, n=MOST_BOARDS)
         candidates += [folder.parent / name for name in similar_names]
     return [candidate for candidate in candidates if is_board(candidate)]
+
+
+def find_boards_here() -> list[Path]:
+    """Return the leaderboards among the folders of the working folder, by name."""
+    names: list[str] = []
+    with suppress(OSError):
+        names = sorted(os.listdir("."))[:MOST_NAMES]
+    return [Path(name) for name in names if is_board(Path(name))]
+
+
+def suggest_board(entry: str, *, searched: Path | None = None) -> str | None:
+    """Return a hint that names the leaderboards which have an entry; None without one.
+
+    Args:
+        entry: the entry, as in ``cavity/mini/gns``.
+        searched: the leaderboard that does not have it.
+    """
+    place = Path(entry)
+    if len(place.parts) != 3 or place.is_absolute() or ".." in place.parts:
+        return None
+    options = []
+    resolved = set()
+    if searched is not None:
+        resolved.add(searched.resolve())
+    for board in (*find_boards_here(), *DEFAULT_BOARDS):
+        is_entry = False
+        with suppress(OSError, ValueError):
+            is_entry = (board / SUBMISSIONS / f"{entry}.yaml").is_file()
+        if is_entry and board.resolve() not in resolved:
+            resolved.add(board.resolve())
+            options.append(f"--board {shlex.quote(str(board))}")
+    if not options:
+        return None
+    return f"another leaderboard has it: {', or '.join(options[:MOST_BOARDS])}"

@@ -11,6 +11,7 @@ import difflib
 import math
 import os
 import re
+import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -38,8 +39,15 @@ from lagbench.metrics.significance import compare as compare_scores
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.submission.format import MAX_NAME
 from lagbench.submission.issues import ValidationResult
+from lagbench.submission.other_files import refuse_other_files
 
-from .boards import find_board, no_board
+from .boards import (
+    find_board,
+    find_boards_here,
+    is_board,
+    no_board,
+    suggest_board,
+)
 from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
@@ -476,22 +484,24 @@ def _no_such_entry(
     place: Place, board: Path | None, entries: Mapping[Place, Path]
 ) -> UsageError:
     """Return the error for the name of an entry that the leaderboard does not have."""
-    if board is None:
-        return no_board()
     name = "/".join(place)
+    in_other_board = suggest_board(name, searched=board)
+    if board is None:
+        return no_board(fix=in_other_board, offered=find_boards_here())
     names = ["/".join(known) for known in entries if known[0] == place[0]]
     return UsageError(
         "no such entry",
         where=str(board),
         expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
         got=ascii(name),
-        fix=suggest_name(name, names),
+        fix=in_other_board or suggest_name(name, names),
     )
 
 
 def _check_files(source: str | Path) -> None:
     """Refuse a method of which some file is no regular one."""
     for path in _seed_files(Path(source)):
+        refuse_other_files(path)
         check_regular(path)
 
 
@@ -518,7 +528,10 @@ def _require_opponent(name: str, size: Size, *, entries: Mapping[Place, Path]) -
     methods = [place[2] for place in entries if place[:2] == (size.split, size.name)]
     others = [" ".join(place[:2]) for place in entries if place[2] == name]
     fix = suggest_name(name, {*methods, *references})
-    if name in REFERENCES:
+    in_other_board = suggest_board(f"{size.split}/{size.name}/{name}")
+    if in_other_board is not None:
+        fix = in_other_board
+    elif name in REFERENCES:
         fix = f"{name} is a reference of other data sets; {fix}"
     elif others:
         fix = f"{name} is an entry of {', '.join(others)}; {fix}"
@@ -590,6 +603,9 @@ def _no_such_name(
     hint = ""
     if names:
         hint = f"{suggest_name(second, names)}; or "
+    in_other_board = suggest_board(f"{split}/{size}/{second}")
+    if in_other_board is not None:
+        hint = f"{in_other_board}; or "
     return UsageError(
         "neither a reference, nor an entry of the leaderboard, nor a file",
         where=f"{split} {size}",
@@ -749,13 +765,22 @@ def _seed_files(path: Path) -> list[Path]:
             files += _score_files(folder)[:1]
         if files:
             return files
+    fix = "`lagbench score` writes them; or name a predictions.nc"
+    if is_board(path):
+        option = f"--board {shlex.quote(str(path))}"
+        fix = (
+            f"it is a leaderboard: name an entry as SPLIT/SIZE/METHOD, with {option}; "
+            f"to list them: lagbench leaderboard show {option}"
+        )
+    names = sorted(inner.name for inner in path.iterdir())
+    visible_names = [name for name in names if not name.startswith(".")]
     raise UnreadableFileError(
         "no scores in the folder",
         where=str(path),
         expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
         f"method's seeds",
-        got=", ".join(sorted(inner.name for inner in path.iterdir())[:5]) or "nothing",
-        fix="`lagbench score` writes them; or name a predictions.nc",
+        got=", ".join(visible_names[:5]) or "nothing",
+        fix=fix,
     )
 
 

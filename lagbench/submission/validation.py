@@ -53,6 +53,7 @@ from .issues import (
     ValidationResult,
     sort_issues,
 )
+from .other_files import refuse_other_files
 from .predictions import attach
 from .start import check_start, read_starts
 from .task_checks import (
@@ -138,6 +139,7 @@ def validate(
     file = Path(path).absolute()
     splits = load_rooted_registry(folder, registry)
     try:
+        refuse_other_files(file)
         check_file(file, fix=WRITE)
         with _open_caller(file, isolated=isolated) as caller:
             size, answer = _examine(

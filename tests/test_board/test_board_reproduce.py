@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 from model_board import NAME, PATH, ModelBoard
-from typer.testing import Result
+from typer.testing import CliRunner, Result
 
 from lagbench.board.check import CheckResult
 from lagbench.board.entry import Level, Verification
@@ -18,6 +19,7 @@ from lagbench.board.folder import Folder
 from lagbench.board.reproduce import ReproduceResult, reproduce
 from lagbench.board.scores_compared import TOLERANCE, sample_scenarios
 from lagbench.board.verified import read_verified
+from lagbench.cli.program import app
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError
 
@@ -143,6 +145,31 @@ def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
     assert line.level is Level.AS_SUBMITTED
     (one,) = line.reproduced
     assert one.difference > TOLERANCE
+
+    words = ["leaderboard", "reproduce", NAME, "--no-costs"]
+    where = ["--board", str(own.folder), "--root", str(own.root)]
+    printed = CliRunner().invoke(app, [*words, *where])
+    assert printed.exit_code == ChecksFailedError.exit_code
+    assert "NOT reproduced" in printed.stdout
+    text = " ".join(printed.stdout.split())
+    assert "fix: if the predictions are of other weights" in text
+    for part in ("lagbench predict FILE --split", "lagbench submit", "--replace"):
+        assert part in text
+
+
+def test_an_entry_without_a_model_names_the_command_that_adds_one(
+    own: ModelBoard,
+) -> None:
+    """`lagbench submit --weights` alone did not run."""
+    own.submit(own.shifted(0.01), replace=True)
+    with pytest.raises(UsageError, match="no model to run") as caught:
+        run_again(own, NAME)
+    command = str(caught.value.fix).partition("lagbench ")[2]
+    assert f"--board {own.folder}" in command
+    result = CliRunner().invoke(app, [*shlex.split(command), "--help"])
+    assert result.exit_code == 0, result.output
+    for option in ("--from", "--method", "--weights", "--replace"):
+        assert option in command
 
 
 def test_a_line_holds_for_its_models_only(own: ModelBoard) -> None:

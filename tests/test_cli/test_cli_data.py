@@ -379,6 +379,7 @@ def test_doctor_knows_the_libraries_of_every_extra() -> None:
         if extra in doctor.PURPOSES:
             declared[library_name(requirement)] = extra
     assert declared == doctor.OPTIONAL_LIBRARIES
+    assert "onnx" in doctor.PURPOSES  # docs/submitting.md needs it
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

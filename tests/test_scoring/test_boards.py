@@ -6,8 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from lagbench.board.folder import Folder
+from lagbench.board.selection import choose_entries
+from lagbench.data.registry import load
 from lagbench.errors import UsageError
-from lagbench.scoring.boards import board_option, find_board, require_board
+from lagbench.scoring.boards import (
+    board_option,
+    find_board,
+    require_board,
+    suggest_board,
+)
+from lagbench.scoring.compare import compare
 
 
 @pytest.fixture
@@ -50,3 +59,34 @@ def test_no_other_leaderboard_is_offered_to_write_into(board: str, here: Path) -
 def test_a_command_names_a_board_that_is_not_the_default(here: Path) -> None:
     assert board_option(here / "leaderboard") == ""
     assert board_option("autumn-board") == " --board autumn-board"
+
+
+def test_the_leaderboard_that_has_an_entry_is_named(here: Path) -> None:
+    """Its option helps more than a similar entry of the leaderboard that was read."""
+    for board, method in (("leaderboard", "mlp"), ("autumn-board", "small")):
+        folder = here / board / "submissions" / "cavity" / "mini"
+        folder.mkdir(parents=True)
+        (folder / f"{method}.yaml").write_text("")
+    entry = "cavity/mini/small"
+    assert str(suggest_board(entry)).endswith(": --board autumn-board")
+    assert suggest_board(entry, searched=here / "autumn-board") is None
+    for name in ("cavity/mini/none", "small", "../mini/small", "a\0/b/c"):
+        assert suggest_board(name) is None
+
+    with pytest.raises(UsageError) as caught:
+        choose_entries(Folder("leaderboard"), [entry], load())
+    assert "--board autumn-board" in str(caught.value.fix)
+    assert "did you mean" not in str(caught.value.fix)
+    with pytest.raises(UsageError, match="no such entry") as caught:
+        compare(entry, "persistence", board="leaderboard")
+    assert "--board autumn-board" in str(caught.value.fix)
+
+
+def test_without_a_default_the_leaderboards_here_are_named(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lagbench.scoring.boards.DEFAULT_BOARDS", (Path("none"),))
+    (here / "leaderboard" / "submissions").rmdir()
+    with pytest.raises(UsageError, match="no leaderboard here") as caught:
+        find_board()
+    assert "autumn-board" in str(caught.value.fix)

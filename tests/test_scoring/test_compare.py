@@ -388,6 +388,25 @@ def test_an_entry_of_the_leaderboard_goes_by_its_name(
     assert caught.value.where == str(entries)
 
 
+@pytest.mark.slow
+def test_a_bare_name_of_another_leaderboard_names_that_board(
+    scored: Folders,
+    entries: Path,
+    bench: ScoreBench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The working folder holds the leaderboard that has the entry."""
+    folder = entries / "submissions" / bench.size.split / bench.size.name
+    folder.mkdir(parents=True)
+    (folder / "moving.yaml").write_text("")
+    other = entries.parent / "other"
+    (other / "submissions").mkdir(parents=True)
+    monkeypatch.chdir(entries.parent)
+    with pytest.raises(UsageError) as caught:
+        compare(scored["still"], "moving", board=other)
+    assert f"--board {entries.name}" in str(caught.value.fix)
+
+
 def test_a_board_without_the_entry_is_named(tmp_path: Path) -> None:
     """An empty leaderboard is one."""
     (tmp_path / "empty" / "submissions").mkdir(parents=True)
