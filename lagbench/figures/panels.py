@@ -468,11 +468,14 @@ def colour_scale(
     Speeds and magnitudes start at 0, vorticities of the plane at minus the limit.
     """
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
 
     if panel is Panel.VORTICITY and not is_solid:
-        return ScalarMappable(Normalize(-limit, limit), build_vorticity_map())
-    return ScalarMappable(Normalize(0.0, limit), build_speed_map())
+        scale = ScalarMappable(cmap=build_vorticity_map())
+        scale.set_clim(-limit, limit)
+    else:
+        scale = ScalarMappable(cmap=build_speed_map())
+        scale.set_clim(0.0, limit)
+    return scale
 
 
 def colour_bar(

@@ -228,8 +228,7 @@ def linear_field(points: Floats, values: Floats) -> Field:
 
     Beyond the points the field has the value at the nearest one.
     """
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import KDTree
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
     linear = LinearNDInterpolator(points, values)
 
@@ -237,9 +236,8 @@ def linear_field(points: Floats, values: Floats) -> Field:
         velocity = np.asarray(linear(at), np.float64)
         is_beyond = np.isnan(velocity[:, 0])
         if is_beyond.any():
-            tree = KDTree(points)
-            _, nearest = tree.query(at[is_beyond])
-            velocity[is_beyond] = values[nearest]
+            nearest = NearestNDInterpolator(points, values)
+            velocity[is_beyond] = nearest(at[is_beyond])
         return velocity
 
     return field
