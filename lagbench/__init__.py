@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -99,8 +100,6 @@ def __dir__() -> list[str]:
 
 def _has_torch() -> bool:
     """Return whether PyTorch is installed, without importing it."""
-    from importlib.util import find_spec
-
     try:
         return find_spec("torch") is not None
     except ValueError:  # sys.modules holds None, or a module without a specification

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
+from lagbench.errors import require
 
 from .canvas import build_speed_map, build_vorticity_map
 from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL
@@ -334,8 +335,6 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) ->
     Dots are cut off at the walls. In three dimensions farther ones are drawn first,
     and paler.
     """
-    from matplotlib.colors import to_rgba_array
-
     recording = scene.recording
     step = math.ceil(len(scene.position) / MOST_DOTS)
     position = scene.position[::step]
@@ -346,7 +345,8 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any], panel: Panel) ->
         dot_diameter = DOT_DIAMETER_SOLID
         place, depth, scale = _project(recording, position, panel)
         order = np.argsort(-depth, kind="stable")
-        rgb = to_rgba_array(colours)[order, :3]
+        matplotlib_colors = require("matplotlib.colors", extra="plots")
+        rgb = matplotlib_colors.to_rgba_array(colours)[order, :3]
         colours = shade(rgb, depth[order], np.ones(3))
         position = place[order]
     x, y = position.T
