@@ -2,27 +2,24 @@
 
 The truth's snapshots and fields are formed once for the submission and the references
 beside it; memory is that of a few frames, whatever the horizon. The few pictures of a
-submission that a board page shows are taken while it is scored. A metric of another
-package that fails is named.
+submission that a board page shows are taken while it is scored.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.errors import WorkFailedError, find_place_in_extension
 from lagbench.metrics.aggregate import Tally, measure, round_statistics
 from lagbench.metrics.distributions import BINS, histograms
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
 from lagbench.metrics.metric import Metric
-from lagbench.metrics.table import METRICS, select
+from lagbench.metrics.table import select
 from lagbench.references.predictor import (
     Given,
     Prediction,
@@ -32,11 +29,11 @@ from lagbench.references.predictor import (
 from lagbench.references.table import REFERENCES
 from lagbench.store.copy import update_working_copy
 from lagbench.submission.format import FileInfo
-from lagbench.submission.issues import Severity, ValidationIssue, quote
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
+from .package_metrics import package_metric_errors
 from .score_layout import FRAMES, PARTICLES, SUBMISSION, Preview
 from .task import ScoredTask
 
@@ -258,91 +255,3 @@ def measure_rows(
     for name, values in measured.items():
         tallies[name] = round_statistics(Tally.of(names, frames, values))
     return tallies, tracer.result()
-
-
-# --- metrics that are not ours and fail -----------------------------------------------
-
-# One of another package costs its own column, not the score. One that a user hands over
-# ends the scoring.
-
-PACKAGE_METRIC_FIX = "mend it, or leave it out: uninstall the package that adds it"
-OWN_METRIC_FIX = "mend the function, or leave it out of metrics="
-
-
-class PackageMetricError(WorkFailedError):
-    """A metric of another package failed."""
-
-    def __init__(self, metric: str, *, where: str, got: str) -> None:
-        self.metric = metric  # its name
-        super().__init__(
-            f"the metric {metric} failed, which is none of lagbench",
-            where=where,
-            expected="a number",
-            got=got,
-            fix=PACKAGE_METRIC_FIX,
-        )
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Rebuild with keyword arguments, so that errors cross process borders."""
-        rebuild: Callable[..., PackageMetricError] = functools.partial(
-            type(self), self.metric, where=str(self.where), got=str(self.got)
-        )
-        return rebuild, ()
-
-
-@contextmanager
-def package_metric_errors() -> Iterator[None]:
-    """Name the metric of another package that raises an error, and its line.
-
-    Raises:
-        PackageMetricError: such a metric failed. Errors of ours go on as they are.
-    """
-    try:
-        yield
-    except Exception as error:
-        name = getattr(error, "metric_name", None)
-        if name is None or name in METRICS:
-            raise
-        notes = ", ".join(getattr(error, "__notes__", ()))
-        places = [
-            find_place_in_extension(error),
-            getattr(error, "where", None),
-            notes or None,
-        ]
-        where = ", ".join(place for place in places if place)
-        raise PackageMetricError(
-            name, where=where, got=quote(f"{type(error).__name__}: {error}")
-        ) from error
-
-
-def drop_metric(metrics: Sequence[Metric], name: str) -> tuple[Metric, ...]:
-    """Return the metrics without one, and without those that follow from it."""
-    rest = []
-    for metric in metrics:
-        if name not in (metric.name, *metric.of):
-            rest.append(metric)
-    return tuple(rest)
-
-
-def own_metric_error(error: PackageMetricError) -> WorkFailedError:
-    """Return the error for a metric that the user hands over, as it failed."""
-    return WorkFailedError(
-        f"the metric {error.metric}, which is your own, failed",
-        where=error.where,
-        expected="a number",
-        got=error.got,
-        fix=OWN_METRIC_FIX,
-    )
-
-
-def describe_failure(error: PackageMetricError) -> ValidationIssue:
-    """Return the warning for a metric that was left out of a score."""
-    return ValidationIssue(
-        check="metric",
-        severity=Severity.WARNING,
-        what=f"{error.what}; its column is left out",
-        where=str(error.where),
-        expected=str(error.expected),
-        got=f"{error.got} in {error.where}",
-        fix=PACKAGE_METRIC_FIX,
-    )

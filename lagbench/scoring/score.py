@@ -46,18 +46,16 @@ from lagbench.work.run import run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, judge_copying, judge_physics, judge_predictability
-from .published_scores import read_scores
-from .references import check_train, measurable
-from .scenario import (
+from .package_metrics import (
     PackageMetricError,
-    ScenarioJob,
-    ScenarioScores,
     describe_failure,
     drop_metric,
     own_metric_error,
     package_metric_errors,
-    score_scenario,
 )
+from .published_scores import read_scores
+from .references import check_train, measurable
+from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics

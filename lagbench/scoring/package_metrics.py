@@ -1,0 +1,98 @@
+"""Metrics that are not ours and fail.
+
+One of another package costs its own column, not the score. One that a user hands over
+ends the scoring.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from lagbench.errors import WorkFailedError, find_place_in_extension
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import METRICS
+from lagbench.submission.issues import Severity, ValidationIssue, quote
+
+FIX = "mend it, or leave it out: uninstall the package that adds it"
+OWN_FIX = "mend the function, or leave it out of metrics="
+
+
+class PackageMetricError(WorkFailedError):
+    """A metric of another package failed."""
+
+    def __init__(self, metric: str, *, where: str, got: str) -> None:
+        self.metric = metric  # its name
+        super().__init__(
+            f"the metric {metric} failed, which is none of lagbench",
+            where=where,
+            expected="a number",
+            got=got,
+            fix=FIX,
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Rebuild with keyword arguments, so that errors cross process borders."""
+        rebuild: Callable[..., PackageMetricError] = functools.partial(
+            type(self), self.metric, where=str(self.where), got=str(self.got)
+        )
+        return rebuild, ()
+
+
+@contextmanager
+def package_metric_errors() -> Iterator[None]:
+    """Name the metric of another package that raises an error, and its line.
+
+    Raises:
+        PackageMetricError: such a metric failed. Errors of ours go on as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        name = getattr(error, "metric_name", None)
+        if name is None or name in METRICS:
+            raise
+        notes = ", ".join(getattr(error, "__notes__", ()))
+        places = [
+            find_place_in_extension(error),
+            getattr(error, "where", None),
+            notes or None,
+        ]
+        where = ", ".join(place for place in places if place)
+        raise PackageMetricError(
+            name, where=where, got=quote(f"{type(error).__name__}: {error}")
+        ) from error
+
+
+def drop_metric(metrics: Sequence[Metric], name: str) -> tuple[Metric, ...]:
+    """Return the metrics without one, and without those that follow from it."""
+    rest = []
+    for metric in metrics:
+        if name not in (metric.name, *metric.of):
+            rest.append(metric)
+    return tuple(rest)
+
+
+def own_metric_error(error: PackageMetricError) -> WorkFailedError:
+    """Return the error for a metric that the user hands over, as it failed."""
+    return WorkFailedError(
+        f"the metric {error.metric}, which is your own, failed",
+        where=error.where,
+        expected="a number",
+        got=error.got,
+        fix=OWN_FIX,
+    )
+
+
+def describe_failure(error: PackageMetricError) -> ValidationIssue:
+    """Return the warning for a metric that was left out of a score."""
+    return ValidationIssue(
+        check="metric",
+        severity=Severity.WARNING,
+        what=f"{error.what}; its column is left out",
+        where=str(error.where),
+        expected=str(error.expected),
+        got=f"{error.got} in {error.where}",
+        fix=FIX,
+    )
