@@ -42,8 +42,9 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     (16.0, 16.0)
     """
     lateral = 1.0 + poisson
+    volumetric = 1.0 - 2.0 * poisson
     mu = young / (2.0 * lateral)
-    la = young * poisson / (lateral * (1.0 - 2.0 * poisson))
+    la = young * poisson / (lateral * volumetric)
     return mu, la
 
 
@@ -54,6 +55,12 @@ def larger(a: f32, b: f32) -> f32:
     This is one instruction, unlike max.
     """
     return ti.select(a > b, a, b)
+
+
+@ti.func
+def smaller(a: f32, b: f32) -> f32:
+    """Return the smaller of two numbers, b if a is not a number."""
+    return -larger(-a, -b)
 
 
 @ti.func
@@ -68,7 +75,8 @@ def exponential(z: f32) -> f32:
     high = (1.0 / 24.0 + t * (1.0 / 120.0)) + square * (1.0 / 720.0)
     mid = 0.5 + t * (1.0 / 6.0)
     low = 1.0 + t
-    e = low + square * (mid + square * high)
+    second_order = mid + square * high
+    e = low + square * second_order
     for _ in ti.static(range(4)):
         e = e * e
     return e
@@ -77,7 +85,11 @@ def exponential(z: f32) -> f32:
 @ti.func
 def determinant(f: mat2) -> f32:
     """Return det F."""
-    return f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+    xx = f[0, 0]
+    xy = f[0, 1]
+    yx = f[1, 0]
+    yy = f[1, 1]
+    return xx * yy - xy * yx
 
 
 @ti.func
@@ -86,9 +98,14 @@ def rotation(f: mat2) -> vec3:
 
     Where q vanishes (F a reflection, or nothing at all) R is the identity.
     """
-    e = 0.5 * (f[0, 0] + f[1, 1])
-    g = 0.5 * (f[1, 0] - f[0, 1])
-    q = ti.sqrt(e * e + g * g)
+    xx = f[0, 0]
+    xy = f[0, 1]
+    yx = f[1, 0]
+    yy = f[1, 1]
+    e = 0.5 * (xx + yy)
+    g = 0.5 * (yx - xy)
+    q_square = e * e + g * g
+    q = ti.sqrt(q_square)
     cosine = 1.0
     sine = 0.0
     if q > _STRETCH_EPSILON:
@@ -99,14 +116,30 @@ def rotation(f: mat2) -> vec3:
 
 
 @ti.func
+def reflection(f: mat2) -> Value:
+    """Return h and k of the scaled reflection in F."""
+    xx = f[0, 0]
+    xy = f[0, 1]
+    yx = f[1, 0]
+    yy = f[1, 1]
+    h = 0.5 * (xx - yy)
+    k = 0.5 * (yx + xy)
+    return h, k
+
+
+@ti.func
 def viscous_stress(c: mat2, viscosity: f32) -> mat2:
     """Return mu (C + C^T).
 
     C is the velocity gradient [1/s], mu the dynamic viscosity [mass/s].
     """
-    shear = viscosity * (c[0, 1] + c[1, 0])
-    normal_x = 2.0 * viscosity * c[0, 0]
-    normal_y = 2.0 * viscosity * c[1, 1]
+    stretch_rate_x = c[0, 0]
+    stretch_rate_y = c[1, 1]
+    shear_rate = c[0, 1] + c[1, 0]
+    double_viscosity = 2.0 * viscosity
+    normal_x = double_viscosity * stretch_rate_x
+    normal_y = double_viscosity * stretch_rate_y
+    shear = viscosity * shear_rate
     return mat2([normal_x, shear], [shear, normal_y])
 
 
@@ -125,16 +158,20 @@ def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     in [mass/s^2].
     """
     cosine, sine, q = rotation(f)
-    h = 0.5 * (f[0, 0] - f[1, 1])
-    k = 0.5 * (f[1, 0] + f[0, 1])
+    h, k = reflection(f)
     r_square = h * h + k * k
     jacobian = q * q - r_square
-    volumetric = la * (jacobian - 1.0) * jacobian
+    volume_change = jacobian - 1.0
+    volumetric = la * volume_change * jacobian
+
+    double_mu = 2.0 * mu
     isotropic = q * (q - 1.0) + r_square
-    mean = 2.0 * mu * isotropic + volumetric
-    w_factor = 2.0 * mu * (2.0 * q - 1.0)
-    normal = w_factor * (cosine * h - sine * k)
-    shear = w_factor * (cosine * k + sine * h)
+    mean = double_mu * isotropic + volumetric
+    w_factor = double_mu * (2.0 * q - 1.0)
+    w_normal = cosine * h - sine * k
+    w_shear = cosine * k + sine * h
+    normal = w_factor * w_normal
+    shear = w_factor * w_shear
     normal_x = mean + normal
     normal_y = mean - normal
     return mat2([normal_x, shear], [shear, normal_y])
@@ -164,24 +201,32 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
         :data:`STRETCH_MIN`) over clamped ones.
     """
     cosine, sine, q = rotation(f)
-    h = 0.5 * (f[0, 0] - f[1, 1])
-    k = 0.5 * (f[1, 0] + f[0, 1])
-    r = ti.sqrt(h * h + k * k)
+    h, k = reflection(f)
+    r_square = h * h + k * k
+    r = ti.sqrt(r_square)
     trial_high = q + r
     trial_low = q - r
     new_high = bounded(trial_high, low, high)
     new_low = bounded(trial_low, low, high)
     new_q = 0.5 * (new_high + new_low)
+    new_r = 0.5 * (new_high - new_low)
 
     r_ratio = 0.0
     if r > _SHEAR_EPSILON:
-        r_ratio = 0.5 * (new_high - new_low) / r
+        r_ratio = new_r / r
     e = new_q * cosine
     g = new_q * sine
     h = r_ratio * h
     k = r_ratio * k
-    elastic = mat2([e + h, k - g], [k + g, e - h])
+    xx = e + h
+    xy = k - g
+    yx = k + g
+    yy = e - h
+    elastic = mat2([xx, xy], [yx, yy])
 
-    old_area = larger(trial_high, STRETCH_MIN) * larger(trial_low, STRETCH_MIN)
+    old_high = larger(trial_high, STRETCH_MIN)
+    old_low = larger(trial_low, STRETCH_MIN)
+    old_area = old_high * old_low
     new_area = new_high * new_low
-    return elastic, old_area / new_area
+    growth = old_area / new_area
+    return elastic, growth

@@ -52,17 +52,25 @@ _EPSILON = 1e-6
 @ti.func
 def rows_of(f: mat3) -> Value:
     """Return the matrix of one particle as a list of rows."""
-    return [
-        [f[0, 0], f[0, 1], f[0, 2]],
-        [f[1, 0], f[1, 1], f[1, 2]],
-        [f[2, 0], f[2, 1], f[2, 2]],
-    ]
+    return [row_of(f, 0), row_of(f, 1), row_of(f, 2)]
+
+
+@ti.func
+def row_of(f: mat3, row: Template) -> Value:
+    """Return a row of the matrix of one particle as a list."""
+    x = f[row, 0]
+    y = f[row, 1]
+    z = f[row, 2]
+    return [x, y, z]
 
 
 @ti.func
 def dot(a: Template, b: Template) -> Value:
     """Return the dot product of two rows."""
-    return (a[0] * b[0] + a[1] * b[1]) + a[2] * b[2]
+    along_x = a[0] * b[0]
+    along_y = a[1] * b[1]
+    along_z = a[2] * b[2]
+    return (along_x + along_y) + along_z
 
 
 @ti.func
@@ -71,7 +79,23 @@ def times_transposed(rows: Template) -> Value:
     x = rows[0]
     y = rows[1]
     z = rows[2]
-    return [dot(x, x), dot(y, y), dot(z, z), dot(y, z), dot(x, z), dot(x, y)]
+    xx = dot(x, x)
+    yy = dot(y, y)
+    zz = dot(z, z)
+    yz = dot(y, z)
+    xz = dot(x, z)
+    xy = dot(x, y)
+    return [xx, yy, zz, yz, xz, xy]
+
+
+@ti.func
+def square(b: Template) -> Value:
+    """Return B^2 of a symmetric matrix, a symmetric matrix too."""
+    xx, yy, zz, yz, xz, xy = b
+    x = [xx, xy, xz]
+    y = [xy, yy, yz]
+    z = [xz, yz, zz]
+    return times_transposed([x, y, z])
 
 
 @ti.func
@@ -103,6 +127,23 @@ def trace(b: Template) -> Value:
 
 
 @ti.func
+def stretch_sum(b: Template, jacobian: Value) -> Value:
+    """Return the sum of the principal stretches, the largest root of the quartic."""
+    b_trace = trace(b)
+    minors = principal_minors(b)
+    total = ti.sqrt(3.0 * b_trace)
+    for _ in ti.static(range(_NEWTON_STEPS)):
+        double_pairs = total * total - b_trace
+        leading = double_pairs * double_pairs
+        quartic = (leading - 8.0 * jacobian * total) - 4.0 * minors
+        derivative = 4.0 * total * double_pairs - 8.0 * jacobian
+        divisor = larger(derivative, _EPSILON)
+        step = quartic / divisor
+        total = total - step
+    return total
+
+
+@ti.func
 def left_stretch(b: Template, jacobian: Value) -> Value:
     """Return V of the polar decomposition F = V R, from B = F F^T and J = det F.
 
@@ -110,28 +151,28 @@ def left_stretch(b: Template, jacobian: Value) -> Value:
     is no stretch.
     """
     b_trace = trace(b)
-    minors = principal_minors(b)
-    total = ti.sqrt(3.0 * b_trace)
-    for _ in ti.static(range(_NEWTON_STEPS)):
-        double_pairs = total * total - b_trace
-        quartic = (double_pairs * double_pairs - 8.0 * jacobian * total) - 4.0 * minors
-        derivative = 4.0 * total * double_pairs - 8.0 * jacobian
-        step = quartic / larger(derivative, _EPSILON)
-        total = total - step
+    total = stretch_sum(b, jacobian)
     pairs = 0.5 * (total * total - b_trace)
-    divisor = larger(pairs * total - jacobian, _EPSILON)
+    sum_product = pairs * total - jacobian
+    divisor = larger(sum_product, _EPSILON)
     inverse = 1.0 / divisor
     b_factor = pairs + b_trace
     isotropic = total * jacobian
-    xx, yy, zz, yz, xz, xy = b
-    b_square = times_transposed([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    b_square = square(b)
+    # entries of (pairs + tr B) B - B^2
+    xx = b_factor * b[0] - b_square[0]
+    yy = b_factor * b[1] - b_square[1]
+    zz = b_factor * b[2] - b_square[2]
+    yz = b_factor * b[3] - b_square[3]
+    xz = b_factor * b[4] - b_square[4]
+    xy = b_factor * b[5] - b_square[5]
     return [
-        inverse * ((b_factor * xx - b_square[0]) + isotropic),
-        inverse * ((b_factor * yy - b_square[1]) + isotropic),
-        inverse * ((b_factor * zz - b_square[2]) + isotropic),
-        inverse * (b_factor * yz - b_square[3]),
-        inverse * (b_factor * xz - b_square[4]),
-        inverse * (b_factor * xy - b_square[5]),
+        inverse * (xx + isotropic),
+        inverse * (yy + isotropic),
+        inverse * (zz + isotropic),
+        inverse * yz,
+        inverse * xz,
+        inverse * xy,
     ]
 
 
@@ -143,16 +184,24 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
     """
     b = times_transposed(rows)
     jacobian = determinant(rows)
-    volumetric = la * (jacobian - 1.0) * jacobian
+    volume_change = jacobian - 1.0
+    volumetric = la * volume_change * jacobian
     v = left_stretch(b, jacobian)
     double_mu = 2.0 * mu
+    # entries of 2 mu (B - V)
+    xx = double_mu * (b[0] - v[0])
+    yy = double_mu * (b[1] - v[1])
+    zz = double_mu * (b[2] - v[2])
+    yz = double_mu * (b[3] - v[3])
+    xz = double_mu * (b[4] - v[4])
+    xy = double_mu * (b[5] - v[5])
     return [
-        double_mu * (b[0] - v[0]) + volumetric,
-        double_mu * (b[1] - v[1]) + volumetric,
-        double_mu * (b[2] - v[2]) + volumetric,
-        double_mu * (b[3] - v[3]),
-        double_mu * (b[4] - v[4]),
-        double_mu * (b[5] - v[5]),
+        xx + volumetric,
+        yy + volumetric,
+        zz + volumetric,
+        yz,
+        xz,
+        xy,
     ]
 
 
@@ -171,7 +220,8 @@ def rotation_tangent(difference: Value, double_entry: Value) -> Value:
         difference: d.
         double_entry: 2 b_pq.
     """
-    root = ti.sqrt(difference * difference + double_entry * double_entry)
+    discriminant = difference * difference + double_entry * double_entry
+    root = ti.sqrt(discriminant)
     signed_root = ti.select(difference < 0.0, -root, root)
     divisor = difference + signed_root
     is_diagonal = divisor == 0.0
@@ -208,35 +258,49 @@ def principal_axes(b: Template) -> Value:
             entry_pq = off_diagonal[r]
             difference = diagonal[q] - diagonal[p]
             tangent = rotation_tangent(difference, 2.0 * entry_pq)
-            cosine = 1.0 / ti.sqrt(tangent * tangent + 1.0)
+            secant = ti.sqrt(tangent * tangent + 1.0)
+            cosine = 1.0 / secant
             sine = tangent * cosine
             shift = tangent * entry_pq
             diagonal[p] = diagonal[p] - shift
             diagonal[q] = diagonal[q] + shift
             off_diagonal[r] = zero
-            entry_pr, entry_qr = rotated(off_diagonal[q], off_diagonal[p], cosine, sine)
-            off_diagonal[q] = entry_pr
-            off_diagonal[p] = entry_qr
+            entry_pr = off_diagonal[q]
+            entry_qr = off_diagonal[p]
+            new_pr, new_qr = rotated(entry_pr, entry_qr, cosine, sine)
+            off_diagonal[q] = new_pr
+            off_diagonal[p] = new_qr
             for row in ti.static(range(3)):
-                p_entry, q_entry = rotated(axes[p][row], axes[q][row], cosine, sine)
-                axes[p][row] = p_entry
-                axes[q][row] = q_entry
+                p_entry = axes[p][row]
+                q_entry = axes[q][row]
+                new_p_entry, new_q_entry = rotated(p_entry, q_entry, cosine, sine)
+                axes[p][row] = new_p_entry
+                axes[q][row] = new_q_entry
     return diagonal, axes
 
 
 @ti.func
 def transposed(rows: Template) -> Value:
     """Return the rows of the transposed matrix."""
-    x = rows[0]
-    y = rows[1]
-    z = rows[2]
-    return [[x[0], y[0], z[0]], [x[1], y[1], z[1]], [x[2], y[2], z[2]]]
+    return [column_of(rows, 0), column_of(rows, 1), column_of(rows, 2)]
+
+
+@ti.func
+def column_of(rows: Template, column: Template) -> Value:
+    """Return a column of a matrix as a list."""
+    x = rows[0][column]
+    y = rows[1][column]
+    z = rows[2][column]
+    return [x, y, z]
 
 
 @ti.func
 def dot_with_each(row: Template, rows: Template) -> Value:
     """Return the dot products of a row with three rows."""
-    return [dot(row, rows[0]), dot(row, rows[1]), dot(row, rows[2])]
+    x = dot(row, rows[0])
+    y = dot(row, rows[1])
+    z = dot(row, rows[2])
+    return [x, y, z]
 
 
 @ti.func
@@ -248,7 +312,9 @@ def clamp_ratios(square: Value, low: f32, high: f32) -> Value:
     positive_square = larger(square, 0.0)
     trial = larger(ti.sqrt(positive_square), STRETCH_MIN)
     clamped = bounded(trial, low, high)
-    return clamped / trial, trial / clamped
+    ratio = clamped / trial
+    growth = trial / clamped
+    return ratio, growth
 
 
 @ti.func
@@ -257,7 +323,10 @@ def elastic_row(
 ) -> Value:
     """Return row i of the elastic gradient Q diag(ratios) Q^T F."""
     q_row = q_rows[i]
-    scaled = [ratios[0] * q_row[0], ratios[1] * q_row[1], ratios[2] * q_row[2]]
+    first = ratios[0] * q_row[0]
+    second = ratios[1] * q_row[1]
+    third = ratios[2] * q_row[2]
+    scaled = [first, second, third]
     stretch_row = dot_with_each(scaled, q_rows)  # of Q diag(ratios) Q^T
     return dot_with_each(stretch_row, f_columns)
 
@@ -275,7 +344,8 @@ def plastic_return(rows: Template, low: f32, high: f32) -> Value:
         The rows of the elastic gradient, and the factor on Jp: the product of trial
         over clamped stretches.
     """
-    squares, axes = principal_axes(times_transposed(rows))
+    b = times_transposed(rows)
+    squares, axes = principal_axes(b)
     ratio_1, growth_1 = clamp_ratios(squares[0], low, high)
     ratio_2, growth_2 = clamp_ratios(squares[1], low, high)
     ratio_3, growth_3 = clamp_ratios(squares[2], low, high)
@@ -283,9 +353,7 @@ def plastic_return(rows: Template, low: f32, high: f32) -> Value:
     ratios = [ratio_1, ratio_2, ratio_3]
     q_rows = transposed(axes)
     f_columns = transposed(rows)
-    elastic = [
-        elastic_row(0, ratios, q_rows, f_columns),
-        elastic_row(1, ratios, q_rows, f_columns),
-        elastic_row(2, ratios, q_rows, f_columns),
-    ]
-    return elastic, growth
+    x_row = elastic_row(0, ratios, q_rows, f_columns)
+    y_row = elastic_row(1, ratios, q_rows, f_columns)
+    z_row = elastic_row(2, ratios, q_rows, f_columns)
+    return [x_row, y_row, z_row], growth
