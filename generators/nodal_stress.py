@@ -85,6 +85,8 @@ class NodalStress:
         """Compute the constants of the scheme and allocate the fields."""
         p = parameters
         dx = 1.0 / p.grid
+        low_wall = p.wall + 0.5  # coordinates of the walls [cells]
+        high_wall = p.grid - p.wall - 0.5
         self.parameters = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
@@ -98,9 +100,8 @@ class NodalStress:
         self.node_count = self.width**2
         self.dt = p.dt
         # smallest and largest coordinate of a particle [length]
-        wall_distance = p.wall + 0.5 + _INSET  # [cells]
-        self.position_min = wall_distance * dx
-        self.position_max = (p.grid - p.wall - 0.5 - _INSET) * dx
+        self.position_min = (low_wall + _INSET) * dx
+        self.position_max = (high_wall - _INSET) * dx
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         reach_bound = _REACH * self.speed_bound
         self.velocity_scale = fixed_point_scale(p.particles, reach_bound)
@@ -241,14 +242,16 @@ class NodalStress:
         slope_scale = vec4(self.cell_scale, self.cell_scale, 0.0, 0.0)
         step_x = slope_scale * self.slope_x[s, p]
         step_y = slope_scale * self.slope_y[s, p]
-        at_particle = scale * self.particle_state[s, p]
-        at_middle = at_particle - offset[0] * step_x - offset[1] * step_y
+        at_middle = scale * self.particle_state[s, p]
+        at_middle = at_middle - offset.x * step_x
+        at_middle = at_middle - offset.y * step_y
         for i, j in ti.static(ti.ndrange(3, 3)):
             at_column = stepped(at_middle, step_x, i - 1)
             at_node = stepped(at_column, step_y, j - 1)
             node = base + i * self.width + j
             weight = self.weight_rows[i][s, p][j]
-            accumulate(self.sums, s, node, weight * at_node, self.atomic)
+            share = weight * at_node
+            accumulate(self.sums, s, node, share, self.atomic)
 
     @ti.func
     def sums_at(self, s: i32, i: i32, j: i32) -> Value:
@@ -274,40 +277,44 @@ class NodalStress:
             image = self.sums_at(s, ghost_i, j)
             count = from_fixed(image[2], self.count_unit)
             speed_y = self.walls.doubled_speed(s, 0, ghost_i)
-            total += ti.Vector([-1, tangential, 1, 1]) * image
-            drag[1] += speed_y * count
+            sign = ti.Vector([-1, tangential, 1, 1])
+            total += sign * image
+            drag.y += speed_y * count
         if is_beside_y_wall:
             image = self.sums_at(s, i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
             speed_x = self.walls.doubled_speed(s, 2, ghost_j)
-            total += ti.Vector([tangential, -1, 1, 1]) * image
-            drag[0] += speed_x * count
+            sign = ti.Vector([tangential, -1, 1, 1])
+            total += sign * image
+            drag.x += speed_x * count
         if is_beside_x_wall and is_beside_y_wall:
             image = self.sums_at(s, ghost_i, ghost_j)
             count = from_fixed(image[2], self.count_unit)
             speed_x = self.walls.doubled_speed(s, 2, ghost_j)
             speed_y = self.walls.doubled_speed(s, 0, ghost_i)
-            total += ti.Vector([-tangential, -tangential, 1, 1]) * image
-            drag[0] += speed_x * count
-            drag[1] += speed_y * count
+            sign = ti.Vector([-tangential, -tangential, 1, 1])
+            total += sign * image
+            drag.x += speed_x * count
+            drag.y += speed_y * count
         return total, drag
 
     @ti.func
     def fold(self, s: i32, i: i32, j: i32, particle_volume: f32) -> None:
         """Turn the sums of an interior node into v, r and Jbar."""
         total, drag = self.received(s, i, j)
-        state = vec4(0.0, 0.0, 0.0, 1.0)
+        velocity = vec2(0.0)
+        density = 0.0
+        jacobian = 1.0
         if total[2] > 0:
+            received_momentum = from_fixed(total.xy, self.velocity_unit)
+            momentum = received_momentum + drag
             count = from_fixed(total[2], self.count_unit)
-            momentum_x = from_fixed(total[0], self.velocity_unit) + drag[0]
-            momentum_y = from_fixed(total[1], self.velocity_unit) + drag[1]
             jacobian_sum = from_fixed(total[3], self.count_unit)
-            state[0] = momentum_x / count
-            state[1] = momentum_y / count
-            state[2] = count * particle_volume
-            state[3] = jacobian_sum / count
+            velocity = momentum / count
+            density = count * particle_volume
+            jacobian = jacobian_sum / count
         node = self.at(i, j)
-        self.node_state[s, node] = state
+        self.node_state[s, node] = vec4(velocity, density, jacobian)
 
     @ti.func
     def source(self, i: i32, j: i32) -> i32:
@@ -328,8 +335,7 @@ class NodalStress:
         image = states[s, source]
         sign = self.walls.reflection(i, j)
         drive = self.walls.drive(s, i, j)
-        image[0] = sign[0] * image[0] + drive[0]
-        image[1] = sign[1] * image[1] + drive[1]
+        image.xy = sign * image.xy + drive
         states[s, node] = image
 
     @ti.func
@@ -352,10 +358,15 @@ class NodalStress:
         south_west = self.jacobian_at(s, i - 1, j - 1)
         south_east = self.jacobian_at(s, i + 1, j - 1)
         north_west = self.jacobian_at(s, i - 1, j + 1)
+        near_x = east - west
+        near_y = north - south
+        # along the two diagonals, and their sums along x and y
         rising = north_east - south_west
         falling = south_east - north_west
-        slope_x = 0.75 * (east - west) + 0.125 * (rising + falling)
-        slope_y = 0.75 * (north - south) + 0.125 * (rising - falling)
+        far_x = rising + falling
+        far_y = rising - falling
+        slope_x = 0.75 * near_x + 0.125 * far_x
+        slope_y = 0.75 * near_y + 0.125 * far_y
         return vec2(slope_x, slope_y)
 
     @ti.func
@@ -365,8 +376,9 @@ class NodalStress:
         west = self.state_at(s, i - 1, j)
         north = self.state_at(s, i, j + 1)
         south = self.state_at(s, i, j - 1)
+        middle = self.state_at(s, i, j)
         neighbours = (east + west) + (north + south)
-        return neighbours - 4.0 * self.state_at(s, i, j)
+        return neighbours - 4.0 * middle
 
     @ti.func
     def add_forces(self, s: i32, i: i32, j: i32) -> None:
@@ -379,12 +391,12 @@ class NodalStress:
         gain = self.pressure_factor * gradient + diffusion * laplacian.xy
         v = state.xy + gain
         self.node_gain[s, node] = gain
-        state[0] = v[0]
-        state[1] = v[1]
+        state.xy = v
         self.next_state[s, node] = state
+        speed = ti.abs(v)
         peak = self.peak_speed[s, node]
-        peak = largest(ti.abs(v[1]), peak)
-        peak = largest(ti.abs(v[0]), peak)
+        peak = largest(speed.y, peak)
+        peak = largest(speed.x, peak)
         self.peak_speed[s, node] = peak
 
     @ti.func
@@ -403,40 +415,45 @@ class NodalStress:
             state += share
             slope_x = stepped(slope_x, share, i - 1)
             slope_y = stepped(slope_y, share, j - 1)
-        slope_x = slope_x - offset[0] * state
-        slope_y = slope_y - offset[1] * state
+        slope_x = slope_x - offset.x * state
+        slope_y = slope_y - offset.y * state
         self.slope_x[s, p] = self.slope_factor * slope_x
         self.slope_y[s, p] = self.slope_factor * slope_y
         self.grid_state[s, p] = state
-        self.grid_gain[s, p] = vec4(gain[0], gain[1], 0.0, 0.0)
+        self.grid_gain[s, p] = vec4(gain, 0.0, 0.0)
 
     @ti.func
     def update(self, s: i32, p: i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
         grid_state = self.grid_state[s, p]
         grid_velocity = grid_state.xy
+        grid_density = grid_state[2]
         grid_jacobian = grid_state[3]
+        grid_gain = self.grid_gain[s, p].xy
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
-        volume = 1.0 / largest(grid_state[2], 0.5)
+        density = largest(grid_density, 0.5)
+        volume = 1.0 / density
 
         density_slope = vec2(slope_x[2], slope_y[2])
         shift = self.shift_factor * volume * density_slope
         shift = bounded(shift, -self.shift_bound, self.shift_bound)
 
         old_state = self.particle_state[s, p]
-        v = old_state.xy + self.grid_gain[s, p].xy
-        v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
-        change_x = shift[0] * slope_x.xy
-        change_y = shift[1] * slope_y.xy
+        v = old_state.xy + grid_gain
+        velocity_lag = grid_velocity - v
+        v = v + self.parameters.velocity_relaxation * velocity_lag
+        change_x = shift.x * slope_x.xy
+        change_y = shift.y * slope_y.xy
         v = v + (change_x + change_y)
 
+        old_x = self.x[s, p].xy
         step = self.dt * grid_velocity + shift
-        x = self.x[s, p].xy + step
+        x = old_x + step
         x = bounded(x, self.position_min, self.position_max)
-        self.x[s, p] = vec4(x[0], x[1], 0.0, 0.0)
+        self.x[s, p] = vec4(x, 0.0, 0.0)
 
-        divergence = slope_x[0] + slope_y[1]
+        divergence = slope_x.x + slope_y.y
         old_jacobian = old_state[3]
         growth = self.dt * divergence * old_jacobian
         lag = grid_jacobian - old_jacobian
@@ -444,17 +461,18 @@ class NodalStress:
         compression = volume - grid_jacobian
         coupling = self.parameters.density_coupling * compression
         jacobian = old_jacobian + growth + relaxation + coupling
-        self.particle_state[s, p] = vec4(v[0], v[1], 1.0, jacobian)
+        self.particle_state[s, p] = vec4(v, 1.0, jacobian)
         speed = ti.abs(v)
-        reached = vec4(speed[0], speed[1], jacobian, -jacobian)
+        reached = vec4(speed, jacobian, -jacobian)
         extremes = self.extremes[s, p]
         self.extremes[s, p] = largest(reached, extremes)
 
     @ti.func
     def sum_velocity(self, s: i32, n: i32) -> None:
         """Add a node's velocity to its sum over time, outside the path of the bits."""
-        velocity = ti.cast(self.next_state[s, n].xy, ti.f64)
-        self.velocity_sum[s, n] = self.velocity_sum[s, n] + velocity
+        velocity = self.next_state[s, n].xy
+        exact = ti.cast(velocity, ti.f64)
+        self.velocity_sum[s, n] = self.velocity_sum[s, n] + exact
 
     # The drivers: the same phases in the same order.
 
@@ -516,7 +534,8 @@ class NodalStress:
             self.p2g(s, p)
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, interior, interior):
-            self.fold(s, i, j, self.particle_volume[s])
+            particle_volume = self.particle_volume[s]
+            self.fold(s, i, j, particle_volume)
         ti.loop_config(parallelize=self.threads)
         for s, k in ti.ndrange(self.scenarios, self.walls.ring_size):
             self.mirror(self.node_state, s, k)
@@ -545,7 +564,7 @@ class NodalStress:
             state = self.particle_state[s, p]
             speed = ti.abs(state.xy)
             jacobian = state[3]
-            self.extremes[s, p] = vec4(speed[0], speed[1], jacobian, -jacobian)
+            self.extremes[s, p] = vec4(speed, jacobian, -jacobian)
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
             self.peak_speed[s, n] = 0.0
