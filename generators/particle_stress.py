@@ -34,6 +34,7 @@ from .constitutive import (
     larger,
     liquid_stress,
     plastic_return,
+    smaller,
     viscous_stress,
 )
 from .free_surface_kernels import LIQUID, ROPE, SNOW, FreeSurfaceKernels, largest_of
@@ -100,8 +101,9 @@ class ParticleStress(FreeSurfaceKernels):
         """Return the Kirchhoff stress tau of a particle."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
-        pressure = liquid_stress(ratio, self.parameters.liquid_modulus)
-        tau = mat2([pressure, 0.0], [0.0, pressure])
+        modulus = self.parameters.liquid_modulus
+        isotropic = liquid_stress(ratio, modulus)
+        tau = mat2([isotropic, 0.0], [0.0, isotropic])
         viscosity = self.liquid_viscosity
         if ti.static(solid):
             mu = self.jelly[0]
@@ -120,9 +122,11 @@ class ParticleStress(FreeSurfaceKernels):
                 mu = self.snow[0] * factor
                 la = self.snow[1] * factor
                 damping = 0.0
-            elastic = corotated_stress(self.deformation[s, p], mu, la)
-            tau = ti.select(kind == LIQUID, tau, elastic)
-            viscosity = ti.select(kind == LIQUID, viscosity, damping)
+            f = self.deformation[s, p]
+            elastic = corotated_stress(f, mu, la)
+            is_liquid = kind == LIQUID
+            tau = ti.select(is_liquid, tau, elastic)
+            viscosity = ti.select(is_liquid, viscosity, damping)
         return tau + viscous_stress(c, viscosity)
 
     @ti.func
@@ -130,7 +134,9 @@ class ParticleStress(FreeSurfaceKernels):
         """Return C of a particle."""
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
-        return mat2([slope_x[0], slope_y[0]], [slope_x[1], slope_y[1]])
+        gradient_of_u = vec2(slope_x.x, slope_y.x)
+        gradient_of_v = vec2(slope_x.y, slope_y.y)
+        return mat2(gradient_of_u, gradient_of_v)
 
     @ti.func
     def prepare(self, s: i32, p: i32, solid: Template) -> None:
@@ -141,10 +147,10 @@ class ParticleStress(FreeSurfaceKernels):
         a = self.dx * c - self.stress_factor * tau
         self.keep_reach(s, p, a)
         scaled = self.velocity_scale * a
-        momentum_slope_x = vec4(scaled[0, 0], scaled[1, 0], 0.0, 0.0)
-        momentum_slope_y = vec4(scaled[0, 1], scaled[1, 1], 0.0, 0.0)
-        self.momentum_slope_x[s, p] = momentum_slope_x
-        self.momentum_slope_y[s, p] = momentum_slope_y
+        first_column = scaled[:, 0]
+        second_column = scaled[:, 1]
+        self.momentum_slope_x[s, p] = vec4(first_column, 0.0, 0.0)
+        self.momentum_slope_y[s, p] = vec4(second_column, 0.0, 0.0)
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
@@ -159,12 +165,13 @@ class ParticleStress(FreeSurfaceKernels):
     def keep_reach(self, s: i32, p: i32, a: mat2) -> None:
         """Keep the largest abs(v) + abs(A o) of a particle in this advance."""
         # A node lies within 1.5 cells per axis.
-        speed = ti.abs(self.particle_state[s, p].xy)
+        velocity = self.particle_state[s, p].xy
+        speed = ti.abs(velocity)
         slope = ti.abs(a)
         slope_of_x = slope[0, 0] + slope[0, 1]
         slope_of_y = slope[1, 0] + slope[1, 1]
-        reach_x = speed[0] + 1.5 * slope_of_x
-        reach_y = speed[1] + 1.5 * slope_of_y
+        reach_x = speed.x + 1.5 * slope_of_x
+        reach_y = speed.y + 1.5 * slope_of_y
         reach = largest_of(reach_x, reach_y)
         extremes = self.extremes[s, p]
         extremes[3] = larger(reach, extremes[3])
@@ -182,14 +189,16 @@ class ParticleStress(FreeSurfaceKernels):
         )
         step_x = self.momentum_slope_x[s, p]
         step_y = self.momentum_slope_y[s, p]
-        at_particle = scale * self.particle_state[s, p]
-        at_middle = at_particle - offset[0] * step_x - offset[1] * step_y
+        at_middle = scale * self.particle_state[s, p]
+        at_middle = at_middle - offset.x * step_x
+        at_middle = at_middle - offset.y * step_y
         for i, j in ti.static(ti.ndrange(3, 3)):
             at_column = stepped(at_middle, step_x, i - 1)
             at_node = stepped(at_column, step_y, j - 1)
             node = base + i * self.width + j
             weight = self.weight_rows[i][s, p][j]
-            accumulate(self.sums, s, node, weight * at_node, self.atomic)
+            share = weight * at_node
+            accumulate(self.sums, s, node, share, self.atomic)
 
     @ti.func
     def at(self, i: i32, j: i32) -> i32:
@@ -213,17 +222,17 @@ class ParticleStress(FreeSurfaceKernels):
         v = 0.0
         jacobian = 1.0
         if total[2] > 0:
+            momentum = from_fixed(total.xy, self.velocity_unit)
             count = from_fixed(total[2], self.count_unit)
-            momentum_x = from_fixed(total[0], self.velocity_unit)
-            momentum_y = from_fixed(total[1], self.velocity_unit)
             jacobian_sum = from_fixed(total[3], self.count_unit)
-            u = momentum_x / count
-            v = momentum_y / count - self.gravity_gain
+            u = momentum.x / count
+            v = momentum.y / count - self.gravity_gain
             jacobian = jacobian_sum / count
             u, v = self.contact(i, u, v, friction)
             v, u = self.contact(j, v, u, friction)
-        mirrored = self.mirrored_count(s, i, j)
-        density = from_fixed(mirrored, self.count_unit) * particle_volume
+        mirrored_sum = self.mirrored_count(s, i, j)
+        mirrored_count = from_fixed(mirrored_sum, self.count_unit)
+        density = mirrored_count * particle_volume
         self.node_state[s, node] = vec4(u, v, density, jacobian)
 
     @ti.func
@@ -235,10 +244,13 @@ class ParticleStress(FreeSurfaceKernels):
         new_normal = normal
         new_tangential = tangential
         if self.is_outward(index, normal):
-            sliding = larger(ti.abs(tangential), 1e-9)
-            loss = friction * ti.abs(normal) / sliding
+            impact_speed = ti.abs(normal)
+            sliding_speed = ti.abs(tangential)
+            divisor = larger(sliding_speed, 1e-9)
+            loss = friction * impact_speed / divisor
+            kept = larger(1.0 - loss, 0.0)
             new_normal = 0.0
-            new_tangential = tangential * larger(1.0 - loss, 0.0)
+            new_tangential = tangential * kept
         return new_normal, new_tangential
 
     @ti.func
@@ -275,8 +287,8 @@ class ParticleStress(FreeSurfaceKernels):
             node = base + i * self.width + j
             weight = self.weight_rows[i][s, p][j]
             share = weight * self.node_state[s, node]
-            distance_x = (i - 1.0) - offset[0]
-            distance_y = (j - 1.0) - offset[1]
+            distance_x = (i - 1.0) - offset.x
+            distance_y = (j - 1.0) - offset.y
             state += share
             slope_x += distance_x * share
             slope_y += distance_y * share
@@ -292,9 +304,10 @@ class ParticleStress(FreeSurfaceKernels):
         grid_density = grid_state[2]
         grid_jacobian = grid_state[3]
         velocity = grid_state.xy
-        x = self.x[s, p].xy + self.dt * velocity
+        old_x = self.x[s, p].xy
+        x = old_x + self.dt * velocity
         x = bounded(x, self.position_min, self.position_max)
-        self.x[s, p] = vec4(x[0], x[1], 0.0, 0.0)
+        self.x[s, p] = vec4(x, 0.0, 0.0)
 
         matter = self.matter[s, p]
         kind = matter[0]
@@ -310,7 +323,8 @@ class ParticleStress(FreeSurfaceKernels):
             is_snow = kind == SNOW
             is_liquid = kind == LIQUID
             old_f = self.deformation[s, p]
-            trial = old_f + self.dt * (c @ old_f)
+            rate = c @ old_f
+            trial = old_f + self.dt * rate
             yielded, growth = plastic_return(trial, self.yield_low, self.yield_high)
             solid_f = ti.select(is_snow, yielded, trial)
             f = ti.select(is_liquid, old_f, solid_f)
@@ -323,24 +337,25 @@ class ParticleStress(FreeSurfaceKernels):
             ratio = ti.select(is_liquid, j, solid_ratio)
             jacobian = ti.select(is_liquid, j, determinant(f))
             spread_jacobian = ti.select(is_liquid, j, 1.0)
-        new_state = vec4(velocity[0], velocity[1], 1.0, spread_jacobian)
-        self.particle_state[s, p] = new_state
+        self.particle_state[s, p] = vec4(velocity, 1.0, spread_jacobian)
 
-        ratio_min = -larger(-ratio, -matter[2])
-        ratio_max = larger(ratio, matter[3])
+        old_min = matter[2]
+        old_max = matter[3]
+        ratio_min = smaller(ratio, old_min)
+        ratio_max = larger(ratio, old_max)
         self.matter[s, p] = vec4(kind, ratio, ratio_min, ratio_max)
-        self.keep_extremes(s, p, ti.abs(velocity), jacobian)
+        speed = ti.abs(velocity)
+        self.keep_extremes(s, p, speed, jacobian)
 
     @ti.func
     def keep_extremes(self, s: i32, p: i32, speed: vec2, jacobian: f32) -> None:
         """Keep the largest speed and the extremes of J in this advance."""
         extremes = self.extremes[s, p]
-        reach = extremes[3]
-        fastest = largest_of(speed[0], speed[1])
-        speed_max = larger(fastest, extremes[0])
-        jacobian_min = -larger(-jacobian, -extremes[1])
-        jacobian_max = larger(jacobian, extremes[2])
-        self.extremes[s, p] = vec4(speed_max, jacobian_min, jacobian_max, reach)
+        fastest = largest_of(speed.x, speed.y)
+        extremes[0] = larger(fastest, extremes[0])
+        extremes[1] = smaller(jacobian, extremes[1])
+        extremes[2] = larger(jacobian, extremes[2])
+        self.extremes[s, p] = extremes
 
     # The drivers: the same phases in the same order.
 
@@ -410,5 +425,5 @@ class ParticleStress(FreeSurfaceKernels):
             if self.matter[s, p][0] == LIQUID:
                 jacobian = state[3]
             speed = ti.abs(state.xy)
-            speed_max = largest_of(speed[0], speed[1])
+            speed_max = largest_of(speed.x, speed.y)
             self.extremes[s, p] = vec4(speed_max, jacobian, jacobian, 0.0)
