@@ -11,6 +11,8 @@ Only ``+ - * /``, ``sqrt`` and comparisons are used, and sums are integers
 Source: Hu et al. 2018; Jiang et al. 2015 (APIC).
 """
 
+import math
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
@@ -137,7 +139,8 @@ class ParticleStress3D(FreeSurfaceKernels):
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
         super()._place_fields()
-        whole_blocks = _LANES * -(-self.particles // _LANES)
+        blocks = math.ceil(self.particles / _LANES)
+        whole_blocks = _LANES * blocks
         listed = (
             self.solids,
             self.snow_particles,
@@ -166,7 +169,8 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def at(self, i: i32, j: i32, k: i32) -> i32:
         """Return the number of a node."""
-        return (i * self.width + j) * self.width + k
+        row = i * self.width + j
+        return row * self.width + k
 
     @ti.func
     def clear(self, s: i32, n: i32) -> None:
@@ -188,15 +192,14 @@ class ParticleStress3D(FreeSurfaceKernels):
             stride = ti.static(self.stride[axis])
             scaled = x[axis] * self.inv_dx
             lowest = ti.cast(scaled - 0.5, i32)
-            f = scaled - ti.cast(lowest, f32)
+            node = ti.cast(lowest, f32)
+            f = scaled - node
             low, mid, high = spline_weights(f)
-            weights = vec4(low, mid, high, 0.0)
-            self.weights[axis][s, p] = weights
+            self.weights[axis][s, p] = vec4(low, mid, high, 0.0)
             offset[axis] = f - 1.0
             number += lowest * stride
         number_bits = ti.bit_cast(number, f32)
-        place = vec4(offset[0], offset[1], offset[2], number_bits)
-        self.stencil_place[s, p] = place
+        self.stencil_place[s, p] = vec4(offset, number_bits)
 
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat3:
@@ -245,49 +248,51 @@ class ParticleStress3D(FreeSurfaceKernels):
     def compute_elastic_stress(self, s: i32, p: i32) -> None:
         """Compute the Kirchhoff stress of a solid without damping."""
         mu, la = self.moduli(s, p)
-        rows = rows_of(self.deformation(s, p))
+        f = self.deformation(s, p)
+        rows = rows_of(f)
         stress = corotated_stress(rows, mu, la)
         self.store_elastic_stress(s, p, stress)
 
     @ti.func
     def copy_gradient_to_list(self, members: Template, number: i32) -> None:
         """Copy F of a particle to its place in a list."""
-        f = self.deformation(0, members[number])
+        p = members[number]
+        f = self.deformation(0, p)
         for row, column in ti.static(ti.ndrange(3, 3)):
             self.listed_gradient[row][column][number] = f[row, column]
 
     @ti.func
     def copy_moduli_to_list(self, number: i32) -> None:
         """Copy Lame's constants of a solid to its place in the list of solids."""
-        mu, la = self.moduli(0, self.solids[number])
+        p = self.solids[number]
+        mu, la = self.moduli(0, p)
         self.listed_moduli[0][number] = mu
         self.listed_moduli[1][number] = la
 
     @ti.func
     def listed_rows(self, block: i32) -> Value:
         """Return the rows of F of a block of particles."""
-        return [
-            self.listed_row(0, block),
-            self.listed_row(1, block),
-            self.listed_row(2, block),
-        ]
+        x_row = self.listed_row(0, block)
+        y_row = self.listed_row(1, block)
+        z_row = self.listed_row(2, block)
+        return [x_row, y_row, z_row]
 
     @ti.func
     def listed_row(self, row: Template, block: i32) -> Value:
         """Return a row of F of a block of particles."""
         fields = ti.static(self.listed_gradient[row])
-        return [
-            load_lanes(fields[0], block),
-            load_lanes(fields[1], block),
-            load_lanes(fields[2], block),
-        ]
+        x = load_lanes(fields[0], block)
+        y = load_lanes(fields[1], block)
+        z = load_lanes(fields[2], block)
+        return [x, y, z]
 
     @ti.func
     def compute_listed_stress(self, block: i32) -> None:
         """Compute the Kirchhoff stress of a block of solids without damping."""
         mu = load_lanes(self.listed_moduli[0], block)
         la = load_lanes(self.listed_moduli[1], block)
-        stress = corotated_stress(self.listed_rows(block), mu, la)
+        rows = self.listed_rows(block)
+        stress = corotated_stress(rows, mu, la)
         for entry in ti.static(range(_ENTRIES)):
             store_lanes(self.listed_stress[entry], block, stress[entry])
 
@@ -302,20 +307,22 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.listed_stress[4][number],
             self.listed_stress[5][number],
         ]
-        self.store_elastic_stress(0, self.solids[number], stress)
+        p = self.solids[number]
+        self.store_elastic_stress(0, p, stress)
 
     @ti.func
     def viscosity(self, s: i32, p: i32) -> f32:
         """Return the dynamic viscosity of a liquid, or the damping of a solid."""
         kind = self.matter[s, p][0]
-        damping = ti.select(kind == SNOW, 0.0, self.solid_viscosity)
-        return ti.select(kind == LIQUID, self.liquid_viscosity, damping)
+        is_snow = kind == SNOW
+        is_liquid = kind == LIQUID
+        damping = ti.select(is_snow, 0.0, self.solid_viscosity)
+        return ti.select(is_liquid, self.liquid_viscosity, damping)
 
     @ti.func
     def stress(self, s: i32, p: i32, solid: Template) -> None:
         """Compute A of a particle, and a bound of the speeds that it gives to nodes."""
-        state = self.particle_state[s, p]
-        spread_jacobian = state[3]
+        spread_jacobian = self.particle_state[s, p][3]
         modulus = self.parameters.liquid_modulus
         isotropic_stress = liquid_stress(spread_jacobian, modulus)
         c = self.velocity_gradient(s, p)
@@ -334,23 +341,28 @@ class ParticleStress3D(FreeSurfaceKernels):
         for column in ti.static(_AXES):
             a = vec4(0.0)
             for row in ti.static(_AXES):
-                shear_rate = c[row, column] + c[column, row]
+                slope = c[row, column]
+                shear_rate = slope + c[column, row]
                 tau = viscosity * shear_rate
                 if ti.static(row == column):
                     tau = tau + diagonal[row]
                 elif ti.static(solid):
                     tau = tau + off_diagonal[3 - row - column]
-                speed_per_cell = self.dx * c[row, column]
+                speed_per_cell = self.dx * slope
                 a[row] = speed_per_cell - self.stress_factor * tau
-                affine_speed[row] = affine_speed[row] + 1.5 * ti.abs(a[row])
+            affine_speed = affine_speed + 1.5 * ti.abs(a.xyz)
             self.momentum_slopes[column][s, p] = self.velocity_scale * a
+        self.keep_node_speed(s, p, affine_speed)
 
+    @ti.func
+    def keep_node_speed(self, s: i32, p: i32, affine_speed: vec3) -> None:
+        """Keep the largest speed that a particle gives to a node in this advance."""
+        velocity = self.particle_state[s, p].xyz
+        node_speed = ti.abs(velocity) + affine_speed
         extremes = self.extremes[s, p]
-        largest_node_speed = extremes[3]
-        for row in ti.static(_AXES):
-            node_speed = ti.abs(state[row]) + affine_speed[row]
-            largest_node_speed = larger(finite(node_speed), largest_node_speed)
-        extremes[3] = largest_node_speed
+        for axis in ti.static(_AXES):
+            component = finite(node_speed[axis])
+            extremes[3] = larger(component, extremes[3])
         self.extremes[s, p] = extremes
 
     @ti.func
@@ -372,9 +384,9 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.count_scale,
         )
         at_middle = scale * self.particle_state[s, p]
-        at_middle = at_middle - place[0] * step_x
-        at_middle = at_middle - place[1] * step_y
-        at_middle = at_middle - place[2] * step_z
+        at_middle = at_middle - place.x * step_x
+        at_middle = at_middle - place.y * step_y
+        at_middle = at_middle - place.z * step_z
         weight_x = self.weights[0][s, p]
         weight_y = self.weights[1][s, p]
         weight_z = self.weights[2][s, p]
@@ -385,7 +397,8 @@ class ParticleStress3D(FreeSurfaceKernels):
             at_row = stepped(at_column, step_y, j - 1)
             row = lowest + (i * self.width + j) * self.width
             for k in ti.static(range(3)):
-                share = weights[k] * stepped(at_row, step_z, k - 1)
+                at_node = stepped(at_row, step_z, k - 1)
+                share = weights[k] * at_node
                 add_shifted(self.sums, s, row + k, share, self.atomic)
             # The fourth weight is 0, so that the fourth sum counts shifts.
             counts = self.count_scale * weights
@@ -411,15 +424,16 @@ class ParticleStress3D(FreeSurfaceKernels):
             total = self.sums[s, node] - shifts
             momentum = from_fixed(total, self.velocity_unit)
             jacobian_sum = from_fixed(total[3], self.count_unit)
-            u = momentum[0] / count
-            v = momentum[1] / count - self.gravity_gain
-            w = momentum[2] / count
+            u = momentum.x / count
+            v = momentum.y / count - self.gravity_gain
+            w = momentum.z / count
             jacobian = jacobian_sum / count
             u, v, w = self.contact(i, u, v, w, friction)
             v, w, u = self.contact(j, v, w, u, friction)
             w, u, v = self.contact(k, w, u, v, friction)
-            mirrored = self.mirrored_count(s, i, j, k)
-            density = from_fixed(mirrored, self.count_unit) * particle_volume
+            mirrored_sum = self.mirrored_count(s, i, j, k)
+            mirrored_count = from_fixed(mirrored_sum, self.count_unit)
+            density = mirrored_count * particle_volume
         state = ti.Vector([u, v, w, jacobian, density, 0.0, 0.0, 0.0])
         self.node_state[s, node] = state
 
@@ -443,8 +457,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         new_first = first
         new_second = second
         if self.is_outward(index, normal):
-            sliding = ti.sqrt(first * first + second * second)
-            loss = friction * ti.abs(normal) / larger(sliding, 1e-9)
+            impact_speed = ti.abs(normal)
+            sliding_speed = ti.sqrt(first * first + second * second)
+            divisor = larger(sliding_speed, 1e-9)
+            loss = friction * impact_speed / divisor
             kept = larger(1.0 - loss, 0.0)
             new_normal = 0.0
             new_first = first * kept
@@ -488,13 +504,13 @@ class ParticleStress3D(FreeSurfaceKernels):
         for i, j in ti.static(ti.ndrange(3, 3)):
             across = weight_x[i] * weight_y[j]
             row = lowest + (i * self.width + j) * self.width
-            distance_x = (i - 1.0) - place[0]
-            distance_y = (j - 1.0) - place[1]
+            distance_x = (i - 1.0) - place.x
+            distance_y = (j - 1.0) - place.y
             for k in ti.static(range(3)):
                 weight = across * weight_z[k]
                 node_state = self.node_state[s, row + k]
                 share = weight * node_state[:4]
-                distance_z = (k - 1.0) - place[2]
+                distance_z = (k - 1.0) - place.z
                 state += share
                 slope_x += distance_x * share
                 slope_y += distance_y * share
@@ -513,19 +529,17 @@ class ParticleStress3D(FreeSurfaceKernels):
         grid_state = self.grid_state[s, p]
         grid_jacobian = grid_state[3]
         velocity = grid_state.xyz
-        old_x = self.x[s, p]
-        x = vec3(0.0)
-        for axis in ti.static(_AXES):
-            target = old_x[axis] + self.dt * velocity[axis]
-            x[axis] = bounded(target, self.position_min, self.position_max)
-        self.x[s, p] = vec4(x[0], x[1], x[2], 0.0)
+        old_x = self.x[s, p].xyz
+        x = old_x + self.dt * velocity
+        x = bounded(x, self.position_min, self.position_max)
+        self.x[s, p] = vec4(x, 0.0)
 
         kind = self.matter[s, p][0]
         old_ratio = self.matter[s, p][1]
         slope_x = self.slopes[0][s, p]
         slope_y = self.slopes[1][s, p]
         slope_z = self.slopes[2][s, p]
-        divergence = slope_x[0] + slope_y[1] + slope_z[2]
+        divergence = slope_x.x + slope_y.y + slope_z.z
         grid_density = self.grid_density[s, p]
         j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
         ratio = j
@@ -534,8 +548,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             is_liquid = kind == LIQUID
             ratio = ti.select(is_liquid, j, old_ratio)
             spread_jacobian = ti.select(is_liquid, j, 1.0)
-        new_state = vec4(velocity[0], velocity[1], velocity[2], spread_jacobian)
-        self.particle_state[s, p] = new_state
+        self.particle_state[s, p] = vec4(velocity, spread_jacobian)
         self.store_ratio(s, p, ratio)
 
         extremes = self.extremes[s, p]
@@ -549,9 +562,9 @@ class ParticleStress3D(FreeSurfaceKernels):
     def store_ratio(self, s: i32, p: i32, ratio: f32) -> None:
         """Store J of a liquid or Jp of snow, and its extremes since the start."""
         matter = self.matter[s, p]
-        ratio_min = matter[2]
+        old_min = matter[2]
         matter[1] = ratio
-        matter[2] = ti.select(ratio < ratio_min, ratio, ratio_min)
+        matter[2] = ti.select(ratio < old_min, ratio, old_min)
         matter[3] = larger(ratio, matter[3])
         self.matter[s, p] = matter
 
@@ -560,16 +573,19 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Return J of a liquid or det F of a solid."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
-        solid_jacobian = determinant(rows_of(self.deformation(s, p)))
-        return ti.select(kind == LIQUID, ratio, solid_jacobian)
+        f = self.deformation(s, p)
+        rows = rows_of(f)
+        solid_jacobian = determinant(rows)
+        is_liquid = kind == LIQUID
+        return ti.select(is_liquid, ratio, solid_jacobian)
 
     @ti.func
     def update_jacobian_extremes(self, s: i32, p: i32) -> None:
         """Update the extremes of J of a liquid or det F of a solid in this advance."""
         jacobian = self.jacobian(s, p)
         extremes = self.extremes[s, p]
-        jacobian_min = extremes[1]
-        extremes[1] = ti.select(jacobian < jacobian_min, jacobian, jacobian_min)
+        old_min = extremes[1]
+        extremes[1] = ti.select(jacobian < old_min, jacobian, old_min)
         extremes[2] = larger(jacobian, extremes[2])
         self.extremes[s, p] = extremes
 
@@ -577,9 +593,11 @@ class ParticleStress3D(FreeSurfaceKernels):
     def deform(self, s: i32, p: i32) -> None:
         """Update F of a solid with the velocity gradient: F <- (I + dt C) F."""
         is_liquid = self.matter[s, p][0] == LIQUID
-        f = self.deformation(s, p)
-        change = self.dt * (self.velocity_gradient(s, p) @ f)
-        f = ti.select(is_liquid, f, f + change)
+        c = self.velocity_gradient(s, p)
+        old_f = self.deformation(s, p)
+        rate = c @ old_f
+        solid_f = old_f + self.dt * rate
+        f = ti.select(is_liquid, old_f, solid_f)
         self.store_deformation(s, p, f)
 
     @ti.func
@@ -589,12 +607,16 @@ class ParticleStress3D(FreeSurfaceKernels):
         F from :meth:`deform` is the trial gradient. The change of volume that it loses
         goes into Jp. Particles of other materials stay as they are.
         """
-        if self.matter[s, p][0] == SNOW:
-            trial = rows_of(self.deformation(s, p))
+        kind = self.matter[s, p][0]
+        if kind == SNOW:
+            f = self.deformation(s, p)
+            trial = rows_of(f)
             rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
             for axis in ti.static(_AXES):
-                column = vec4(rows[0][axis], rows[1][axis], rows[2][axis], 0.0)
-                self.deformation_columns[axis][s, p] = column
+                x = rows[0][axis]
+                y = rows[1][axis]
+                z = rows[2][axis]
+                self.deformation_columns[axis][s, p] = vec4(x, y, z, 0.0)
             self.update_plastic_ratio(s, p, growth)
 
     @ti.func
@@ -612,27 +634,28 @@ class ParticleStress3D(FreeSurfaceKernels):
         trial = self.listed_rows(block)
         rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
         for row, column in ti.static(ti.ndrange(3, 3)):
-            store_lanes(self.listed_gradient[row][column], block, rows[row][column])
+            field = ti.static(self.listed_gradient[row][column])
+            store_lanes(field, block, rows[row][column])
         store_lanes(self.listed_growth, block, growth)
 
     @ti.func
     def copy_plasticity_from_list(self, number: i32) -> None:
         """Update F and Jp of a snow particle from its place in the list of snow."""
+        p = self.snow_particles[number]
         for axis in ti.static(_AXES):
             x = self.listed_gradient[0][axis][number]
             y = self.listed_gradient[1][axis][number]
             z = self.listed_gradient[2][axis][number]
-            p = self.snow_particles[number]
             self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
         growth = self.listed_growth[number]
-        self.update_plastic_ratio(0, self.snow_particles[number], growth)
+        self.update_plastic_ratio(0, p, growth)
 
     @ti.func
     def store_deformation(self, s: i32, p: i32, f: mat3) -> None:
         """Store F, column by column."""
         for axis in ti.static(_AXES):
-            column = vec4(f[0, axis], f[1, axis], f[2, axis], 0.0)
-            self.deformation_columns[axis][s, p] = column
+            column = f[:, axis]
+            self.deformation_columns[axis][s, p] = vec4(column, 0.0)
 
     # The drivers run the same phases in the same order.
 
@@ -778,9 +801,10 @@ def block_count(count: i32) -> i32:
 @ti.func
 def largest_component(velocity: vec3) -> f32:
     """Return the largest absolute component, huge where one is not a number."""
+    speed = ti.abs(velocity)
     largest = 0.0
     for axis in ti.static(_AXES):
-        component = finite(ti.abs(velocity[axis]))
+        component = finite(speed[axis])
         largest = larger(component, largest)
     return largest
 
@@ -789,7 +813,7 @@ def largest_component(velocity: vec3) -> f32:
 def columns(first: vec4, second: vec4, third: vec4) -> mat3:
     """Return the matrix with these columns, without their fourth entries."""
     return mat3(
-        [first[0], second[0], third[0]],
-        [first[1], second[1], third[1]],
-        [first[2], second[2], third[2]],
+        [first.x, second.x, third.x],
+        [first.y, second.y, third.y],
+        [first.z, second.z, third.z],
     )
