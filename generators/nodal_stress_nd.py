@@ -129,15 +129,17 @@ class NodalStressND:
         self.row_steps = tuple(row_steps)
         # one of each pair of opposite neighbours; nearest first
         pairs = []
+        middle = (0,) * self.dimension
         for step in itertools.product((1, 0, -1), repeat=self.dimension):
-            if step > (0,) * self.dimension:
+            if step > middle:
                 pairs.append(step)
         self.pairs = tuple(sorted(pairs, key=_axis_count))
         # weight in a gradient of the difference of a pair, by the number of further
         # axes along which the two differ
         weights = []
         for further in range(self.dimension):
-            weights.append(0.75 ** (row_axes - further) * 0.125**further)
+            equal_axes = row_axes - further
+            weights.append(0.75**equal_axes * 0.125**further)
         self.pair_weight = tuple(weights)
 
     def _declare_fields(self) -> None:
@@ -234,25 +236,31 @@ class NodalStressND:
         edge_count = len(tables.images.node)
         image_shape = tables.images.ghost.shape
         layer_count = max(1, self.parameters.force_layers)
+        particle_shape = (scenarios, self.particles)
+        node_shape = (scenarios, node_count)
+        # Two more: a node counts the rows of the two nodes before it as well.
+        row_shape = (scenarios, node_count + 2)
+        drive_shape = (scenarios, ghost_count)
+        drag_shape = (scenarios, *image_shape)
+        force_shape = (scenarios, layer_count)
         mask_shape = (1, 1)
         if self.has_obstacle:
-            mask_shape = (scenarios, node_count)
+            mask_shape = node_shape
         fringe_count = 1
         if self.has_fringe:
             fringe_count = node_count
         return backend.place(
-            ((scenarios, self.particles), particle_fields),
-            ((scenarios, node_count), node_fields),
-            # Two more: a node counts the rows of the two nodes before it as well.
-            ((scenarios, node_count + 2), [self.row_sums]),
+            (particle_shape, particle_fields),
+            (node_shape, node_fields),
+            (row_shape, [self.row_sums]),
             ((ghost_count,), ghost_fields),
             ((edge_count,), [self.edge_node]),
             (image_shape, [self.image_ghost]),
             (tables.interior.shape, [self.interior_node]),
             ((node_count,), [self.force_layer]),
-            ((scenarios, ghost_count), [self.ghost_drive]),
-            ((scenarios, *image_shape), [self.image_drag]),
-            ((scenarios, layer_count), [self.force_gain]),
+            (drive_shape, [self.ghost_drive]),
+            (drag_shape, [self.image_drag]),
+            (force_shape, [self.force_gain]),
             ((scenarios,), scenario_fields),
             (mask_shape, [self.fluid_mask]),
             ((fringe_count,), [self.fringe_damping]),
@@ -269,13 +277,15 @@ class NodalStressND:
         # the layer of each node along y; ghosts belong to the nearest one
         row_count = self.cells[1]
         layer_count = max(1, self.parameters.force_layers)
+        last_row = row_count - 1
         row = tables.index[:, 1] - 1
-        row = np.clip(row, 0, row_count - 1)
+        row = np.clip(row, 0, last_row)
         layer = row * layer_count // row_count
         self.force_layer.from_numpy(layer.astype(np.int32))
         if self.has_fringe:
             places = self._node_places()
-            rates = self.parameters.fringe_rates(places[:, 0])
+            x = places[:, 0]
+            rates = self.parameters.fringe_rates(x)
             damping = self.dt * rates
             self.fringe_damping.from_numpy(damping.astype(np.float32))
 
@@ -286,23 +296,30 @@ class NodalStressND:
 
     def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
-        self.ghost_drive.from_numpy(self.tables.ghost_drive(velocity))
-        self.image_drag.from_numpy(self.tables.image_drag(velocity))
+        drive = self.tables.ghost_drive(velocity)
+        drag = self.tables.image_drag(velocity)
+        self.ghost_drive.from_numpy(drive)
+        self.image_drag.from_numpy(drag)
 
     def apply_force(self, acceleration: Singles) -> None:
         """Let a force act [length/s^2], shape [scenario, layer, axis]."""
         scenarios, layers, dimension = acceleration.shape
-        gain = np.zeros((scenarios, layers, LANES), np.float32)
-        gain[..., :dimension] = np.float32(self.dt) * acceleration
+        dt = np.float32(self.dt)
+        shape = (scenarios, layers, LANES)
+        gain = np.zeros(shape, np.float32)
+        gain[..., :dimension] = dt * acceleration
         self.force_gain.from_numpy(gain)
 
     def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the nodes that each scenario's obstacle holds at rest."""
         places = self._node_places()
-        mask = np.empty((self.scenarios, len(places)), np.float32)
-        discs = np.zeros((self.scenarios, LANES), np.float32)
+        mask_shape = (self.scenarios, len(places))
+        disc_shape = (self.scenarios, LANES)
+        mask = np.empty(mask_shape, np.float32)
+        discs = np.zeros(disc_shape, np.float32)
+        inset = _INSET / self.inv_dx
         for s, obstacle in enumerate(obstacles):
-            least_distance = obstacle.radius + _INSET / self.inv_dx
+            least_distance = obstacle.radius + inset
             is_solid = is_inside(places, obstacle.centre, obstacle.radius)
             mask[s] = ~is_solid
             discs[s, : self.dimension] = obstacle.centre
@@ -312,7 +329,8 @@ class NodalStressND:
 
     def set_stream(self, velocity: Singles) -> None:
         """Let the fringe draw to a velocity [length/s], shape [scenario, axis]."""
-        stream = np.zeros((self.scenarios, LANES), np.float32)
+        shape = (self.scenarios, LANES)
+        stream = np.zeros(shape, np.float32)
         stream[:, : self.dimension] = velocity
         self.stream.from_numpy(stream)
 
@@ -343,15 +361,14 @@ class NodalStressND:
             lowest = ti.cast(scaled - 0.5, i32)
             # A periodic coordinate may round up to the end of its last cell.
             lowest = ti.min(lowest, last)
-            f = scaled - ti.cast(lowest, f32)
+            node = ti.cast(lowest, f32)
+            f = scaled - node
             low, mid, high = spline_weights(f)
-            weights = vec4(low, mid, high, 0.0)
-            self.weights[axis][s, p] = weights
+            self.weights[axis][s, p] = vec4(low, mid, high, 0.0)
             offset[axis] = f - 1.0
             number += lowest * stride
         number_bits = ti.bit_cast(number, f32)
-        place = vec4(offset[0], offset[1], offset[2], number_bits)
-        self.stencil_place[s, p] = place
+        self.stencil_place[s, p] = vec4(offset, number_bits)
 
     @ti.func
     def lowest_node(self, place: vec4) -> i32:
@@ -391,7 +408,8 @@ class NodalStressND:
         number = lowest
         for axis in ti.static(range(self.dimension - 1)):
             stride = ti.static(self.tables.stride[axis])
-            number += ti.static((step[axis] + 1) * stride)
+            steps_from_low = ti.static(step[axis] + 1)
+            number += ti.static(steps_from_low * stride)
         return number
 
     @ti.func
@@ -412,10 +430,11 @@ class NodalStressND:
         step_x = slope_scale * slope_x
         step_y = slope_scale * slope_y
         step_z = slope_scale * slope_z
-        at_particle = scale * self.particle_state[s, p]
-        at_middle = at_particle - place[0] * step_x - place[1] * step_y
+        at_middle = scale * self.particle_state[s, p]
+        at_middle = at_middle - place.x * step_x
+        at_middle = at_middle - place.y * step_y
         if ti.static(self.dimension == 3):
-            at_middle = at_middle - place[2] * step_z
+            at_middle = at_middle - place.z * step_z
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
@@ -477,7 +496,8 @@ class NodalStressND:
             momentum = received + self.drag[s, n]
             state = momentum / count
             state[3] = count * particle_volume
-            jacobian = from_fixed(total[3], self.count_unit) / count
+            jacobian_sum = from_fixed(total[3], self.count_unit)
+            jacobian = jacobian_sum / count
         self.node_state[s, n] = state
         self.node_jacobian[s, n] = jacobian
 
@@ -526,7 +546,8 @@ class NodalStressND:
                 rises[further, axis] = stepped(sum_before, rise, step[axis])
         gradient = vec4(0.0)
         for axis in ti.static(range(self.dimension)):
-            slope = ti.static(self.pair_weight[0]) * rises[0, axis]
+            nearest_weight = ti.static(self.pair_weight[0])
+            slope = nearest_weight * rises[0, axis]
             for further in ti.static(range(1, self.dimension)):
                 weight = ti.static(self.pair_weight[further])
                 slope = slope + weight * rises[further, axis]
@@ -543,8 +564,9 @@ class NodalStressND:
             state_ahead = self.node_state[s, ahead]
             state_behind = self.node_state[s, behind]
             neighbours = neighbours + (state_ahead + state_behind)
+        middle = self.node_state[s, n]
         neighbour_count = ti.static(2.0 * self.dimension)
-        return neighbours - neighbour_count * self.node_state[s, n]
+        return neighbours - neighbour_count * middle
 
     @ti.func
     def add_forces(self, s: i32, n: i32) -> None:
@@ -565,9 +587,10 @@ class NodalStressND:
             mask = self.fluid_mask[s, n]
             gain = mask * gain
             v = mask * v
+        speed = ti.abs(v)
         peak = self.peak_speed[s, n]
         for axis in ti.static(range(self.dimension)):
-            peak = largest(ti.abs(v[axis]), peak)
+            peak = largest(speed[axis], peak)
         self.peak_speed[s, n] = peak
         # The fourth lanes hold Jbar and r.
         gain[3] = self.node_jacobian[s, n]
@@ -598,15 +621,16 @@ class NodalStressND:
             start = self.row_start(lowest, step)
             for k in ti.static(range(3)):
                 node = start + k
-                share = weights[k] * self.next_state[s, node]
-                gain += weights[k] * self.node_gain[s, node]
+                weight = weights[k]
+                share = weight * self.next_state[s, node]
+                gain += weight * self.node_gain[s, node]
                 state += share
                 slope_x = stepped(slope_x, share, step[0])
                 slope_y = stepped(slope_y, share, k - 1)
         self.grid_state[s, p] = state
         self.grid_gain[s, p] = gain
-        slope_x = slope_x - place[0] * state
-        slope_y = slope_y - place[1] * state
+        slope_x = slope_x - place.x * state
+        slope_y = slope_y - place.y * state
         self.slopes[0][s, p] = self.slope_factor * slope_x
         self.slopes[1][s, p] = self.slope_factor * slope_y
 
@@ -626,13 +650,15 @@ class NodalStressND:
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
+            middle = start + 1
+            last = start + 2
             low = weights[0] * self.next_state[s, start]
-            mid = weights[1] * self.next_state[s, start + 1]
-            high = weights[2] * self.next_state[s, start + 2]
+            mid = weights[1] * self.next_state[s, middle]
+            high = weights[2] * self.next_state[s, last]
             row_state = low + mid + high
             low_gain = weights[0] * self.node_gain[s, start]
-            mid_gain = weights[1] * self.node_gain[s, start + 1]
-            high_gain = weights[2] * self.node_gain[s, start + 2]
+            mid_gain = weights[1] * self.node_gain[s, middle]
+            high_gain = weights[2] * self.node_gain[s, last]
             row_gain = low_gain + mid_gain + high_gain
             state += row_state
             gain += row_gain
@@ -641,11 +667,11 @@ class NodalStressND:
             slope_z += high - low
         self.grid_state[s, p] = state
         self.grid_gain[s, p] = gain
-        slope_x = slope_x - place[0] * state
-        slope_y = slope_y - place[1] * state
+        slope_x = slope_x - place.x * state
+        slope_y = slope_y - place.y * state
+        slope_z = slope_z - place.z * state
         self.slopes[0][s, p] = self.slope_factor * slope_x
         self.slopes[1][s, p] = self.slope_factor * slope_y
-        slope_z = slope_z - place[2] * state
         self.slopes[2][s, p] = self.slope_factor * slope_z
 
     @ti.func
@@ -655,10 +681,12 @@ class NodalStressND:
         grid_velocity = grid_state.xyz
         grid_gain = self.grid_gain[s, p]
         grid_jacobian = grid_gain[3]
-        volume = 1.0 / largest(grid_state[3], 0.5)
+        density = largest(grid_state[3], 0.5)
+        volume = 1.0 / density
         old_state = self.particle_state[s, p]
         v = old_state.xyz + grid_gain.xyz
-        v = v + self.parameters.velocity_relaxation * (grid_velocity - v)
+        velocity_lag = grid_velocity - v
+        v = v + self.parameters.velocity_relaxation * velocity_lag
 
         shift = vec3(0.0)
         shift_change = vec3(0.0)  # of the velocity, along the shift
@@ -680,7 +708,8 @@ class NodalStressND:
         inside = vec3(0.0)
         for axis in ti.static(range(self.dimension)):
             step = self.dt * grid_velocity[axis] + shift[axis]
-            inside[axis] = self.kept_inside(old_x[axis] + step, axis)
+            target = old_x[axis] + step
+            inside[axis] = self.kept_inside(target, axis)
         x = inside
         if ti.static(self.has_obstacle):
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
@@ -693,19 +722,20 @@ class NodalStressND:
         compression = volume - grid_jacobian
         coupling = self.parameters.density_coupling * compression
         jacobian = old_jacobian + growth + relaxation + coupling
-        self.particle_state[s, p] = vec4(v[0], v[1], v[2], jacobian)
+        self.particle_state[s, p] = vec4(v, jacobian)
         speed = ti.abs(v)
-        reached = vec4(speed[0], speed[1], speed[2], jacobian)
+        reached = vec4(speed, jacobian)
         extremes = self.extremes[s, p]
         self.extremes[s, p] = largest(reached, extremes)
         minus_jacobian = largest(-jacobian, old_x[3])
-        self.x[s, p] = vec4(x[0], x[1], x[2], minus_jacobian)
+        self.x[s, p] = vec4(x, minus_jacobian)
 
     @ti.func
     def hold(self, s: i32, p: i32) -> None:
         """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
-        density = self.grid_state[s, p][3]
-        volume = 1.0 / largest(density, 0.5)
+        grid_density = self.grid_state[s, p][3]
+        density = largest(grid_density, 0.5)
+        volume = 1.0 / density
         grid_jacobian = self.grid_gain[s, p][3]
         for axis in ti.static(range(self.dimension)):
             self.slopes[axis][s, p] = vec4(0.0)
@@ -723,11 +753,14 @@ class NodalStressND:
         obstacle = self.obstacle[s]
         radius = obstacle[3]
         way = target - obstacle.xyz
-        square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+        square = way.x * way.x + way.y * way.y + way.z * way.z
         # A place at the very centre has no nearest one; it stays.
-        is_inside = (square < radius * radius) and (square > 0.0)
+        is_near = square < radius * radius
+        is_off_centre = square > 0.0
+        is_inside = is_near and is_off_centre
         safe_square = ti.select(is_inside, square, 1.0)
-        stretch = radius / ti.sqrt(safe_square)
+        distance = ti.sqrt(safe_square)
+        stretch = radius / distance
         on_surface = target + (stretch - 1.0) * way
         return ti.select(is_inside, on_surface, target)
 
@@ -874,7 +907,7 @@ class NodalStressND:
             state = self.particle_state[s, p]  # v_p, J_p
             speed = ti.abs(state.xyz)
             jacobian = state[3]
-            self.extremes[s, p] = vec4(speed[0], speed[1], speed[2], jacobian)
+            self.extremes[s, p] = vec4(speed, jacobian)
             self.x[s, p][3] = -jacobian  # this lane keeps the largest -J
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
