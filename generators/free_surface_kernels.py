@@ -63,8 +63,9 @@ class FreeSurfaceKernels:
         self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
         # of abs(v) + abs(A o), what sums have room for
         self.reach_bound = self.reach * self.speed_bound
+        jacobian_bound = max(1.0, p.jacobian_max)
         self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
-        self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
+        self.count_scale = fixed_point_scale(p.particles, jacobian_bound)
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
         self.stress_factor = 4.0 * p.dt * p.grid / p.density  # 4 dt / (rho dx)
@@ -165,11 +166,13 @@ class FreeSurfaceKernels:
         first = ti.Vector([self.high] * self.dimension)
         last = ti.Vector([0] * self.dimension)
         for p in range(particles):
+            x = self.x[0, p]
             for axis in ti.static(range(self.dimension)):
-                scaled = self.x[0, p][axis] * self.inv_dx
+                scaled = x[axis] * self.inv_dx
                 base = ti.cast(scaled - 0.5, i32)
+                end = base + 3
                 first[axis] = ti.min(first[axis], base)
-                last[axis] = ti.max(last[axis], base + 3)
+                last[axis] = ti.max(last[axis], end)
         for axis in ti.static(range(self.dimension)):
             if first[axis] <= self.low + 1:
                 first[axis] = self.low - 1

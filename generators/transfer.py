@@ -50,9 +50,11 @@ def fixed_point_scale(particles: int, bound: float) -> float:
     >>> fixed_point_scale(8192, 8.0) == 2.0**46
     True
     """
-    bits = min(50, 62 - (particles - 1).bit_length())
+    count_bits = (particles - 1).bit_length()
+    bits = min(50, 62 - count_bits)
     mantissa, exponent = math.frexp(bound)
-    if mantissa == 0.5:  # a power of two
+    is_power_of_two = mantissa == 0.5
+    if is_power_of_two:
         exponent -= 1
     return math.ldexp(1.0, bits - exponent)
 
@@ -81,19 +83,20 @@ def stencil(x: vec4, inv_dx: f32, width: i32) -> Value:
     """
     scaled = x.xy * inv_dx
     base = ti.cast(scaled - 0.5, i32)
-    f = scaled - ti.cast(base, f32)
+    base_place = ti.cast(base, f32)  # [cells]
+    f = scaled - base_place
     offset = f - 1.0
-    node = base[0] * width + base[1]
+    node = base.x * width + base.y
     node_bits = ti.bit_cast(node, f32)
     low, mid, high = spline_weights(f)
-    along_y = vec3(low[1], mid[1], high[1])
-    first = low[0] * along_y
-    second = mid[0] * along_y
-    third = high[0] * along_y
+    along_y = vec3(low.y, mid.y, high.y)
+    first = low.x * along_y
+    second = mid.x * along_y
+    third = high.x * along_y
     return (
-        vec4(first[0], first[1], first[2], node_bits),
-        vec4(second[0], second[1], second[2], offset[0]),
-        vec4(third[0], third[1], third[2], offset[1]),
+        vec4(first, node_bits),
+        vec4(second, offset.x),
+        vec4(third, offset.y),
     )
 
 
@@ -119,7 +122,8 @@ def node_number(bits: f32, node_count: Template) -> Value:
     each address is computed anew.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
-    return ti.bit_cast(bits, i32) & mask
+    number = ti.bit_cast(bits, i32)
+    return number & mask
 
 
 @ti.func
@@ -136,14 +140,16 @@ def to_fixed(scaled: Value) -> Value:
 def shifted(scaled: Value) -> Value:
     """Return :func:`to_fixed` plus the bits of the shift."""
     rounding_shift = ti.cast(_ROUNDING_SHIFT, f64)
-    moved = ti.cast(scaled, f64) + rounding_shift
+    exact = ti.cast(scaled, f64)
+    moved = exact + rounding_shift
     return ti.bit_cast(moved, i64)
 
 
 @ti.func
 def from_fixed(total: Value, inverse_scale: f32) -> Value:
     """Return a sum of :func:`to_fixed` as float32, rounded once."""
-    return ti.cast(total, f32) * inverse_scale
+    rounded = ti.cast(total, f32)
+    return rounded * inverse_scale
 
 
 @ti.func
@@ -156,7 +162,8 @@ def accumulate(
     """
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):
-        ti.atomic_add(sums[s, node], to_fixed(scaled))
+        contribution = to_fixed(scaled)
+        ti.atomic_add(sums[s, node], contribution)
     else:
         # The shift comes off the sum: off the contribution, LLVM finds vectors for two
         # lanes only.

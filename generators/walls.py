@@ -19,12 +19,15 @@ class Walls:
 
     def __init__(self, *, grid: int, wall: int, no_slip: bool) -> None:
         """Set the indices; the field ``speed`` is the caller's to place."""
-        self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
-        # low and high index of the interior nodes
-        self.edge = (wall + 1, grid - wall - 1)
+        low_ghost = wall
+        high_ghost = grid - wall
+        low_edge = low_ghost + 1
+        high_edge = high_ghost - 1
+        self.ghost = (low_ghost, high_ghost)  # indices of the ghost nodes
+        self.edge = (low_edge, high_edge)  # of the outermost interior nodes
         # the same as ranges along either axis: first index, and the one behind the last
-        self.all_nodes = (self.ghost[0], self.ghost[1] + 1)
-        self.interior_nodes = (self.edge[0], self.edge[1] + 1)
+        self.all_nodes = (low_ghost, high_ghost + 1)
+        self.interior_nodes = (low_edge, high_edge + 1)
         self.span = grid - 2 * wall
         self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
         # sign with which a wall mirrors a tangential component
@@ -50,9 +53,10 @@ class Walls:
 
         ``first`` is the index of the low wall of the pair.
         """
-        speed = self.speed[s][first]
+        speeds = self.speed[s]
+        speed = speeds[first]
         if ghost == self.ghost[1]:
-            speed = self.speed[s][first + 1]
+            speed = speeds[first + 1]
         return 2.0 * speed
 
     @ti.func
@@ -91,7 +95,7 @@ class Walls:
         if i != self.source(i):
             sign = vec2(-1.0, tangential)
         if j != self.source(j):
-            sign = vec2(sign[0] * tangential, -sign[1])
+            sign = vec2(sign.x * tangential, -sign.y)
         return sign
 
     @ti.func
@@ -107,12 +111,12 @@ class Walls:
             speed = self.doubled_speed(s, 0, i)
             if self.is_edge(j):
                 speed = 0.5 * speed
-            velocity[1] = speed
+            velocity.y = speed
         if is_beyond_y_wall and not is_beyond_x_wall:
             speed = self.doubled_speed(s, 2, j)
             if self.is_edge(i):
                 speed = 0.5 * speed
-            velocity[0] = speed
+            velocity.x = speed
         return velocity
 
     @ti.func
