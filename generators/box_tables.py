@@ -119,30 +119,37 @@ class BoxTables:
         node = np.flatnonzero(is_ghost).astype(np.int32)
         index = self.index[node]
         mirrored = np.clip(index, 1, self._last)
-        wrapped = (index - 1) % self._last + 1
+        from_first = index - 1
+        wrapped = from_first % self._last + 1
         source_index = np.where(self._is_walled, mirrored, wrapped)
         source = self._number(source_index)
 
         # whether a wall lies between a ghost and its source, shape [ghost, axis]
         is_across = self._is_outside[node] & self._is_walled
         ghost_count = len(node)
-        sign = np.ones((ghost_count, LANES), np.float32)
+        sign_shape = (ghost_count, LANES)
+        sign = np.ones(sign_shape, np.float32)
         for axis in range(self.dimension):
             is_mirrored = is_across[:, axis, None]
-            factor = np.where(is_mirrored, self._reflection(axis), 1)
+            reflection = self._reflection(axis)
+            factor = np.where(is_mirrored, reflection, 1)
             sign *= factor.astype(np.float32)
 
         # Only one wall moves a ghost; where two meet, none does.
-        is_single = is_across.sum(axis=1) == 1
+        wall_count = is_across.sum(axis=1)
+        is_single = wall_count == 1
         normal = np.argmax(is_across, axis=1)
         ghosts = np.arange(ghost_count)
-        is_upper = index[ghosts, normal] > 1
-        wall = np.where(is_single, 2 * normal + is_upper, 0)
+        index_along_normal = index[ghosts, normal]
+        is_upper = index_along_normal > 1
+        nearest_wall = 2 * normal + is_upper
+        wall = np.where(is_single, nearest_wall, 0)
         axes = np.arange(self.dimension)
         is_along_wall = axes != normal[:, None]
         is_tangential = is_single[:, None] & is_along_wall
         # In the last cells before a wall that the motion runs into it is halved.
-        is_at_end = (index == 1) | (index == self._last)
+        is_first = index == 1
+        is_at_end = is_first | (index == self._last)
         is_last = is_at_end & self._is_walled
         share = np.where(is_last, 1.0, 2.0)
         drive = share * is_tangential
@@ -167,7 +174,8 @@ class BoxTables:
         # one beyond the other end along a periodic axis
         is_below = np.where(self._is_walled, is_low, is_high)
         beyond = np.where(is_below, 0, self._last + 1)
-        wall_across = 2 * np.arange(self.dimension) + is_high
+        low_wall = 2 * np.arange(self.dimension)
+        wall_across = low_wall + is_high
 
         subsets = []
         for crossed in itertools.product((False, True), repeat=self.dimension):
@@ -176,9 +184,11 @@ class BoxTables:
         edge_count = len(node)
         image_count = len(subsets)
         image_shape = (edge_count, image_count)
+        sign_shape = (image_count, LANES)
+        wall_shape = (edge_count, image_count, self.dimension)
         ghost = np.full(image_shape, -1, np.int32)
-        sign = np.ones((image_count, LANES), np.int64)
-        wall = np.full((*image_shape, self.dimension), -1, np.int32)
+        sign = np.ones(sign_shape, np.int64)
+        wall = np.full(wall_shape, -1, np.int32)
         for image, subset in enumerate(subsets):
             may_cross = is_low | is_high | ~subset
             exists = may_cross.all(axis=1)
@@ -189,7 +199,8 @@ class BoxTables:
             crosses_wall = exists[:, None] & walled_subset
             wall[:, image] = np.where(crosses_wall, wall_across, -1)
             for axis in np.flatnonzero(walled_subset):
-                sign[image] *= self._reflection(int(axis))
+                reflection = self._reflection(int(axis))
+                sign[image] *= reflection
         return Images(node=node, ghost=ghost, sign=sign, wall=wall)
 
     def ghost_drive(self, wall_velocity: Singles) -> Singles:
