@@ -41,7 +41,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._states = list(states)
         self._move_walls_towards(0)
         # nu dt / dx^2, shape [scenario]
-        viscosity = np.array([state.viscosity for state in states])
+        viscosities = [state.viscosity for state in states]
+        viscosity = np.array(viscosities)
         diffusion_number = viscosity * p.dt * p.grid**2
         kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
         for field in (
@@ -70,9 +71,10 @@ class ClosedBox(Driver[ClosedBoxParameters]):
             return end
         interval = self.parameters.substeps_per_frame
         frame, past = divmod(self._substeps, interval)
+        next_frame = frame + 1
         if past == 0:
-            self._move_walls_towards(frame + 1)
-        return min(end, (frame + 1) * interval)
+            self._move_walls_towards(next_frame)
+        return min(end, next_frame * interval)
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario."""
@@ -93,7 +95,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         Node (i, j) lies at (i, j) / grid; nodes beyond the ghost layer hold 0.
         """
         state = self._kernels.next_state.to_numpy()
-        return self._on_grid(state[..., :2])
+        velocity = state[..., :2]
+        return self._on_grid(velocity)
 
     def mean_grid_velocity(self) -> NDArray[np.float64]:
         """Mean nodal velocity of the substeps advanced with ``average=True``; shape as
@@ -143,18 +146,18 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         speed_bound = self._kernels.speed_bound / 2.0
         speeds = np.abs(state.wall_velocity)
         normal = state.wall_velocity[..., _WALL_NUMBERS, _NORMAL_AXES]
-        has_normal_motion = bool(np.any(normal != 0.0))
-        is_slow_enough = bool(np.all(speeds <= speed_bound))
-        is_sliding = bool(np.any(state.wall_velocity != 0.0))
+        has_normal_motion = normal.any()
+        is_slow_enough = (speeds <= speed_bound).all()
+        is_sliding = speeds.any()
         may_slide = self.parameters.no_slip or not is_sliding
         if has_normal_motion or not is_slow_enough or not may_slide:
             by_frame = speeds.reshape(-1, 4, 2)
             largest_speeds = by_frame.max(axis=0).tolist()
+            order = ", ".join(WALLS)
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
-                where=f"scenario {index}, wall_velocity in the order "
-                f"{', '.join(WALLS)}",
+                where=f"scenario {index}, wall_velocity in the order {order}",
                 expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}",
                 got=f"speeds up to {largest_speeds}",
                 fix="correct what initial_state returns: docs/extending.md",

@@ -83,16 +83,19 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         # Material of each particle, shape [scenario, particle]
         self._material = stack(states, "material").astype(np.int32)
         kernels.sort_by_material(self._material)
-        matter = np.zeros((*shape, 4), np.float32)
+        matter_shape = (*shape, 4)
+        matter = np.zeros(matter_shape, np.float32)
         matter[:, :, 0] = self._material
         matter[:, :, 1:] = 1.0
         kernels.matter.from_numpy(matter)
         identity = np.eye(self.dimension, dtype=np.float32)
-        gradients = np.empty((*shape, *identity.shape), np.float32)
+        gradient_shape = (*shape, *identity.shape)
+        gradients = np.empty(gradient_shape, np.float32)
         gradients[...] = identity
         self._set_deformation(gradients)
         frictions = [state.friction for state in states]
-        kernels.friction.from_numpy(np.array(frictions, np.float32))
+        friction = np.array(frictions, np.float32)
+        kernels.friction.from_numpy(friction)
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
@@ -104,11 +107,13 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         extremes = np.where(is_number, extremes, np.nan)
         healths = []
         for extreme in extremes:
+            speed, jacobian_min, jacobian_max, _ = extreme.T
+            is_finite = np.isfinite(extreme)
             health = Health(
-                finite=bool(np.isfinite(extreme).all()),
-                max_speed=float(extreme[:, 0].max()),
-                jacobian_min=float(extreme[:, 1].min()),
-                jacobian_max=float(extreme[:, 2].max()),
+                finite=bool(is_finite.all()),
+                max_speed=float(speed.max()),
+                jacobian_min=float(jacobian_min.min()),
+                jacobian_max=float(jacobian_max.max()),
             )
             healths.append(health)
         return healths
@@ -158,19 +163,23 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         """Return the energy of each scenario, in float64 from the particles."""
         p = self.parameters
         mass = p.density * self._volume  # of a particle, shape [scenario]
+        weight = p.gravity * mass
         position = self.position().astype(np.float64)
         velocity = self.velocity().astype(np.float64)
         affine = self.affine().astype(np.float64)
         height = position[..., 1] - self._kernels.position_min
-        velocity_square = (velocity**2).sum(axis=-1)
-        affine_square = (affine**2).sum(axis=(-2, -1))
+        velocity_square = np.square(velocity).sum(axis=-1)
+        affine_square = np.square(affine).sum(axis=(-2, -1))
         spin = affine_square / (4.0 * p.grid**2)
         motion = velocity_square + spin
         elastic_density = self._elastic_density()
+        motion_sum = motion.sum(axis=-1)
+        height_sum = height.sum(axis=-1)
+        elastic_sum = elastic_density.sum(axis=-1)
         return Energy(
-            kinetic=0.5 * mass * motion.sum(axis=-1),
-            gravitational=p.gravity * mass * height.sum(axis=-1),
-            elastic=self._volume * elastic_density.sum(axis=-1),
+            kinetic=0.5 * mass * motion_sum,
+            gravitational=weight * height_sum,
+            elastic=self._volume * elastic_sum,
         )
 
     def _elastic_density(self) -> Array:
@@ -185,9 +194,11 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         jacobian = np.linalg.det(f)
         stretches[..., -1] *= np.sign(jacobian)
         strains = stretches - 1.0
-        shear = (strains**2).sum(axis=-1)
-        bulk = 0.5 * (jacobian - 1.0) ** 2
-        exponent = p.snow_hardening * (1.0 - ratio)
+        shear = np.square(strains).sum(axis=-1)
+        volume_change = jacobian - 1.0
+        bulk = 0.5 * volume_change**2
+        compaction = 1.0 - ratio
+        exponent = p.snow_hardening * compaction
         hardening = np.exp(exponent)
         hardening = np.clip(hardening, p.snow_hardening_min, p.snow_hardening_max)
 
@@ -202,7 +213,8 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             psi = mu * shear + la * bulk
             if material is Material.SNOW:
                 psi = psi * hardening
-            density = np.where(self._material == material, psi, density)
+            is_material = self._material == material
+            density = np.where(is_material, psi, density)
         return np.asarray(density)
 
 

@@ -56,11 +56,14 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     c^2 is K/rho in liquid and (lambda + 2 mu)/rho in solids.
     """
     p = parameters
+    jelly = wave_modulus(p.jelly_modulus, p.jelly_poisson)
+    snow = wave_modulus(p.snow_modulus, p.snow_poisson)
+    rope = wave_modulus(p.rope_modulus, p.rope_poisson)
     moduli = {
         Material.LIQUID: p.liquid_modulus,
-        Material.JELLY: wave_modulus(p.jelly_modulus, p.jelly_poisson),
-        Material.SNOW: wave_modulus(p.snow_modulus, p.snow_poisson),
-        Material.ROPE: wave_modulus(p.rope_modulus, p.rope_poisson),
+        Material.JELLY: jelly,
+        Material.SNOW: snow,
+        Material.ROPE: rope,
     }
     speeds = {}
     for material, modulus in moduli.items():
@@ -70,7 +73,9 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
 
 def wave_modulus(young: float, poisson: float) -> float:
     """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)) [mass/s^2]."""
-    divisor = (1.0 + poisson) * (1.0 - 2.0 * poisson)
+    lateral = 1.0 + poisson
+    volumetric = 1.0 - 2.0 * poisson
+    divisor = lateral * volumetric
     return young * (1.0 - poisson) / divisor
 
 
@@ -124,22 +129,29 @@ class SoundnessRecorder:
             # the other tail: the start of the bin that holds it
             end_of_bin = _quantile(self._jacobian_counts, 0.001)
             liquid_jacobian_999 = end_of_bin - BIN
+        mach_999 = _quantile(self._mach_counts, 0.999)
+        liquid_least = least[self._is_liquid]
+        liquid_greatest = greatest[self._is_liquid]
+        snow_least = least[self._is_snow]
+        snow_greatest = greatest[self._is_snow]
         return FreeSurfaceSoundness(
-            mach_999=round(_quantile(self._mach_counts, 0.999), 3),
+            mach_999=round(mach_999, 3),
             mach_max=self._mach_max,
             liquid_jacobian_999=round(liquid_jacobian_999, 3),
-            liquid_jacobian_min=_least(least[self._is_liquid]),
-            liquid_jacobian_max=_greatest(greatest[self._is_liquid]),
-            snow_jp_min=_least(least[self._is_snow]),
-            snow_jp_max=_greatest(greatest[self._is_snow]),
+            liquid_jacobian_min=_least(liquid_least),
+            liquid_jacobian_max=_greatest(liquid_greatest),
+            snow_jp_min=_least(snow_least),
+            snow_jp_max=_greatest(snow_greatest),
             clamped_particles=self._count_clamped(least, greatest),
         )
 
     def _count_clamped(self, least: Singles, greatest: Singles) -> int:
         p = self._parameters
         # Jp at which the hardening factor meets its caps [1]
-        stiffest_jp = 1.0 - math.log(p.snow_hardening_max) / p.snow_hardening
-        softest_jp = 1.0 - math.log(p.snow_hardening_min) / p.snow_hardening
+        greatest_exponent = math.log(p.snow_hardening_max)
+        least_exponent = math.log(p.snow_hardening_min)
+        stiffest_jp = 1.0 - greatest_exponent / p.snow_hardening
+        softest_jp = 1.0 - least_exponent / p.snow_hardening
         lowest_jp = max(p.snow_jp_min, stiffest_jp)
 
         is_thin = least <= np.float32(p.jacobian_min)
@@ -161,8 +173,9 @@ def _quantile(counts: NDArray[np.int64], share: float) -> float:
     """Return the end of the first bin up to which a share of the values lies."""
     cumulative = np.cumsum(counts)
     total = cumulative[-1]
-    index = int(np.searchsorted(cumulative, share * total))
-    return (index + 1) * BIN
+    first_bin = np.searchsorted(cumulative, share * total)
+    end = int(first_bin) + 1  # [bins]
+    return end * BIN
 
 
 def _least(values: Singles) -> float:
