@@ -83,7 +83,8 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
 def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
     radius = draw_between(rng, size, "ball_radius")
     ball = Ball(radius)
-    centre = _draw_place(rng, size, ball, size.value("fall_height"))
+    lowest = size.value("fall_height")
+    centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "fall_velocity")
     body = _LiquidBody(ball, centre, velocity)
     return _state(rng, size, "falling-ball", [body])
@@ -113,11 +114,12 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
         start = high - 0.5 * width
     y = low + 0.5 * height
     middle = 0.5 * (low + high)
+    side = high - low
     if number % 2 == 0:
-        column = Block((width, height, high - low))
+        column = Block((width, height, side))
         centre = (start, y, middle)
     else:
-        column = Block((high - low, height, width))
+        column = Block((side, height, width))
         centre = (middle, y, start)
     body = _LiquidBody(column, centre, AT_REST)
     return _state(rng, size, "dam-break", [body])
@@ -126,12 +128,15 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
 def _splash(rng: RandomSource, size: Size) -> InitialState:
     low, high = free_surface_walls(size)
     depth = draw_between(rng, size, "pool_depth")
-    pool = Block((high - low, depth, high - low))
+    side = high - low
+    pool = Block((side, depth, side))
     middle = 0.5 * (low + high)
-    pool_centre = (middle, low + 0.5 * depth, middle)
+    pool_y = low + 0.5 * depth
+    pool_centre = (middle, pool_y, middle)
     radius = draw_between(rng, size, "drop_radius")
     ball = Ball(radius)
-    lowest = low + depth + size.value("margin") + radius
+    surface = low + depth
+    lowest = surface + size.value("margin") + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
     pool_body = _LiquidBody(pool, pool_centre, AT_REST)
@@ -160,24 +165,28 @@ def _state(
             volume_share = volumes[index] / total_volume
             count = int(size.particles * volume_share)
         left_count -= count
-        place = Body(body.solid, np.array(body.centre))
+        centre = np.array(body.centre)
+        place = Body(body.solid, centre)
         position = sample_points(rng, place, count)
+        velocity = np.full(position.shape, body.velocity)
         positions.append(position)
-        velocities.append(np.full(position.shape, body.velocity))
+        velocities.append(velocity)
 
     low, high = free_surface_walls(size)
-    position = np.clip(np.concatenate(positions), low, high)
+    all_positions = np.concatenate(positions)
+    all_velocities = np.concatenate(velocities)
     last_body = bodies[-1]
     parameters: dict[str, int | float | str] = {
         "family": family,
         "volume": total_volume,
     }
+    last_centre = quantise(last_body.centre)
     for axis, name in enumerate("xyz"):
-        parameters[f"centre_{name}"] = float(quantise(last_body.centre[axis]))
+        parameters[f"centre_{name}"] = float(last_centre[axis])
         parameters[f"velocity_{name}"] = float(last_body.velocity[axis])
     return InitialState(
-        position=position,
-        velocity=quantise(np.concatenate(velocities)),
+        position=np.clip(all_positions, low, high),
+        velocity=quantise(all_velocities),
         affine=np.zeros((size.particles, 3, 3)),
         material=liquid(size.particles),
         area=total_volume,

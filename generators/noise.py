@@ -58,9 +58,11 @@ class Jet:
         f_y = self.y
         g_x = other.x
         g_y = other.y
-        xx = self.xx * g + 2.0 * (f_x * g_x) + f * other.xx
+        crossed_xx = 2.0 * (f_x * g_x)
+        crossed_yy = 2.0 * (f_y * g_y)
+        xx = self.xx * g + crossed_xx + f * other.xx
         xy = self.xy * g + f_x * g_y + f_y * g_x + f * other.xy
-        yy = self.yy * g + 2.0 * (f_y * g_y) + f * other.yy
+        yy = self.yy * g + crossed_yy + f * other.yy
         return Jet(
             value=f * g,
             x=f_x * g + f * g_x,
@@ -90,14 +92,16 @@ class Jet:
         """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
         result = self.scale(0.0)
         for coefficient in reversed(coefficients):
-            result = (result * self).shift(coefficient)
+            product = result * self
+            result = product.shift(coefficient)
         return result
 
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
-    zero = np.zeros(len(position))
-    one = np.ones(len(position))
+    point_count = len(position)
+    zero = np.zeros(point_count)
+    one = np.ones(point_count)
     x, y = position.T
     x_jet = Jet(x, one, zero, zero, zero, zero)
     y_jet = Jet(y, zero, one, zero, zero, zero)
@@ -132,8 +136,10 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     i = np.minimum(column, last)
     j = np.minimum(row, last)
     # distances from the low corner of the cell
-    p = x.shift(-i.astype(np.float64))
-    q = y.shift(-j.astype(np.float64))
+    corner_x = i.astype(np.float64)
+    corner_y = j.astype(np.float64)
+    p = x.shift(-corner_x)
+    q = y.shift(-corner_y)
 
     def corner(k: int, m: int) -> Jet:
         """Return the ramp along the gradient of one corner of the cell."""
@@ -141,7 +147,9 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
         slope_x, slope_y = gradient.T
         from_corner_x = p.shift(-float(k))
         from_corner_y = q.shift(-float(m))
-        return from_corner_x.scale(slope_x) + from_corner_y.scale(slope_y)
+        ramp_x = from_corner_x.scale(slope_x)
+        ramp_y = from_corner_y.scale(slope_y)
+        return ramp_x + ramp_y
 
     u = fade(p)
     w = fade(q)
@@ -149,9 +157,12 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     low_right = corner(1, 0)
     high_left = corner(0, 1)
     high_right = corner(1, 1)
-    low = low_left + u * (low_right - low_left)
-    high = high_left + u * (high_right - high_left)
-    return low + w * (high - low)
+    low_rise = low_right - low_left
+    high_rise = high_right - high_left
+    low = low_left + u * low_rise
+    high = high_left + u * high_rise
+    rise = high - low
+    return low + w * rise
 
 
 def ramp(t: Jet) -> Jet:
