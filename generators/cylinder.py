@@ -51,7 +51,8 @@ def solver_parameters(size: Size) -> FullBoxParameters:
 def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
     """Draw how many frames a scenario is simulated before frame 0; the first draw."""
     del scenario  # the same range for all
-    return draw_integer(rng, *interval(size, "start_frame"))
+    least, most = interval(size, "start_frame")
+    return draw_integer(rng, least, most)
 
 
 def lattice_counts(size: Size) -> tuple[int, int]:
@@ -70,7 +71,8 @@ def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
     every disc covers as many places of the lattice.
     """
     most_steps = int(size.value("offset_max"))
-    steps = choice(rng, 2 * most_steps + 1) - most_steps
+    place_count = 2 * most_steps + 1
+    steps = choice(rng, place_count) - most_steps
     x = float(size.value("obstacle_x"))
     middle = float(size.box.centre[1])
     offset = steps / size.value("lattice")
@@ -87,7 +89,8 @@ def _square(vectors: Array) -> Array:
 def moved_out(position: Array, centre: Array, radius: float) -> Array:
     """Return positions of which those inside a disc are put on its rim [length]."""
     way = position - centre
-    distance = np.sqrt(_square(way))
+    square = _square(way)
+    distance = np.sqrt(square)
     is_in = distance < radius
     stretch = np.where(is_in, radius / distance, 1.0)
     stretched_way = stretch[:, None] * way
@@ -115,23 +118,23 @@ def potential_flow(
         speed: U of the stream along x [length/s].
     """
     way = position - centre
-    x = way[:, 0]
-    y = way[:, 1]
+    x, y = way.T
     square = _square(way)
-    dipole = speed * radius * radius / (square * square)
-    u = speed - dipole * (x * x - y * y)
+    moment = speed * radius * radius
+    dipole = moment / (square * square)
+    difference = x * x - y * y
+    u = speed - dipole * difference
     v = -2.0 * dipole * x * y
     velocity = np.stack([u, v], axis=1)
     # The flow is harmonic: two numbers make the gradient.
     real_part = x * x - 3.0 * y * y  # of (x + iy)^3, over x
     imaginary_part = 3.0 * x * x - y * y  # of (x + iy)^3, over y
-    stretch = 2.0 * dipole * x * real_part / square
-    shear = 2.0 * dipole * y * imaginary_part / square
-    gradient = np.empty((len(position), 2, 2))
-    gradient[:, 0, 0] = stretch
-    gradient[:, 0, 1] = shear
-    gradient[:, 1, 0] = shear
-    gradient[:, 1, 1] = -stretch
+    double_dipole = 2.0 * dipole
+    stretch = double_dipole * x * real_part / square
+    shear = double_dipole * y * imaginary_part / square
+    gradient_of_u = np.stack([stretch, shear], axis=1)
+    gradient_of_v = np.stack([shear, -stretch], axis=1)
+    gradient = np.stack([gradient_of_u, gradient_of_v], axis=1)
     return velocity, gradient
 
 
@@ -155,18 +158,22 @@ def eddy(
     """
     way = (position - centre) / radius
     square = _square(way)
-    rest = np.where(square < 1.0, 1.0 - square, 0.0)
+    is_inside_eddy = square < 1.0
+    rest = np.where(is_inside_eddy, 1.0 - square, 0.0)
     rate = 3.5 * speed * rest * rest
-    x = way[:, 0]
-    y = way[:, 1]
-    velocity = np.stack([-rate * y, rate * x], axis=1)
+    x, y = way.T
+    u = -rate * y
+    v = rate * x
+    velocity = np.stack([u, v], axis=1)
     # derivative of the rate with respect to the square, times 2
     slope = -14.0 * speed * rest
-    gradient = np.empty((len(position), 2, 2))
-    gradient[:, 0, 0] = -slope * x * y
-    gradient[:, 0, 1] = -slope * y * y - rate
-    gradient[:, 1, 0] = slope * x * x + rate
-    gradient[:, 1, 1] = slope * x * y
+    u_x = -slope * x * y
+    u_y = -slope * y * y - rate
+    v_x = slope * x * x + rate
+    v_y = slope * x * y
+    gradient_of_u = np.stack([u_x, u_y], axis=1)
+    gradient_of_v = np.stack([v_x, v_y], axis=1)
+    gradient = np.stack([gradient_of_u, gradient_of_v], axis=1)
     return velocity, gradient / radius
 
 

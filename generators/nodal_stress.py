@@ -216,7 +216,8 @@ class NodalStress:
     def clear(self, s: i32, i: i32, j: i32) -> None:
         """Set the sums of a node of scenario s to zero, before P2G adds to them."""
         node = self.at(i, j)
-        self.sums[s, node] = ti.Vector.zero(ti.i64, 4)
+        zero = ti.Vector.zero(ti.i64, 4)
+        self.sums[s, node] = zero
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
@@ -305,10 +306,11 @@ class NodalStress:
         velocity = vec2(0.0)
         density = 0.0
         jacobian = 1.0
-        if total[2] > 0:
+        count_sum = total[2]
+        if count_sum > 0:
             received_momentum = from_fixed(total.xy, self.velocity_unit)
             momentum = received_momentum + drag
-            count = from_fixed(total[2], self.count_unit)
+            count = from_fixed(count_sum, self.count_unit)
             jacobian_sum = from_fixed(total[3], self.count_unit)
             velocity = momentum / count
             density = count * particle_volume
@@ -345,7 +347,8 @@ class NodalStress:
         node = self.at(i, j)
         source = self.source(i, j)
         sign = self.walls.reflection(i, j)
-        self.node_gain[s, node] = sign * self.node_gain[s, source]
+        gain = self.node_gain[s, source]
+        self.node_gain[s, node] = sign * gain
 
     @ti.func
     def pressure_gradient(self, s: i32, i: i32, j: i32) -> vec2:
@@ -410,8 +413,10 @@ class NodalStress:
         for i, j in ti.static(ti.ndrange(3, 3)):
             node = base + i * self.width + j
             weight = self.weight_rows[i][s, p][j]
-            share = weight * self.next_state[s, node]
-            gain += weight * self.node_gain[s, node]
+            node_state = self.next_state[s, node]
+            node_gain = self.node_gain[s, node]
+            share = weight * node_state
+            gain += weight * node_gain
             state += share
             slope_x = stepped(slope_x, share, i - 1)
             slope_y = stepped(slope_y, share, j - 1)
@@ -472,7 +477,8 @@ class NodalStress:
         """Add a node's velocity to its sum over time, outside the path of the bits."""
         velocity = self.next_state[s, n].xy
         exact = ti.cast(velocity, ti.f64)
-        self.velocity_sum[s, n] = self.velocity_sum[s, n] + exact
+        sum_before = self.velocity_sum[s, n]
+        self.velocity_sum[s, n] = sum_before + exact
 
     # The drivers: the same phases in the same order.
 

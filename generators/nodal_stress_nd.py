@@ -93,7 +93,8 @@ class NodalStressND:
         self.inv_dx = float(p.grid)
         self.dt = p.dt
         self.origin = p.origin  # coordinate of node 0 of each axis [cells]
-        inset = np.where(p.box.periodic, 0.0, _INSET * dx)
+        wall_inset = _INSET * dx
+        inset = np.where(p.box.periodic, 0.0, wall_inset)
         # smallest and largest coordinate of a particle along each axis
         position_min = np.array(p.box.low) + inset
         position_max = np.array(p.box.high) - inset
@@ -454,7 +455,8 @@ class NodalStressND:
     def settle(self, s: i32, n: i32) -> None:
         """Take the shifts off a node's sums, and add up its n from three rows."""
         weight_sum, shifts = row_count(self.row_sums, s, n)
-        self.sums[s, n] = self.sums[s, n] - shifts
+        total = self.sums[s, n]
+        self.sums[s, n] = total - shifts
         self.weight_sum[s, n] = weight_sum
 
     @ti.func
@@ -474,11 +476,14 @@ class NodalStressND:
             ghost = self.image_ghost[e, k]
             if ghost >= 0:
                 ghost_weight = self.weight_sum[s, ghost]
-                total += self.image_sign(k) * self.sums[s, ghost]
+                ghost_sums = self.sums[s, ghost]
+                sign = self.image_sign(k)
+                total += sign * ghost_sums
                 weight_sum += ghost_weight
                 if ti.static(self.has_walls):
                     count = from_fixed(ghost_weight, self.count_unit)
-                    drag += self.image_drag[s, e, k] * count
+                    drag_per_particle = self.image_drag[s, e, k]
+                    drag += drag_per_particle * count
         self.sums[s, n] = total
         self.weight_sum[s, n] = weight_sum
         self.drag[s, n] = drag
@@ -493,7 +498,8 @@ class NodalStressND:
             total = self.sums[s, n]
             count = from_fixed(weight_sum, self.count_unit)
             received = from_fixed(total, self.velocity_unit)
-            momentum = received + self.drag[s, n]
+            drag = self.drag[s, n]
+            momentum = received + drag
             state = momentum / count
             state[3] = count * particle_volume
             jacobian_sum = from_fixed(total[3], self.count_unit)
@@ -506,9 +512,12 @@ class NodalStressND:
         """Fill a ghost node before the forces."""
         n = self.ghost_node[g]
         source = self.ghost_source[g]
-        image = self.ghost_sign[g] * self.node_state[s, source]
-        self.node_state[s, n] = image + self.ghost_drive[s, g]
-        self.node_jacobian[s, n] = self.node_jacobian[s, source]
+        sign = self.ghost_sign[g]
+        drive = self.ghost_drive[s, g]
+        state = self.node_state[s, source]
+        jacobian = self.node_jacobian[s, source]
+        self.node_state[s, n] = sign * state + drive
+        self.node_jacobian[s, n] = jacobian
 
     @ti.func
     def mirror_forces(self, s: i32, g: i32) -> None:
@@ -516,9 +525,11 @@ class NodalStressND:
         n = self.ghost_node[g]
         source = self.ghost_source[g]
         sign = self.ghost_sign[g]
-        image = sign * self.next_state[s, source]
-        self.next_state[s, n] = image + self.ghost_drive[s, g]
-        self.node_gain[s, n] = sign * self.node_gain[s, source]
+        drive = self.ghost_drive[s, g]
+        state = self.next_state[s, source]
+        gain = self.node_gain[s, source]
+        self.next_state[s, n] = sign * state + drive
+        self.node_gain[s, n] = sign * gain
 
     @ti.func
     def neighbour(self, n: i32, step: Template, side: Template) -> i32:
@@ -542,8 +553,9 @@ class NodalStressND:
             rise = jacobian_ahead - jacobian_behind
             further = ti.static(_axis_count(step) - 1)
             for axis in ti.static(range(self.dimension)):
+                side = ti.static(step[axis])
                 sum_before = rises[further, axis]
-                rises[further, axis] = stepped(sum_before, rise, step[axis])
+                rises[further, axis] = stepped(sum_before, rise, side)
         gradient = vec4(0.0)
         for axis in ti.static(range(self.dimension)):
             nearest_weight = ti.static(self.pair_weight[0])
@@ -578,10 +590,12 @@ class NodalStressND:
         gain = self.pressure_factor * gradient + diffusion * laplacian
         if ti.static(self.parameters.force_layers > 0):
             layer = self.force_layer[n]
-            gain = gain + self.force_gain[s, layer]
+            force_gain = self.force_gain[s, layer]
+            gain = gain + force_gain
         if ti.static(self.has_fringe):
             lag = self.stream[s] - state
-            gain = gain + self.fringe_damping[n] * lag
+            damping = self.fringe_damping[n]
+            gain = gain + damping * lag
         v = state + gain
         if ti.static(self.has_obstacle):
             mask = self.fluid_mask[s, n]
@@ -679,9 +693,10 @@ class NodalStressND:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
         grid_state = self.grid_state[s, p]
         grid_velocity = grid_state.xyz
+        grid_density = grid_state[3]
         grid_gain = self.grid_gain[s, p]
         grid_jacobian = grid_gain[3]
-        density = largest(grid_state[3], 0.5)
+        density = largest(grid_density, 0.5)
         volume = 1.0 / density
         old_state = self.particle_state[s, p]
         v = old_state.xyz + grid_gain.xyz
@@ -693,7 +708,8 @@ class NodalStressND:
         divergence = 0.0
         for axis in ti.static(range(self.dimension)):
             slope = self.slopes[axis][s, p]
-            wanted = self.shift_factor * volume * slope[3]
+            density_slope = slope[3]
+            wanted = self.shift_factor * volume * density_slope
             shift[axis] = bounded(wanted, -self.shift_bound, self.shift_bound)
             axis_change = shift[axis] * slope.xyz
             if ti.static(axis == 0):
@@ -727,7 +743,8 @@ class NodalStressND:
         reached = vec4(speed, jacobian)
         extremes = self.extremes[s, p]
         self.extremes[s, p] = largest(reached, extremes)
-        minus_jacobian = largest(-jacobian, old_x[3])
+        old_minus_jacobian = old_x[3]
+        minus_jacobian = largest(-jacobian, old_minus_jacobian)
         self.x[s, p] = vec4(x, minus_jacobian)
 
     @ti.func

@@ -106,12 +106,10 @@ class ParticleStress(FreeSurfaceKernels):
         tau = mat2([isotropic, 0.0], [0.0, isotropic])
         viscosity = self.liquid_viscosity
         if ti.static(solid):
-            mu = self.jelly[0]
-            la = self.jelly[1]
+            mu, la = self.jelly
             damping = self.solid_viscosity
             if kind == ROPE:
-                mu = self.rope[0]
-                la = self.rope[1]
+                mu, la = self.rope
             if kind == SNOW:
                 factor = hardening(
                     ratio,
@@ -119,8 +117,9 @@ class ParticleStress(FreeSurfaceKernels):
                     self.parameters.snow_hardening_min,
                     self.parameters.snow_hardening_max,
                 )
-                mu = self.snow[0] * factor
-                la = self.snow[1] * factor
+                snow_mu, snow_la = self.snow
+                mu = snow_mu * factor
+                la = snow_la * factor
                 damping = 0.0
             f = self.deformation[s, p]
             elastic = corotated_stress(f, mu, la)
@@ -209,7 +208,8 @@ class ParticleStress(FreeSurfaceKernels):
     def clear(self, s: i32, i: i32, j: i32) -> None:
         """Set the sums of a node of scenario s to zero, before P2G adds to them."""
         node = self.at(i, j)
-        self.sums[s, node] = ti.Vector.zero(i64, 4)
+        zero = ti.Vector.zero(i64, 4)
+        self.sums[s, node] = zero
 
     @ti.func
     def update(
@@ -221,9 +221,10 @@ class ParticleStress(FreeSurfaceKernels):
         u = 0.0
         v = 0.0
         jacobian = 1.0
-        if total[2] > 0:
+        count_sum = total[2]
+        if count_sum > 0:
             momentum = from_fixed(total.xy, self.velocity_unit)
-            count = from_fixed(total[2], self.count_unit)
+            count = from_fixed(count_sum, self.count_unit)
             jacobian_sum = from_fixed(total[3], self.count_unit)
             u = momentum.x / count
             v = momentum.y / count - self.gravity_gain
@@ -286,7 +287,8 @@ class ParticleStress(FreeSurfaceKernels):
         for i, j in ti.static(ti.ndrange(3, 3)):
             node = base + i * self.width + j
             weight = self.weight_rows[i][s, p][j]
-            share = weight * self.node_state[s, node]
+            node_state = self.node_state[s, node]
+            share = weight * node_state
             distance_x = (i - 1.0) - offset.x
             distance_y = (j - 1.0) - offset.y
             state += share
@@ -396,7 +398,9 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.kernel
     def _parallel_substep(self, solid: Template) -> Nothing:
         # with the nodes behind the walls
-        nodes = ti.static((self.low - 1, self.high + 2))
+        first_node = ti.static(self.low - 1)
+        end_node = ti.static(self.high + 2)
+        nodes = ti.static((first_node, end_node))
         ti.loop_config(parallelize=self.threads)
         for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
             self.clear(s, i, j)

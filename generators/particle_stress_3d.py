@@ -175,12 +175,14 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def clear(self, s: i32, n: i32) -> None:
         """Set the sums of a node to zero, before P2G adds to them."""
-        self.sums[s, n] = ti.Vector.zero(i64, 4)
+        zero = ti.Vector.zero(i64, 4)
+        self.sums[s, n] = zero
 
     @ti.func
     def clear_row(self, s: i32, n: i32) -> None:
         """Set the sums of a row of three nodes to zero; ``n`` is the last of them."""
-        self.row_sums[s, n] = ti.Vector.zero(i64, 4)
+        zero = ti.Vector.zero(i64, 4)
+        self.row_sums[s, n] = zero
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
@@ -222,11 +224,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Return Lame's constants mu and lambda of a solid [mass/(length s^2)]."""
         kind = self.matter[s, p][0]
         ratio = self.matter[s, p][1]
-        mu = self.jelly[0]
-        la = self.jelly[1]
+        mu, la = self.jelly
         if kind == ROPE:
-            mu = self.rope[0]
-            la = self.rope[1]
+            mu, la = self.rope
         if kind == SNOW:
             factor = hardening(
                 ratio,
@@ -234,15 +234,17 @@ class ParticleStress3D(FreeSurfaceKernels):
                 self.parameters.snow_hardening_min,
                 self.parameters.snow_hardening_max,
             )
-            mu = self.snow[0] * factor
-            la = self.snow[1] * factor
+            snow_mu, snow_la = self.snow
+            mu = snow_mu * factor
+            la = snow_la * factor
         return mu, la
 
     @ti.func
     def store_elastic_stress(self, s: i32, p: i32, stress: Template) -> None:
         """Store the Kirchhoff stress of a solid without damping."""
-        self.elastic_diagonal[s, p] = vec4(stress[0], stress[1], stress[2], 0.0)
-        self.elastic_off_diagonal[s, p] = vec4(stress[3], stress[4], stress[5], 0.0)
+        xx, yy, zz, yz, xz, xy = stress
+        self.elastic_diagonal[s, p] = vec4(xx, yy, zz, 0.0)
+        self.elastic_off_diagonal[s, p] = vec4(yz, xz, xy, 0.0)
 
     @ti.func
     def compute_elastic_stress(self, s: i32, p: i32) -> None:
@@ -694,11 +696,13 @@ class ParticleStress3D(FreeSurfaceKernels):
             for i in range(first[0], last[0]):
                 for j in range(first[1], last[1]):
                     for k in range(first[2], last[2]):
-                        self.clear(0, self.at(i, j, k))
+                        node = self.at(i, j, k)
+                        self.clear(0, node)
                     # A row has the number of its last node. So the numbers of rows with
                     # a touched node are larger by at most two.
                     for k in range(first[2], last[2] + 2):
-                        self.clear_row(0, self.at(i, j, k))
+                        node = self.at(i, j, k)
+                        self.clear_row(0, node)
             for p in range(particles):
                 self.locate(0, p)
             if ti.static(solid):

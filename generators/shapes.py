@@ -72,7 +72,8 @@ class Rectangle:
     def of_area(cls, area: float, aspect: float) -> Rectangle:
         """Return the level rectangle of an area [length^2] and an aspect ratio [1]."""
         length = math.sqrt(area * aspect)
-        return cls(length, area / length)
+        width = area / length
+        return cls(length, width)
 
     @property
     def measure(self) -> float:
@@ -82,8 +83,9 @@ class Rectangle:
     @property
     def reach(self) -> tuple[float, float]:
         """Half the bounding box of the turned rectangle."""
-        c = abs(self.axis[0])
-        s = abs(self.axis[1])
+        x, y = self.axis
+        c = abs(x)
+        s = abs(y)
         width = c * self.length + s * self.width
         height = s * self.length + c * self.width
         return 0.5 * width, 0.5 * height
@@ -101,7 +103,8 @@ class Rectangle:
         inside = np.minimum(farther, 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
-        outside = np.sqrt(along * along + across * across)
+        square_outside = along * along + across * across
+        outside = np.sqrt(square_outside)
         return np.asarray(outside + inside)
 
 
@@ -114,7 +117,8 @@ class Disc:
     @classmethod
     def of_area(cls, area: float) -> Disc:
         """Return the disc that covers this area [length^2]."""
-        return cls(math.sqrt(area / math.pi))
+        radius = math.sqrt(area / math.pi)
+        return cls(radius)
 
     @property
     def measure(self) -> float:
@@ -129,7 +133,8 @@ class Disc:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y = position.T
-        from_centre = np.sqrt(x * x + y * y)
+        square = x * x + y * y
+        from_centre = np.sqrt(square)
         return np.asarray(from_centre - self.radius)
 
 
@@ -157,6 +162,7 @@ class Blobs:
         high = offsets.max(axis=0) + 1.0
         centres = offsets - 0.5 * (low + high)
         width, height = high - low
+        # middles of the cells from the centre, as shares of the box
         middle = (np.arange(cells) + 0.5) / cells - 0.5
         x, y = np.meshgrid(middle * width, middle * height)
         cell_count = cells * cells
@@ -164,21 +170,26 @@ class Blobs:
         for centre_x, centre_y in centres:
             dx = x - centre_x
             dy = y - centre_y
-            is_covered |= dx * dx + dy * dy <= 1.0
+            square = dx * dx + dy * dy
+            is_covered |= square <= 1.0
         box_area = width * height
         covered_count = np.count_nonzero(is_covered)
         unit_area = float(covered_count * box_area) / cell_count
         scale = math.sqrt(area / unit_area)
         scaled = []
         for centre_x, centre_y in centres.tolist():
-            scaled.append((centre_x * scale, centre_y * scale))
+            scaled_x = centre_x * scale
+            scaled_y = centre_y * scale
+            scaled.append((scaled_x, scaled_y))
         return cls(tuple(scaled), scale, area)
 
     @property
     def reach(self) -> tuple[float, float]:
         """Half the bounding box of all discs."""
         x, y = zip(*self.centres, strict=True)
-        return max(x) + self.radius, max(y) + self.radius
+        reach_x = max(x) + self.radius
+        reach_y = max(y) + self.radius
+        return reach_x, reach_y
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance, exact outside and on the outline."""
@@ -215,15 +226,18 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
     """
     centre = []
     for reach, (low, high) in zip(shape.reach, region, strict=True):
-        if high - low < 2.0 * reach:
+        room = high - low
+        extent = 2.0 * reach
+        if room < extent:
             raise WorkFailedError(
                 "a body does not fit between the walls",
                 where="datasets.yaml",
-                expected=f"extent up to {high - low:.4f}",
-                got=f"{2.0 * reach:.4f}",
+                expected=f"extent up to {room:.4f}",
+                got=f"{extent:.4f}",
                 fix="lower the areas or lengths of this split in datasets.yaml",
             )
-        centre.append(uniform(rng, low + reach, high - reach))
+        coordinate = uniform(rng, low + reach, high - reach)
+        centre.append(coordinate)
     return body_at(shape, *centre)
 
 
@@ -238,12 +252,14 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     Returns:
         Positions [length], multiples of 2^-20, shape [count, axis].
     """
-    steps = _ROBERTS[len(body.shape.reach)]
+    reach = body.shape.reach
+    dimension = len(reach)
+    steps = _ROBERTS[dimension]
     shift = rng.random(steps.shape)
-    side = 2.0 * max(body.shape.reach)
+    side = 2.0 * max(reach)
     # in blocks: a million particles take no memory beside their own
     block_size = min(4 * count, 1 << 16)
-    blocks = [np.empty((0, len(steps)))]
+    blocks = [np.empty((0, dimension))]
     missing_count = count
     start = 1
     while missing_count > 0:
@@ -258,4 +274,5 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
         blocks.append(points)
         missing_count -= len(points)
         start += block_size
-    return quantise(body.centre + np.concatenate(blocks))
+    way = np.concatenate(blocks)  # from the centre
+    return quantise(body.centre + way)

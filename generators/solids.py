@@ -38,8 +38,10 @@ class Ball:
     @classmethod
     def of_volume(cls, volume: float) -> Ball:
         """Return the ball that fills this volume [length^3]."""
-        radius_cubed = volume / (4.0 / 3.0 * math.pi)
-        return cls(cube_root(radius_cubed))
+        unit_volume = 4.0 / 3.0 * math.pi
+        radius_cubed = volume / unit_volume
+        radius = cube_root(radius_cubed)
+        return cls(radius)
 
     @property
     def measure(self) -> float:
@@ -55,7 +57,8 @@ class Ball:
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y, z = position.T
-        from_centre = np.sqrt(x * x + y * y + z * z)
+        square = x * x + y * y + z * z
+        from_centre = np.sqrt(square)
         return np.asarray(from_centre - self.radius)
 
 
@@ -73,7 +76,9 @@ class Block:
         along_x, along_z = aspects
         height_cubed = volume / (along_x * along_z)
         height = cube_root(height_cubed)
-        return cls((along_x * height, height, along_z * height))
+        width = along_x * height
+        depth = along_z * height
+        return cls((width, height, depth))
 
     @property
     def measure(self) -> float:
@@ -116,8 +121,11 @@ class Rod:
     @property
     def reach(self) -> tuple[float, float, float]:
         """Half the bounding box of the turned rod."""
-        x, y, z = (self._reach_along(component) for component in self.axis)
-        return x, y, z
+        x, y, z = self.axis
+        reach_x = self._reach_along(x)
+        reach_y = self._reach_along(y)
+        reach_z = self._reach_along(z)
+        return reach_x, reach_y, reach_z
 
     def _reach_along(self, component: float) -> float:
         square_sine = 1.0 - component * component
@@ -130,16 +138,19 @@ class Rod:
         x, y, z = position.T
         a, b, c = self.axis
         height = a * x + b * y + c * z
-        square = x * x + y * y + z * z - height * height
+        square_from_centre = x * x + y * y + z * z
+        square = square_from_centre - height * height
+        square = np.maximum(square, 0.0)
         # distances beyond the ends and beyond the side, negative between them
         along = np.abs(height) - 0.5 * self.length
-        from_axis = np.sqrt(np.maximum(square, 0.0))
+        from_axis = np.sqrt(square)
         across = from_axis - self.radius
         farther = np.maximum(along, across)
         inside = np.minimum(farther, 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
-        outside = np.sqrt(along * along + across * across)
+        square_outside = along * along + across * across
+        outside = np.sqrt(square_outside)
         return np.asarray(outside + inside)
 
 
@@ -154,7 +165,8 @@ def cube_root(value: float) -> float:
     """
     root = max(1.0, value)
     while True:
-        excess = root * root * root - value
+        cube = root * root * root
+        excess = cube - value
         slope = 3.0 * root * root
         smaller = root - excess / slope
         if not smaller < root:
