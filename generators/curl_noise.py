@@ -62,7 +62,8 @@ def stream_function(
     The velocity is u = psi.y and v = -psi.x.
     """
     cell_count = float(len(lattice) - 1)
-    per_length = cell_count / (high - low)
+    width = high - low
+    per_length = cell_count / width
     x, y = coordinates(position)
     minus_x = x.scale(-1.0)
     minus_y = y.scale(-1.0)
@@ -77,7 +78,7 @@ def stream_function(
     for distance in (from_left, from_bottom, from_right, from_top):
         half_cells = distance.scale(2.0)
         psi = psi * ramp(half_cells)
-    return psi.scale(scale * (high - low))
+    return psi.scale(scale * width)
 
 
 def flow(psi: Jet) -> tuple[Array, Array]:
@@ -111,9 +112,10 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     divergence is the grid's share, not the field's.
     """
     low, high = closed_box_walls(size)
-    first = size.value("wall") + 1
-    last = size.grid - size.value("wall")
-    node = np.arange(first, last) / size.grid
+    wall = size.value("wall")
+    first = wall + 1
+    end = size.grid - wall
+    node = np.arange(first, end) / size.grid
     node_count = len(node)
     x, y = np.meshgrid(node, node, indexing="ij")
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
@@ -132,19 +134,21 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     north = (inner, after)
     south = (inner, before)
     per_difference = 0.5 * size.grid  # slope for a difference over two cells
-    divergence = u[east] - u[west] + v[north] - v[south]
-    vorticity = v[east] - v[west] - u[north] + u[south]
-    return (
-        _root_mean_square(divergence * per_difference),
-        _root_mean_square(vorticity * per_difference),
-    )
+    u_rise = u[east] - u[west]
+    v_rise = v[east] - v[west]
+    divergence = u_rise + v[north] - v[south]
+    vorticity = v_rise - u[north] + u[south]
+    divergence_rms = _root_mean_square(divergence * per_difference)
+    vorticity_rms = _root_mean_square(vorticity * per_difference)
+    return divergence_rms, vorticity_rms
 
 
 def _scale_of(size: Size, frequency: int) -> float:
     """Return s0 (F0 / F)^k [length/s]; no power: its bits differ between machines."""
     scale = float(size.value("velocity_scale"))
+    least_frequency = size.value("frequency_min")
     for _ in range(size.value("scale_falloff")):
-        scale = scale * size.value("frequency_min") / frequency
+        scale = scale * least_frequency / frequency
     return scale
 
 
@@ -152,8 +156,10 @@ def _frequency(size: Size, scenario: int) -> int:
     """Return the lattice frequency of a scenario."""
     number = shift_number(size, scenario)
     if number is None:
-        turn = scenario % int(size.value("frequency_count"))
-        return turn + int(size.value("frequency_min"))
+        frequency_count = int(size.value("frequency_count"))
+        least_frequency = int(size.value("frequency_min"))
+        turn = scenario % frequency_count
+        return least_frequency + turn
     if number % 2 == 0:
         return int(size.value("frequency_shift_low"))
     return int(size.value("frequency_shift_high"))
@@ -167,12 +173,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     low, high = closed_box_walls(size)
     columns = size.value("lattice_x")
     rows = size.value("lattice_y")
-    if columns * rows != size.particles:
+    place_count = columns * rows
+    if place_count != size.particles:
         raise UsageError(
             "the lattice does not hold the particles",
             where=f"datasets.yaml, {size.split} {size.name}",
             expected=f"lattice_x * lattice_y = particles = {size.particles}",
-            got=f"{columns} * {rows} = {columns * rows}",
+            got=f"{columns} * {rows} = {place_count}",
             fix="correct the number of particles in the file of the split",
         )
     position = fill_grid(
@@ -184,21 +191,22 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         jitter=size.value("jitter"),
     )
     frequency = _frequency(size, scenario)
-    noise_gradients = gradients(rng, frequency)
+    lattice = gradients(rng, frequency)
     scale = _scale_of(size, frequency)
 
-    psi = stream_function(position, noise_gradients, low=low, high=high, scale=scale)
+    psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)
-    divergence, vorticity = _grid_rates(noise_gradients, size, scale)
+    divergence, vorticity = _grid_rates(lattice, size, scale)
     components = velocity.ravel().tolist()
     square_sum = math.fsum(component * component for component in components)
     energy = 0.5 * square_sum / size.particles
+    width = high - low
     return InitialState(
         position=position,
         velocity=velocity,
         affine=affine,
         material=liquid(size.particles),
-        area=(high - low) * (high - low),
+        area=width * width,
         parameters={
             "frequency": frequency,
             "scale": scale,

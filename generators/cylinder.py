@@ -193,11 +193,14 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         high=box.high,
         jitter=size.value("jitter"),
     )
-    cell = np.indices(counts).reshape(2, -1).T
-    from_corner = (cell + 0.5) / size.value("lattice")
+    indices = np.indices(counts)
+    cell = indices.reshape(2, -1).T
+    middle = cell + 0.5
+    from_corner = middle / size.value("lattice")
     places = quantise(np.array(box.low) + from_corner)
     is_solid = is_inside(places, (x, y), radius)
-    _check_counts(size, int(is_solid.sum()), len(places))
+    solid_count = int(is_solid.sum())
+    _check_counts(size, solid_count, len(places))
     obstacle = Obstacle(
         centre=(x, y),
         radius=radius,
@@ -214,14 +217,16 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     eddy_speed = uniform(rng, 0.5, 1.0) * speed
     if choice(rng, 2):
         eddy_speed = -eddy_speed
-    fluid = moved_out(position[~is_solid], centre, radius)
+    is_fluid = ~is_solid
+    fluid = moved_out(position[is_fluid], centre, radius)
     eddy_centre = centre + diameter * way
     velocity, affine = eddy(fluid, eddy_centre, radius=eddy_radius, speed=eddy_speed)
     past, past_affine = potential_flow(fluid, centre, radius=radius, speed=speed)
     velocity += past
     affine += past_affine
 
-    reynolds = log_uniform(rng, *interval(size, "reynolds"))
+    least_reynolds, most_reynolds = interval(size, "reynolds")
+    reynolds = log_uniform(rng, least_reynolds, most_reynolds)
     viscosity = speed * diameter / reynolds
     return InitialState(
         position=fluid,
@@ -247,8 +252,10 @@ def _check_counts(size: Size, solid_count: int, lattice_count: int) -> None:
     Raises:
         UsageError: datasets.yaml states other numbers of particles.
     """
-    expected = (lattice_count - solid_count, solid_count)
-    stated = (size.particles, int(size.value("obstacle_particles")))
+    fluid_count = lattice_count - solid_count
+    stated_solid_count = int(size.value("obstacle_particles"))
+    expected = (fluid_count, solid_count)
+    stated = (size.particles, stated_solid_count)
     if stated != expected:
         raise UsageError(
             "the lattice does not hold the particles",

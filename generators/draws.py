@@ -66,10 +66,13 @@ def entropy(
         words = []
         for start in range(0, len(season), 8):
             eight_bytes = season[start : start + 8]
-            words.append(int.from_bytes(eight_bytes, "big"))
+            word = int.from_bytes(eight_bytes, "big")
+            words.append(word)
         return (*words, scenario)
-    digest = hashlib.sha256(f"{split}/{size}".encode()).digest()
-    return int.from_bytes(digest[:8], "big"), major, scenario
+    name = f"{split}/{size}"
+    digest = hashlib.sha256(name.encode()).digest()
+    word = int.from_bytes(digest[:8], "big")
+    return word, major, scenario
 
 
 def generator(
@@ -142,7 +145,8 @@ def _draw_unit(rng: RandomSource) -> float:
 def uniform(rng: RandomSource, low: float, high: float) -> float:
     """Draw uniformly from [low, high), rounded to a multiple of 2^-20."""
     share = _draw_unit(rng)
-    value = low + (high - low) * share
+    width = high - low
+    value = low + width * share
     return float(quantise(value))
 
 
@@ -162,8 +166,10 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     ratio = _PRECISE.divide(Decimal(high), Decimal(low))
     span = _PRECISE.ln(ratio)
     share = Decimal(_draw_unit(rng))
-    growth = _PRECISE.exp(_PRECISE.multiply(span, share))
-    return float(_PRECISE.multiply(Decimal(low), growth))
+    exponent = _PRECISE.multiply(span, share)
+    growth = _PRECISE.exp(exponent)
+    value = _PRECISE.multiply(Decimal(low), growth)
+    return float(value)
 
 
 def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> Array:
@@ -180,14 +186,16 @@ def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> Array
 
 def choice(rng: RandomSource, count: int) -> int:
     """Draw an integer from 0 to ``count - 1``, each equally likely (to 2^-53)."""
-    return math.floor(_draw_unit(rng) * count)
+    share = _draw_unit(rng)
+    return math.floor(share * count)
 
 
 def draw_integer(rng: RandomSource, low: float, high: float) -> int:
     """Draw an integer, end points included."""
     first = int(low)
     last = int(high)
-    return first + choice(rng, last - first + 1)
+    count = last - first + 1
+    return first + choice(rng, count)
 
 
 def direction(rng: RandomSource) -> tuple[float, float]:
@@ -244,7 +252,8 @@ def draw_program(
         end_value = uniform(rng, 0.0, amplitude)
         if start_value > 0.0:
             end_value = -end_value
-        frames = np.arange(min(end, frame_count) - start)  # since the knot
+        values_end = min(end, frame_count)
+        frames = np.arange(values_end - start)  # since the knot
         s = frames / (end - start)
         rise = s * s * (3.0 - 2.0 * s)
         difference = end_value - start_value
@@ -280,7 +289,8 @@ def fill(
     columns = math.isqrt(count)
     ends = []
     for column in range(columns + 1):
-        ends.append(count * column // columns)
+        end = count * column // columns
+        ends.append(end)
     return _fill_columns(rng, np.array(ends), low=low, high=high, jitter=jitter)
 
 
@@ -326,6 +336,7 @@ def _fill_columns(
     unit = rng.random(cell.shape)
     displacement = (unit - 0.5) * jitter
     middle = cell + 0.5
+    place = middle + displacement  # [cells]
     side = high - low
-    from_corner = side * (middle + displacement) / cell_counts
+    from_corner = side * place / cell_counts
     return quantise(low + from_corner)

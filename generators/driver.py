@@ -138,12 +138,14 @@ class Driver(ABC, Generic[Parameters]):
         p = self.parameters
         kernels = self._kernels
         self._fixed = self._fixed_positions(states)
-        self._place(stack(states, "position"))
+        position = stack(states, "position")
+        self._place(position)
         shape = (self.scenarios, p.particles, 4)
         particle_state = np.empty(shape, np.float32)
         # what stands behind the velocity keeps its value at rest; its slopes are 0
         particle_state[...] = kernels.at_rest
-        particle_state[..., : self.dimension] = stack(states, "velocity")
+        velocity = stack(states, "velocity")
+        particle_state[..., : self.dimension] = velocity
         self._write(kernels.particle_state, particle_state, at_rest=kernels.at_rest)
         affine = stack(states, "affine")
         for axis, field in enumerate(kernels.slopes):
@@ -293,10 +295,12 @@ class Driver(ABC, Generic[Parameters]):
         self._check_arrays(index, state)
         material_values = [material.value for material in Material]
         area = np.float64(state.area)
-        is_outside = (state.position < 0.0) | (state.position > 1.0)
-        outside_count = np.count_nonzero(is_outside)
-        has_known_materials = np.isin(state.material, material_values).all()
-        if outside_count or not has_known_materials or not 0.0 < area <= 1.0:
+        is_below = state.position < 0.0
+        is_above = state.position > 1.0
+        outside_count = np.count_nonzero(is_below | is_above)
+        is_known = np.isin(state.material, material_values)
+        has_area = 0.0 < area <= 1.0
+        if outside_count or not is_known.all() or not has_area:
             raise UsageError(
                 "no such initial state",
                 where=f"scenario {index}",
@@ -312,7 +316,8 @@ class Driver(ABC, Generic[Parameters]):
         largest_slope = np.abs(state.affine).max()
         stretch = largest_slope * self.parameters.dt
         is_finite = np.isfinite(state.position)
-        if not (is_finite.all() and speed <= speed_bound and stretch <= 2.0):
+        is_slow = speed <= speed_bound and stretch <= 2.0
+        if not is_finite.all() or not is_slow:
             raise WorkFailedError(
                 "the initial state is outside the solver's bounds",
                 where=f"scenario {index}",
@@ -328,11 +333,14 @@ class Driver(ABC, Generic[Parameters]):
         """Refuse arrays of another shape or kind of number than the kernels take."""
         count = self.parameters.particles
         dimension = self.dimension
+        vector_shape = (count, dimension)
+        matrix_shape = (count, dimension, dimension)
+        scalar_shape = (count,)
         expected_arrays = (
-            ("position", (count, dimension), "floating", "f"),
-            ("velocity", (count, dimension), "floating", "f"),
-            ("affine", (count, dimension, dimension), "floating", "f"),
-            ("material", (count,), "whole", "iu"),
+            ("position", vector_shape, "floating", "f"),
+            ("velocity", vector_shape, "floating", "f"),
+            ("affine", matrix_shape, "floating", "f"),
+            ("material", scalar_shape, "whole", "iu"),
         )
         for name, shape, number, kinds in expected_arrays:
             array = np.asarray(getattr(state, name))

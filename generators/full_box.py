@@ -48,13 +48,16 @@ class FullBox(Driver[FullBoxParameters]):
         self._states = list(states)
         self._drive_towards(0)
         # nu dt / dx^2, shape [scenario]
-        viscosity = np.array([state.viscosity for state in states])
+        viscosities = [state.viscosity for state in states]
+        viscosity = np.array(viscosities)
         diffusion_number = viscosity * p.dt * p.grid**2
         kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
         if p.obstacle_particles:
-            kernels.place_obstacles(_obstacles_of(states))
+            obstacles = _obstacles_of(states)
+            kernels.place_obstacles(obstacles)
         if p.fringe_rate:
-            kernels.set_stream(_streams_of(states))
+            streams = _streams_of(states)
+            kernels.set_stream(streams)
         for field in (
             kernels.drag,
             kernels.node_state,
@@ -100,9 +103,10 @@ class FullBox(Driver[FullBoxParameters]):
             return end
         interval = self.parameters.substeps_per_frame
         frame, past = divmod(self._substeps, interval)
+        next_frame = frame + 1
         if past == 0:
-            self._drive_towards(frame + 1)
-        return min(end, (frame + 1) * interval)
+            self._drive_towards(next_frame)
+        return min(end, next_frame * interval)
 
     def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
@@ -170,11 +174,12 @@ class FullBox(Driver[FullBoxParameters]):
         """Refuse walls that move as no wall of this box can."""
         p = self.parameters
         speed_bound = self._kernels.speed_bound / 2.0
-        shape = (2 * self.dimension, self.dimension)
+        wall_count = 2 * self.dimension
+        shape = (wall_count, self.dimension)
         speeds = np.abs(np.asarray(state.wall_velocity))
         has_walls = speeds.shape[-2:] == shape
         if has_walls:
-            wall = np.arange(2 * self.dimension)
+            wall = np.arange(wall_count)
             normal = wall // 2
             is_periodic = np.repeat(p.box.periodic, 2)
             may_move = np.full(shape, p.no_slip)
@@ -237,14 +242,16 @@ class FullBox(Driver[FullBoxParameters]):
         is_clear_below = centre - reach >= box.low
         is_clear_above = centre + reach <= box.high
         is_clear = is_clear_below & is_clear_above
-        is_finite = np.isfinite(obstacle.position).all()
+        position = obstacle.position
+        is_finite = np.isfinite(position)
+        is_covered = is_inside(position, obstacle.centre, obstacle.radius)
         if not is_clear.all():
             expected = f"a centre {reach:g} or more from all faces of the box"
             got = f"centre {obstacle.centre}"
-        elif not is_finite:
+        elif not is_finite.all():
             expected = "finite positions"
             got = "NaN or infinity"
-        elif not is_inside(obstacle.position, obstacle.centre, obstacle.radius).all():
+        elif not is_covered.all():
             expected = f"particles less than {obstacle.radius:g} from the centre"
             got = "some farther away"
         else:
@@ -263,9 +270,10 @@ class FullBox(Driver[FullBoxParameters]):
         if stream is None and not self.parameters.fringe_rate:
             return
         speed_bound = self._kernels.speed_bound
+        has_fringe = self.parameters.fringe_rate > 0.0
         is_valid = (
             stream is not None
-            and self.parameters.fringe_rate > 0.0
+            and has_fringe
             and stream.shape == (self.dimension,)
             and float(np.abs(stream).max()) <= speed_bound
         )

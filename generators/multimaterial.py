@@ -95,7 +95,9 @@ def _draw_rectangle(rng: RandomSource, size: Size, area: float) -> Shape:
 
 
 def _draw_rope(rng: RandomSource, size: Size, length: float) -> Shape:
-    return Rectangle(length, size.value("rope_width"), direction(rng))
+    width = size.value("rope_width")
+    axis = direction(rng)
+    return Rectangle(length, width, axis)
 
 
 PLANE_SHAPES = BodyShapes(
@@ -125,7 +127,8 @@ def _probe_nodes(shape: Shape, cell_count: int) -> Array:
     [node, axis].
     """
     numbers = np.arange(cell_count + 1)
-    unit_axis = (2.0 * numbers - cell_count) / cell_count  # from -1 to 1
+    from_middle = 2.0 * numbers - cell_count  # [half a cell]
+    unit_axis = from_middle / cell_count  # from -1 to 1
     axes = [unit_axis * reach for reach in shape.reach]
     coordinates = np.meshgrid(*axes)
     columns = [along.ravel() for along in coordinates]
@@ -144,8 +147,10 @@ def _keeps_gap(
     """
     nodes = second.centre + offsets
     is_inside = second.distance(nodes) <= 0.0
-    distance = first.distance(nodes[is_inside])
-    return float(distance.min()) >= gap
+    inner_nodes = nodes[is_inside]
+    distance = first.distance(inner_nodes)
+    least_distance = float(distance.min())
+    return least_distance >= gap
 
 
 def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
@@ -213,8 +218,11 @@ def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int
     area = add_in_order(measures)
     counts = []
     for body_area in measures[:-1]:
-        counts.append(math.floor(particle_count * body_area / area + 0.5))
-    counts.append(particle_count - sum(counts))
+        share = particle_count * body_area / area
+        count = math.floor(share + 0.5)
+        counts.append(count)
+    last_count = particle_count - sum(counts)
+    counts.append(last_count)
     return counts
 
 
@@ -266,32 +274,37 @@ def draw_bodies(
     velocities = []
     for body in bodies:
         way = point - body.centre
-        velocities.append(quantise(rate * way))
+        velocity = quantise(rate * way)
+        velocities.append(velocity)
 
     friction = 0.0
     if Material.LIQUID not in materials:
         friction = float(size.value("friction"))
 
-    points = []
+    positions = []
     for body, count in zip(bodies, counts, strict=True):
-        points.append(sample_points(rng, body, count))
+        position = sample_points(rng, body, count)
+        positions.append(position)
+    names = [material.name.lower() for material in materials]
     parameters: dict[str, int | float | str] = {
-        "pair": "-".join(material.name.lower() for material in materials),
+        "pair": "-".join(names),
         "attraction": rate,
         "friction": friction,
     }
     for body_values in zip(_NAMES, bodies, measures, velocities, strict=False):
         parameters |= _body_parameters(*body_values)
     dimension = size.dimension
+    affine_shape = (size.particles, dimension, dimension)
+    wall_shape = (2 * dimension, dimension)
     body_velocity = np.stack(velocities)
     body_material = np.array(materials, dtype=np.int8)
     return InitialState(
-        position=np.concatenate(points),
+        position=np.concatenate(positions),
         velocity=np.repeat(body_velocity, counts, axis=0),
-        affine=np.zeros((size.particles, dimension, dimension)),
+        affine=np.zeros(affine_shape),
         material=np.repeat(body_material, counts),
         area=add_in_order(measures),
-        wall_velocity=np.zeros((2 * dimension, dimension)),
+        wall_velocity=np.zeros(wall_shape),
         friction=friction,
         parameters=parameters,
     )

@@ -53,40 +53,41 @@ class Smooth:
 
     def __add__(self, other: Smooth) -> Smooth:
         """Add term by term."""
-        return Smooth(
-            self.value + other.value,
-            self.gradient + other.gradient,
-            self.hessian + other.hessian,
-        )
+        value = self.value + other.value
+        gradient = self.gradient + other.gradient
+        hessian = self.hessian + other.hessian
+        return Smooth(value, gradient, hessian)
 
     def __mul__(self, other: Smooth) -> Smooth:
         """Multiply by the product rule."""
         f = self.value[:, None]
         g = other.value[:, None]
+        value = self.value * other.value
         gradient = g * self.gradient + f * other.gradient
         # f'_i g'_j and its transpose, shape [point, axis, axis]
         f_slope = self.gradient[:, :, None]
         g_slope = other.gradient[:, None, :]
         crossed = f_slope * g_slope
-        both_crossed = crossed + crossed.transpose(0, 2, 1)
+        transposed = crossed.transpose(0, 2, 1)
+        both_crossed = crossed + transposed
         f_curved = g[..., None] * self.hessian
         g_curved = f[..., None] * other.hessian
         hessian = f_curved + g_curved + both_crossed
-        return Smooth(self.value * other.value, gradient, hessian)
+        return Smooth(value, gradient, hessian)
 
     def scale(self, factor: Array | float) -> Smooth:
         """Multiply by numbers that do not depend on the point's coordinates."""
         exact = np.asarray(factor, np.float64)
         factors = np.broadcast_to(exact, self.value.shape)
-        return Smooth(
-            factors * self.value,
-            factors[:, None] * self.gradient,
-            factors[:, None, None] * self.hessian,
-        )
+        value = factors * self.value
+        gradient = factors[:, None] * self.gradient
+        hessian = factors[:, None, None] * self.hessian
+        return Smooth(value, gradient, hessian)
 
     def shift(self, amount: Array | float) -> Smooth:
         """Add numbers that do not depend on the point's coordinates."""
-        return Smooth(self.value + amount, self.gradient, self.hessian)
+        value = self.value + amount
+        return Smooth(value, self.gradient, self.hessian)
 
     def polynomial(self, *coefficients: float) -> Smooth:
         """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
@@ -100,11 +101,10 @@ class Smooth:
         """Return the function at some points, and zero at the others."""
         of_gradient = chosen[:, None]
         of_hessian = chosen[:, None, None]
-        return Smooth(
-            np.where(chosen, self.value, 0.0),
-            np.where(of_gradient, self.gradient, 0.0),
-            np.where(of_hessian, self.hessian, 0.0),
-        )
+        value = np.where(chosen, self.value, 0.0)
+        gradient = np.where(of_gradient, self.gradient, 0.0)
+        hessian = np.where(of_hessian, self.hessian, 0.0)
+        return Smooth(value, gradient, hessian)
 
 
 @dataclass(frozen=True)
@@ -133,11 +133,12 @@ def coordinate(values: Array, axis: int, dimension: int) -> Smooth:
 
 def constant(value: float, point_count: int, dimension: int) -> Smooth:
     """Return a constant function."""
-    return Smooth(
-        np.full(point_count, value),
-        np.zeros((point_count, dimension)),
-        np.zeros((point_count, dimension, dimension)),
-    )
+    gradient_shape = (point_count, dimension)
+    hessian_shape = (point_count, dimension, dimension)
+    values = np.full(point_count, value)
+    gradient = np.zeros(gradient_shape)
+    hessian = np.zeros(hessian_shape)
+    return Smooth(values, gradient, hessian)
 
 
 def draw_direction(rng: RandomSource, dimension: int) -> Array:
@@ -193,7 +194,8 @@ def noise(position: Array, lattice: Array) -> Smooth:
         t = coordinate(distance, axis, dimension)
         along.append(t)
         rising = _fade(t)
-        falling = rising.scale(-1.0).shift(1.0)
+        minus_rising = rising.scale(-1.0)
+        falling = minus_rising.shift(1.0)
         weights.append((falling, rising))
 
     total = constant(0.0, point_count, dimension)
@@ -202,18 +204,19 @@ def noise(position: Array, lattice: Array) -> Smooth:
         gradient = lattice[tuple(node.T)]
         term = constant(0.0, point_count, dimension)
         for axis, side in enumerate(corner):
+            slope = gradient[:, axis]
             from_corner = along[axis].shift(-float(side))
-            term = term + from_corner.scale(gradient[:, axis])
+            term = term + from_corner.scale(slope)
         for axis, side in enumerate(corner):
-            term = term * weights[axis][side]
+            weight = weights[axis][side]
+            term = term * weight
         total = total + term
     # from derivatives per cell of the lattice to derivatives per length
     per_length = float(frequency)
-    return Smooth(
-        total.value,
-        total.gradient * per_length,
-        total.hessian * (per_length * per_length),
-    )
+    per_square = per_length * per_length
+    gradient = total.gradient * per_length
+    hessian = total.hessian * per_square
+    return Smooth(total.value, gradient, hessian)
 
 
 def wrapped_offset(position: Array, centre: Array) -> Array:
@@ -245,10 +248,12 @@ def curl(potential: Sequence[Smooth]) -> Flow:
         second = (axis + 2) % 3
         a = potential[first]
         b = potential[second]
-        component = b.gradient[:, first] - a.gradient[:, second]
-        component_gradient = b.hessian[:, first] - a.hessian[:, second]
-        components.append(component)
-        gradients.append(component_gradient)
+        b_slope = b.gradient[:, first]
+        a_slope = a.gradient[:, second]
+        b_curvature = b.hessian[:, first]
+        a_curvature = a.hessian[:, second]
+        components.append(b_slope - a_slope)
+        gradients.append(b_curvature - a_curvature)
     velocity = np.stack(components, axis=1)
     affine = np.stack(gradients, axis=1)
     return Flow(velocity, affine)
@@ -287,7 +292,9 @@ def fill_box(
     cell = indices.reshape(dimension, -1).T
     unit = rng.random(cell.shape)
     displacement = (unit - 0.5) * jitter
-    share = (cell + 0.5 + displacement) / np.asarray(counts)  # of the extent
+    place = cell + 0.5 + displacement  # [cells]
+    share = place / np.asarray(counts)  # of the extent
     start = np.asarray(low, np.float64)
-    extent = np.asarray(high, np.float64) - start
+    end = np.asarray(high, np.float64)
+    extent = end - start
     return quantise(start + extent * share)
