@@ -149,9 +149,9 @@ class BoxTables:
         is_tangential = is_single[:, None] & is_along_wall
         # In the last cells before a wall that the motion runs into it is halved.
         is_first = index == 1
-        is_at_end = is_first | (index == self._last)
-        is_last = is_at_end & self._is_walled
-        share = np.where(is_last, 1.0, 2.0)
+        is_last = index == self._last
+        is_before_wall = (is_first | is_last) & self._is_walled
+        share = np.where(is_before_wall, 1.0, 2.0)
         drive = share * is_tangential
         return Ghosts(
             node=node,

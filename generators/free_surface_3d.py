@@ -36,13 +36,16 @@ class FreeSurface3D(FreeSurfaceDriver):
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, 3, 3].
         """
-        columns = [
-            field.to_numpy()[..., :3] for field in self._kernels.deformation_columns
-        ]
+        columns = []
+        for field in self._kernels.deformation_columns:
+            column = field.to_numpy()
+            columns.append(column[..., :3])
         return np.stack(columns, axis=-1)
 
     def _set_deformation(self, gradients: Singles) -> None:
+        scenarios, particles, _, _ = gradients.shape
+        shape = (scenarios, particles, 4)
         for axis, field in enumerate(self._kernels.deformation_columns):
-            column = np.zeros((*gradients.shape[:2], 4), np.float32)
+            column = np.zeros(shape, np.float32)
             column[..., :3] = gradients[..., axis]
             field.from_numpy(column)

@@ -30,13 +30,16 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 
 
 def _draw_rod(rng: RandomSource, size: Size, length: float) -> Solid:
-    return Rod(length, size.value("rope_radius"), direction_in_space(rng))
+    radius = size.value("rope_radius")
+    axis = direction_in_space(rng)
+    return Rod(length, radius, axis)
 
 
 def _draw_block(rng: RandomSource, size: Size, volume: float) -> Solid:
     along_x = draw_between(rng, size, "aspect")
     along_z = draw_between(rng, size, "aspect")
-    return Block.of_volume(volume, (along_x, along_z))
+    aspects = (along_x, along_z)
+    return Block.of_volume(volume, aspects)
 
 
 SOLIDS = BodyShapes(

@@ -733,11 +733,8 @@ class NodalStressND:
 
         old_jacobian = old_state[3]
         growth = self.dt * divergence * old_jacobian
-        lag = grid_jacobian - old_jacobian
-        relaxation = self.parameters.jacobian_relaxation * lag
-        compression = volume - grid_jacobian
-        coupling = self.parameters.density_coupling * compression
-        jacobian = old_jacobian + growth + relaxation + coupling
+        flowed = old_jacobian + growth
+        jacobian = self.relaxed(flowed, old_jacobian, grid_jacobian, volume)
         self.particle_state[s, p] = vec4(v, jacobian)
         speed = ti.abs(v)
         reached = vec4(speed, jacobian)
@@ -757,12 +754,23 @@ class NodalStressND:
         for axis in ti.static(range(self.dimension)):
             self.slopes[axis][s, p] = vec4(0.0)
         old_jacobian = self.particle_state[s, p][3]
+        jacobian = self.relaxed(old_jacobian, old_jacobian, grid_jacobian, volume)
+        self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
+
+    @ti.func
+    def relaxed(
+        self,
+        flowed: f32,
+        old_jacobian: f32,
+        grid_jacobian: f32,
+        volume: f32,
+    ) -> f32:
+        """Return J_p, after the flow changed it, drawn towards Jbar and 1/r."""
         lag = grid_jacobian - old_jacobian
         relaxation = self.parameters.jacobian_relaxation * lag
         compression = volume - grid_jacobian
         coupling = self.parameters.density_coupling * compression
-        jacobian = old_jacobian + relaxation + coupling
-        self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
+        return flowed + relaxation + coupling
 
     @ti.func
     def kept_outside(self, s: i32, target: vec3) -> Value:

@@ -45,20 +45,23 @@ def solver_parameters(size: Size) -> FullBoxParameters:
 def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
     """Draw how many frames a scenario is simulated before frame 0; the first draw."""
     del scenario  # the same range for all
-    return draw_integer(rng, *interval(size, "start_frame"))
+    least, most = interval(size, "start_frame")
+    return draw_integer(rng, least, most)
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw eddies, and the force that drives the halves through all frames."""
     start = start_frame(size, scenario, rng)
+    frame_count = start + size.frame_count(scenario)
     program = draw_program(
         rng,
-        start + size.frame_count(scenario),
+        frame_count,
         amplitude=size.value("force_max"),
         knot_gap=interval(size, "knot_gap"),
     )
     # acceleration of both layers towards each frame, shape [frame, layer, axis]
-    body_force = np.zeros((len(program), 2, 2))
+    shape = (len(program), 2, 2)
+    body_force = np.zeros(shape)
     body_force[:, 0, 0] = program
     body_force[:, 1, 0] = -program
 

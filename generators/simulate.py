@@ -183,9 +183,11 @@ def simulate(
             position, velocity = batch.frame(index)
             stored_velocity = velocity if size.stores_velocity else None
             writers[index].append(position, stored_velocity)
-            energies[index].append(_kinetic_energy(velocity, masses[index]))
+            energy = _kinetic_energy(velocity, masses[index])
+            energies[index].append(energy)
             if recorders:
-                recorders[index].add(velocity, batch.volume_ratio(index))
+                volume_ratio = batch.volume_ratio(index)
+                recorders[index].add(velocity, volume_ratio)
             if frame == COMPILING - 1:
                 started = clock()
 
