@@ -182,7 +182,7 @@ def count_pairs_of_seeds() -> tuple[int, int]:
 PAGE = """\
 # Power: which differences can the test find?
 
-After this page you know how many seeds and scenarios a comparison needs.
+After this page you know how small a difference the test can find.
 `lagbench compare` and the leaderboard use the statistical test
 `lagbench.metrics.differ`. This page answers two questions about the test:
 
@@ -213,8 +213,8 @@ names of splits. They use standard deviations that we measured from the score fi
 size mini in leaderboard/scores.
 
 The measurement needs two methods whose means differ by less than a factor of two. At
-least one of these methods must have several seeds. With only two methods of two seeds
-each, the measured standard deviations are inaccurate.
+least one of these methods must have several seeds. Where a split has no more than that,
+its row is inaccurate.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
@@ -245,6 +245,9 @@ the seeds of the first side is still unknown.
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|
 {false_rows}
+
+The rows *middling* and *large* are equal. All standard deviations of *large* are twice
+those of *middling*, and the test does not depend on the scale of the scores.
 
 The leaderboard has {pair_count} pairs of two seeds of the same method, on cavity,
 curl-noise, fluid and multimaterial at size mini. The test finds a difference, at 5 %,

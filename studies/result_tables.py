@@ -56,9 +56,9 @@ def summary_table(all_results: Sequence[SplitResults]) -> str:
                     results.where,
                     results.ranking,
                     _name_and_score(results, results.best_naive),
-                    _name_score_and_cost(results, solver),
+                    _name_score_and_cost(results, solver, beside=model),
                     str(kind),
-                    _name_score_and_cost(results, model),
+                    _name_score_and_cost(results, model, beside=model),
                     number(results.skill(model)),
                     _format_against(results, model),
                 )
@@ -224,14 +224,34 @@ def _format_against(results: SplitResults, model: str) -> str:
     )
 
 
-def _name_score_and_cost(results: SplitResults, name: str | None) -> str:
+def _name_score_and_cost(results: SplitResults, name: str | None, beside: str) -> str:
+    """Return name, score and time per frame, as measured in the run of a model."""
     text = _name_and_score(results, name)
     if name is None:
         return text
-    seconds = results.seconds_per_frame(name)
+    seconds = _seconds_in_run(results, name, beside)
     if seconds is None:
         return text
     return f"{text} ({number(1000.0 * seconds)} ms)"
+
+
+def _seconds_in_run(results: SplitResults, name: str, model: str) -> float | None:
+    """Return the time of a frame in the run that measured a model and the solvers [s].
+
+    Without such a run it is the time that is known, on the machine that measured the
+    reference predictors.
+
+    Args:
+        results: of a data set.
+        name: the model, or a classical solver.
+        model: the model whose run it is.
+    """
+    measured = results.methods[model].measured
+    if measured is None or not measured.classical:
+        return results.seconds_per_frame(name)
+    if name == model:
+        return measured.seconds_per_frame
+    return measured.classical.get(name)
 
 
 def _name_and_score(results: SplitResults, name: str | None) -> str:

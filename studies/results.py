@@ -70,19 +70,14 @@ Each row compares the best learned model, or the best hybrid, of a data set with
 best predictors that are not trained. A hybrid is a solver with a learned part. A lower
 score is better.
 
-- The time in brackets after a score is the processor time of one frame on one core, on
-  the machine of the reference predictors. Learned models were measured on another
-  machine. Therefore their times are multiplied by a ratio: the time of our solver on
-  the machine of the reference predictors, divided by the time of our solver on the
-  other machine.
+- The time in brackets after a score is the processor time of one frame on one core. All
+  times of a row come from one run on one machine (`leaderboard/verified.yaml`), and
+  `against_classical` uses them. Other rows may come from other machines.
 - `skill` is 1 - (score of the model) / (score of the best naive baseline).
 - `against_classical` is (score of the model) / (score of the best classical solver that
   costs no more per frame than the model). The brackets contain the 95 % interval. The
   name of the solver follows. If the whole interval is below 1,
-  [learning pays](glossary.md).
-- If one run timed the model and the solvers together (`leaderboard/verified.yaml`),
-  `against_classical` uses the times of this run, as the leaderboard does. They may
-  differ from the times in brackets."""
+  [learning pays](glossary.md)."""
 
 HOW_TO_READ = """\
 ## How to read this page

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import os
 import signal
 import time
@@ -42,6 +43,11 @@ def refuse(report: Report) -> None:
 def crash(report: Report) -> None:
     """Raise an error of nobody's."""
     raise ZeroDivisionError
+
+
+def lack_permission(path: Path, report: Report) -> None:
+    """Raise an error of the operating system."""
+    raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
 
 def sleep_long(marker: Path, report: Report) -> None:

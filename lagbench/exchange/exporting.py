@@ -262,7 +262,10 @@ def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> No
             fix="replace them: --overwrite; or name another folder: --output",
         )
     if folder.is_dir() and not overwrite:
-        others = sorted(path.name for path in folder.iterdir())
+        others = []
+        for path in sorted(folder.iterdir()):
+            if not path.name.startswith("."):  # as file browsers leave behind
+                others.append(path.name)
         if others:
             raise UsageError(
                 "the folder holds other files",

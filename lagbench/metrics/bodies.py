@@ -172,7 +172,7 @@ METRICS = (
     ),
     *_body_metrics(
         connectivity,
-        "Share of first neighbours that stay within twice their distance",
+        "Share of the neighbours in frame 0 whose distance has at most doubled",
         unit="1",
         direction=Direction.HIGHER,
         perfect=1.0,

@@ -168,7 +168,7 @@ stable_frames = Metric(
     least=0.0,
     source="Kochkov et al. 2021, PNAS 118(21)",
     summary=f"Frames before vorticity_pearson first falls below {STABLE_PEARSON:g}; "
-    "frames in which it is undefined do not count",
+    "frames in which it is undefined are left out",
     of=("vorticity_pearson",),
     over_frames=frames_before_fall,
     per_frame=False,

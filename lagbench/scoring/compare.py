@@ -506,15 +506,19 @@ def _check_files(source: str | Path) -> None:
 
 
 def _check_different(first: str | Path, second: str | Path) -> None:
-    """Refuse to compare files with themselves, by whatever paths they are named."""
+    """Refuse two methods that share a file, by whatever paths it is named."""
     first_files = {os.path.realpath(path) for path in _seed_files(Path(first))}
     second_files = {os.path.realpath(path) for path in _seed_files(Path(second))}
-    if first_files == second_files:
+    shared_files = first_files & second_files
+    if shared_files:
+        got = f"{first} and {second}, which are the same"
+        if first_files != second_files:
+            got = f"{first} and {second}, which share {min(shared_files)}"
         raise UsageError(
             "a method cannot be compared with itself",
             where="A and B",
             expected="the files of two methods",
-            got=f"{first} and {second}, which are the same",
+            got=got,
             fix="name another file, a reference predictor or an entry of the "
             "leaderboard as B",
         )

@@ -343,7 +343,8 @@ def _run_item(message: bytes, channel: Connection) -> tuple[str, Any]:
     try:
         function, arguments = pickle.loads(message)
         return "done", function(*arguments, report)
-    except LagbenchError as error:
+    except (LagbenchError, OSError) as error:
+        # The program explains a full disk or a missing permission wherever it occurs.
         return "error", error
     except Exception as error:
         return "error", crash_error(error)

@@ -354,6 +354,15 @@ def test_an_export_mixes_with_other_files_only_on_request(
     assert (folder / "metadata.json").is_file()
 
 
+def test_an_export_ignores_hidden_files(mixed: LocalSplit, tmp_path: Path) -> None:
+    """File browsers leave such files in folders that a user sees as empty."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / ".DS_Store").write_text("icons")
+    export(str(mixed.folder), format="gns-npz", output=folder)
+    assert (folder / "metadata.json").is_file()
+
+
 class _Names(pickle.Unpickler):
     """Notes what a pickle names."""
 

@@ -655,6 +655,13 @@ def test_a_seed_is_not_compared_with_itself(scored: Folders, seed_folder: Path) 
     assert str(seed_folder) in str(caught.value.where)
 
 
+def test_seeds_are_not_compared_with_one_of_them(seed_folder: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        compare(seed_folder, seed_folder / "0")
+    assert caught.value.where == "A and B"
+    assert str(seed_folder / "0" / "scores.json") in str(caught.value.got)
+
+
 def test_a_reference_goes_second(scored: Folders) -> None:
     with pytest.raises(UsageError):
         compare("persistence", scored["still"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -190,6 +191,18 @@ def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> Non
     error = failure("a", pool_tasks.crash)
     assert "pool_tasks.py" in str(error.where)
     assert "ZeroDivisionError" in str(error.got)
+
+
+def test_errors_of_the_system_stay_what_they_are(tmp_path: Path) -> None:
+    """A missing permission is no fault of lagbench, wherever it is missing."""
+    path = tmp_path / "file"
+    task = WorkItem(name="a", function=pool_tasks.lack_permission, arguments=(path,))
+    with Pool(1) as pool:
+        pool.submit(task)
+        with pytest.raises(PermissionError) as caught:
+            list(pool.events())
+    assert caught.value.filename == str(path)
+    assert caught.value.errno == errno.EACCES
 
 
 def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from lagbench.baselines.operators.operator import Losses, Operator
 class Sage(Operator):
     """Mean over the neighbours (Hamilton et al. 2017).
 
-    SAGEConv takes no edge features. The sum of the messages, which is part of ``node``,
-    brings them in.
+    SAGEConv takes no edge features. It still learns of the edges: the features ``node``
+    of a particle contain the sum of its messages.
     """
 
     method = "GNS + SAGEConv"
