@@ -9,8 +9,8 @@ from lagbench.baselines.operators.operator import Losses, Operator
 class Sage(Operator):
     """Mean over the neighbours (Hamilton et al. 2017).
 
-    SAGEConv takes no edge features. It still learns of the edges: the features ``node``
-    of a particle contain the sum of its messages.
+    SAGEConv takes no edge features. They still reach it: the input ``node`` contains
+    the sum of the messages to each particle.
     """
 
     method = "GNS + SAGEConv"
@@ -27,5 +27,5 @@ class Sage(Operator):
         *,
         generator: Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the aggregation of each node, and no loss of the operator."""
+        """Return the aggregated features of each node, and no further loss term."""
         return self.conv(node, edge_index), {}
