@@ -42,9 +42,9 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     (16.0, 16.0)
     """
     lateral = 1.0 + poisson
-    volumetric = 1.0 - 2.0 * poisson
+    incompressibility = 1.0 - 2.0 * poisson
     mu = young / (2.0 * lateral)
-    la = young * poisson / (lateral * volumetric)
+    la = young * poisson / (lateral * incompressibility)
     return mu, la
 
 
@@ -116,7 +116,7 @@ def rotation(f: mat2) -> vec3:
 
 
 @ti.func
-def reflection(f: mat2) -> Value:
+def shear_parts(f: mat2) -> Value:
     """Return h and k of the scaled reflection in F."""
     xx = f[0, 0]
     xy = f[0, 1]
@@ -158,7 +158,7 @@ def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     in [mass/s^2].
     """
     cosine, sine, q = rotation(f)
-    h, k = reflection(f)
+    h, k = shear_parts(f)
     r_square = h * h + k * k
     jacobian = q * q - r_square
     volume_change = jacobian - 1.0
@@ -201,7 +201,7 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
         :data:`STRETCH_MIN`) over clamped ones.
     """
     cosine, sine, q = rotation(f)
-    h, k = reflection(f)
+    h, k = shear_parts(f)
     r_square = h * h + k * k
     r = ti.sqrt(r_square)
     trial_high = q + r

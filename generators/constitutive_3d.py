@@ -89,7 +89,7 @@ def times_transposed(rows: Template) -> Value:
 
 
 @ti.func
-def square(b: Template) -> Value:
+def symmetric_square(b: Template) -> Value:
     """Return B^2 of a symmetric matrix, a symmetric matrix too."""
     xx, yy, zz, yz, xz, xy = b
     x = [xx, xy, xz]
@@ -158,7 +158,7 @@ def left_stretch(b: Template, jacobian: Value) -> Value:
     inverse = 1.0 / divisor
     b_factor = pairs + b_trace
     isotropic = total * jacobian
-    b_square = square(b)
+    b_square = symmetric_square(b)
     # entries of (pairs + tr B) B - B^2
     xx = b_factor * b[0] - b_square[0]
     yy = b_factor * b[1] - b_square[1]

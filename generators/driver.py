@@ -316,8 +316,8 @@ class Driver(ABC, Generic[Parameters]):
         largest_slope = np.abs(state.affine).max()
         stretch = largest_slope * self.parameters.dt
         is_finite = np.isfinite(state.position)
-        is_slow = speed <= speed_bound and stretch <= 2.0
-        if not is_finite.all() or not is_slow:
+        is_within_bounds = speed <= speed_bound and stretch <= 2.0
+        if not is_finite.all() or not is_within_bounds:
             raise WorkFailedError(
                 "the initial state is outside the solver's bounds",
                 where=f"scenario {index}",

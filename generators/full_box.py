@@ -244,14 +244,13 @@ class FullBox(Driver[FullBoxParameters]):
         is_clear = is_clear_below & is_clear_above
         position = obstacle.position
         is_finite = np.isfinite(position)
-        is_covered = is_inside(position, obstacle.centre, obstacle.radius)
         if not is_clear.all():
             expected = f"a centre {reach:g} or more from all faces of the box"
             got = f"centre {obstacle.centre}"
         elif not is_finite.all():
             expected = "finite positions"
             got = "NaN or infinity"
-        elif not is_covered.all():
+        elif not is_inside(position, obstacle.centre, obstacle.radius).all():
             expected = f"particles less than {obstacle.radius:g} from the centre"
             got = "some farther away"
         else:

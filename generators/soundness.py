@@ -74,8 +74,8 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
 def wave_modulus(young: float, poisson: float) -> float:
     """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)) [mass/s^2]."""
     lateral = 1.0 + poisson
-    volumetric = 1.0 - 2.0 * poisson
-    divisor = lateral * volumetric
+    incompressibility = 1.0 - 2.0 * poisson
+    divisor = lateral * incompressibility
     return young * (1.0 - poisson) / divisor
 
 

@@ -38,6 +38,23 @@ PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics"
 DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """What the operating system says of a disk, a quota or a file that is full."""
 
+VANISHED_ERRORS = frozenset(
+    {
+        errno.ENOENT,
+        errno.ENOTDIR,
+        errno.EIO,
+        errno.ENODEV,
+        errno.ENXIO,
+        errno.ESTALE,
+        errno.EROFS,
+        errno.ENOTCONN,
+    }
+)
+"""What a disk or a folder raises that is no longer there, or only read."""
+
+PERMISSION_ERRORS = frozenset({errno.EACCES, errno.EPERM})
+"""What the operating system says of a file that the user may not touch."""
+
 _WORD = re.compile(r"\S+")
 _DIGITS = re.compile(r"[0-9]+")
 # The scheme before it is only looked back at: a search through a long text is linear.

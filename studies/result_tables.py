@@ -238,8 +238,7 @@ def _name_score_and_cost(results: SplitResults, name: str | None, beside: str) -
 def _seconds_in_run(results: SplitResults, name: str, model: str) -> float | None:
     """Return the time of a frame in the run that measured a model and the solvers [s].
 
-    Without such a run it is the time that is known, on the machine that measured the
-    reference predictors.
+    None without such a run: times of other machines do not stand in one row.
 
     Args:
         results: of a data set.
@@ -248,7 +247,7 @@ def _seconds_in_run(results: SplitResults, name: str, model: str) -> float | Non
     """
     measured = results.methods[model].measured
     if measured is None or not measured.classical:
-        return results.seconds_per_frame(name)
+        return None
     if name == model:
         return measured.seconds_per_frame
     return measured.classical.get(name)
@@ -506,8 +505,10 @@ def cost_table(results: SplitResults) -> str:
         if method.parameters is not None:
             parameters = f"{method.parameters:,}"
         seeds = []
+        machines = []
         for training in method.trainings:
             seeds.append("-" if training.seed is None else str(training.seed))
+            machines.append(format_hardware(training.record))
         rows.append(
             [
                 label(name),
@@ -516,7 +517,7 @@ def cost_table(results: SplitResults) -> str:
                 parameters,
                 ", ".join(seeds),
                 number(method.hours_per_seed),
-                format_hardware(method.trainings[0].record),
+                " / ".join(dict.fromkeys(machines)),
                 *_frame_costs(method),
             ]
         )

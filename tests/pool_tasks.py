@@ -50,6 +50,18 @@ def lack_permission(path: Path, report: Report) -> None:
     raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
 
+class Unsent(OSError):
+    """An error that cannot be sent to another process: it needs two arguments."""
+
+    def __init__(self, number: int, place: str) -> None:
+        super().__init__(errno.EPIPE, f"{number} at {place}")
+
+
+def break_a_pipe(report: Report) -> None:
+    """Raise an error of the operating system that no message explains."""
+    raise Unsent(1, "here")
+
+
 def sleep_long(marker: Path, report: Report) -> None:
     """Write the worker's process id, then work for a minute, deaf to everything."""
     marker.write_text(str(os.getpid()))

@@ -23,6 +23,7 @@ from typer.main import get_command
 from lagbench.addresses import REPOSITORY, describe
 from lagbench.errors import (
     DISK_FULL_ERRORS,
+    VANISHED_ERRORS,
     LagbenchError,
     UnreadableFileError,
     UsageError,
@@ -75,18 +76,6 @@ COMMANDS_WITHOUT_SIZE = {
     "lagbench submit",
 }
 """Commands that read the size of the data set from predictions or scores."""
-
-VANISHED_ERRORS = {
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EIO,
-    errno.ENODEV,
-    errno.ENXIO,
-    errno.ESTALE,
-    errno.EROFS,
-    errno.ENOTCONN,
-}
-"""What a disk or a folder raises that is no longer there, or only read."""
 
 MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 """What a library says that finds no memory while it is loaded."""

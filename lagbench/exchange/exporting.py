@@ -264,7 +264,7 @@ def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> No
     if folder.is_dir() and not overwrite:
         others = []
         for path in sorted(folder.iterdir()):
-            if not path.name.startswith("."):  # as file browsers leave behind
+            if not path.name.startswith("."):  # hidden, as some file browsers leave
                 others.append(path.name)
         if others:
             raise UsageError(

@@ -317,12 +317,12 @@ def mean_over_seeds(values: ArrayLike) -> Floats:
 def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | None:
     """Draw scenarios and seeds with replacement: the two-way bootstrap of a mean.
 
-    The value of seed s in scenario i is read as ``mean + b_i + a_s`` and a rest. The
-    means over seeds ``b_i`` and those over scenarios ``a_s`` are drawn independently of
+    The value of seed s in scenario i is read as ``mean + w_i + u_s`` and a rest. The
+    means over seeds ``w_i`` and those over scenarios ``u_s`` are drawn independently of
     each other, each stretched by ``sqrt(n / (n - 1))`` so that few seeds do not look
     alike by being few::
 
-        Var = sum_i b_i^2 / (N (N - 1)) + sum_s a_s^2 / (S (S - 1))
+        Var = sum_i w_i^2 / (N (N - 1)) + sum_s u_s^2 / (S (S - 1))
 
     The rest enters both sums once, which errs on the side of too wide. With one seed
     only the scenarios are drawn: the mean is then that of these weights, not of the

@@ -305,8 +305,8 @@ def compare(
 
     Raises:
         UsageError: an unknown metric, reference, entry or split, no leaderboard where
-            one is named, or the two belong to different splits or sizes, or are the
-            same files.
+            one is named, or the two belong to different splits or sizes, or
+            share a file.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
@@ -511,13 +511,15 @@ def _check_different(first: str | Path, second: str | Path) -> None:
     second_files = {os.path.realpath(path) for path in _seed_files(Path(second))}
     shared_files = first_files & second_files
     if shared_files:
+        what = "a method cannot be compared with itself"
         got = f"{first} and {second}, which are the same"
         if first_files != second_files:
+            what = "the two methods share a file"
             got = f"{first} and {second}, which share {min(shared_files)}"
         raise UsageError(
-            "a method cannot be compared with itself",
+            what,
             where="A and B",
-            expected="the files of two methods",
+            expected="two methods without a common file",
             got=got,
             fix="name another file, a reference predictor or an entry of the "
             "leaderboard as B",

@@ -33,7 +33,7 @@ from lagbench.atomic import check_writable, temporary_name, write_atomically
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 
 from .machine import describe_machine
-from .pool import Event, WorkItem, crash_error
+from .pool import Event, WorkItem, error_to_send
 
 PATIENCE = 30.0  # how long a file of another machine may take to appear [s]
 PAUSE = 0.1  # pause between two looks for a file [s]
@@ -211,10 +211,8 @@ def run_item(item: WorkItem, number: int, client: Client) -> ItemResult:
 
     try:
         value = item.function(*item.arguments, report)
-    except LagbenchError:
-        raise
     except Exception as error:
-        raise crash_error(error) from None
+        raise error_to_send(error) from None
     return ItemResult(value, total_units, describe_machine("unknown"))
 
 

@@ -28,6 +28,9 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Self, TextIO
 
 from lagbench.errors import (
+    DISK_FULL_ERRORS,
+    PERMISSION_ERRORS,
+    VANISHED_ERRORS,
     LagbenchError,
     WorkFailedError,
     find_place_in_extension,
@@ -265,6 +268,25 @@ class Pool:
         return Event(item=attempt.item, kind="lost", value=worker.progress)
 
 
+def error_to_send(error: Exception) -> Exception:
+    """Return an error of an item as the process that waits for it is to raise it.
+
+    Errors of ours stay as they are, and so do a full disk, a vanished one and a missing
+    permission, which the program explains. A package's errors and all others become an
+    error that holds their traceback.
+    """
+    if isinstance(error, LagbenchError):
+        return error
+    is_in_extension = find_place_in_extension(error) is not None
+    if isinstance(error, OSError) and not is_in_extension:
+        is_full = error.errno in DISK_FULL_ERRORS
+        is_lost = error.errno in VANISHED_ERRORS | PERMISSION_ERRORS
+        if is_full or (is_lost and error.filename is not None):
+            # A new one: not every subclass can be sent to another process.
+            return OSError(error.errno, error.strerror, error.filename)
+    return crash_error(error)
+
+
 def crash_error(error: Exception) -> WorkFailedError:
     """Return an unexpected exception of an item as an error of ours."""
     place = find_place_in_extension(error)
@@ -343,8 +365,5 @@ def _run_item(message: bytes, channel: Connection) -> tuple[str, Any]:
     try:
         function, arguments = pickle.loads(message)
         return "done", function(*arguments, report)
-    except (LagbenchError, OSError) as error:
-        # The program explains a full disk or a missing permission wherever it occurs.
-        return "error", error
     except Exception as error:
-        return "error", crash_error(error)
+        return "error", error_to_send(error)

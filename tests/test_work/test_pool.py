@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import os
 import signal
 import subprocess
@@ -203,6 +204,18 @@ def test_errors_of_the_system_stay_what_they_are(tmp_path: Path) -> None:
             list(pool.events())
     assert caught.value.filename == str(path)
     assert caught.value.errno == errno.EACCES
+
+
+def test_errors_of_the_system_that_nobody_explains_bring_their_traceback(
+    package: Callable[..., Path],
+) -> None:
+    """So do those that cannot be sent, and those of a package name the package."""
+    error = failure("a", pool_tasks.break_a_pipe)
+    assert error.what == "a worker crashed"
+    assert "1 at here" in str(error)
+    package("generators", "pool_tasks")
+    error = failure("a", functools.partial(pool_tasks.lack_permission, Path("file")))
+    assert error.what == "a package failed in a worker"
 
 
 def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
