@@ -76,15 +76,16 @@ CHECKS: Mapping[str, BoardCheck] = {
         "choose another name, or say what differs, as in 'GNS, six terms'",
     ),
     "lifecycle": BoardCheck(
-        "a superseded entry whose successor is missing or is the entry itself (also "
-        "through other entries)",
+        "a superseded entry whose successor is missing; a chain of successors that "
+        "comes back to the entry",
         "the entry is superseded by an entry that is not there",
         "another entry there, active in the end",
         "name an entry that is there and replaces it, or set status: withdrawn",
     ),
     "predictions": BoardCheck(
-        "predictions that the entry names as a file in the folder, if this file is "
-        "missing, has another length or is no netCDF file",
+        "a file of predictions that the entry names, but that is missing, has "
+        "another length or is no netCDF file; the check covers only files inside "
+        "the folder",
         "the predictions do not lie where the entry says",
         "a file of that length",
         "correct path and bytes, or remove path",
@@ -124,7 +125,8 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "training": BoardCheck(
         "a training on windows of `test` or `shift`; a `kind: classical` with "
-        "predictions of a trained model; weights beside an entry of another data set",
+        "predictions of a trained model; weights that were trained on another data "
+        "set than that of their entry",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",
@@ -132,11 +134,12 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scenarios",
     ),
     "weights": BoardCheck(
-        "weights that are missing, edited or in a wrong place; weights that no entry "
-        "names; weights that two active entries use in the same way; options of a "
-        "prediction that the model in the weights does not take; shared weights that "
-        "are not those of the entry in `shared_with`; more than 60 MB of weights, "
-        "or a file of more than 40 MB; a training log that is too long or broken",
+        "weights that are missing, edited or in a wrong place; weights that no "
+        "entry names; two active entries with the same weights, size and options of "
+        "the prediction; options of a prediction that the model does not have; "
+        "shared weights that differ from those of the entry in `shared_with`; more "
+        "than 60 MB of weights, or a file of more than 40 MB; a training log that "
+        "is too long or broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "
@@ -164,16 +167,17 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "verified": BoardCheck(
         "a line of verified.yaml about an entry that does not exist, or whose score "
-        "files have changed; a level without the records that prove it; a date in the "
-        "future; a cost of a reference predictor that the data set does not have; a "
-        "blind score of a season that is not there",
+        "files have changed; a level without the records that prove it; a date in "
+        "the future; a cost of a reference predictor, if the data set does not have "
+        "this predictor; a blind score of a season (a test on new scenarios) that "
+        "does not exist",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
     "shift": BoardCheck(
-        "a line of shift.yaml about an entry that does not exist, or about other "
-        "models, data or scenarios",
+        "a line of shift.yaml about an entry that does not exist, or whose models, "
+        "data or scenarios are not those of the entry any more",
         "shift.yaml has scores that belong to no entry",
         "scores of the entry's own models on the present data",
         "remove the line, and score anew: lagbench leaderboard shift ENTRY",
@@ -185,9 +189,9 @@ CHECKS: Mapping[str, BoardCheck] = {
         "restore the file, or write it anew: python -m studies.gates",
     ),
     "season": BoardCheck(
-        "a file of a blind season that cannot be read; seeds, scenarios or models "
-        "that differ from the frozen ones; public scores that disagree with the score"
-        " files",
+        "a file of a season that cannot be read; seeds, scenarios or models that "
+        "differ from those that the season recorded; public scores that disagree "
+        "with the score files",
         "a season is not the one that was closed",
         "what `lagbench season close` and `lagbench season run` wrote",
         "restore the files of the commit that closed the season",
@@ -205,8 +209,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "what the scorer gives",
     ),
     "measured": BoardCheck(
-        "a shipped score of a reference predictor that differs when it is measured "
-        "again",
+        "a score of a reference predictor in the package that differs when it is "
+        "measured again",
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
