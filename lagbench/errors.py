@@ -52,9 +52,6 @@ VANISHED_ERRORS = frozenset(
 )
 """What a disk or a folder raises that is no longer there, or only read."""
 
-PERMISSION_ERRORS = frozenset({errno.EACCES, errno.EPERM})
-"""What the operating system says of a file that the user may not touch."""
-
 _WORD = re.compile(r"\S+")
 _DIGITS = re.compile(r"[0-9]+")
 # The scheme before it is only looked back at: a search through a long text is linear.
@@ -312,6 +309,49 @@ class WorkFailedError(LagbenchError):
     """The work itself failed: blow-up, disk full, worker lost."""
 
     exit_code = 5
+
+
+def explain_system_error(error: OSError) -> LagbenchError | None:
+    """Return the message for an error of the operating system that a user can mend.
+
+    These are a missing permission, a disk or folder that has vanished, a name that is
+    too long, and a full disk. None for all others.
+    """
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return WorkFailedError(
+            "no permission",
+            where=os.fsdecode(error.filename),
+            expected="a file or folder that you may read or write",
+            got=error.strerror,
+            fix="see who owns it, or name another",
+        )
+    if error.errno in VANISHED_ERRORS:
+        return WorkFailedError(
+            "cannot read or write there",
+            where=os.fsdecode(error.filename or "the working folder"),
+            expected="a disk and a folder that stay there while lagbench works",
+            got=error.strerror,
+            fix="see that they are there and can be written to, then repeat the "
+            "command",
+        )
+    if error.errno == errno.ENAMETOOLONG:
+        name = str(error.filename)
+        return UsageError(
+            "no file can have that name",
+            where="an argument or an option",
+            expected="a name of at most 255 bytes",
+            got=f"{name[:60]!r}..., {len(os.fsencode(name))} bytes",
+            fix="use a shorter name",
+        )
+    if error.errno in DISK_FULL_ERRORS:
+        return WorkFailedError(
+            "cannot write there",
+            where=error.filename or "standard output, or another output file",
+            expected="space on the disk",
+            got=error.strerror,
+            fix="free disk space",
+        )
+    return None
 
 
 def check_regular(

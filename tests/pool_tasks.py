@@ -50,7 +50,7 @@ def lack_permission(path: Path, report: Report) -> None:
     raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
 
-class Unsent(OSError):
+class UnsentError(OSError):
     """An error that cannot be sent to another process: it needs two arguments."""
 
     def __init__(self, number: int, place: str) -> None:
@@ -59,7 +59,7 @@ class Unsent(OSError):
 
 def break_a_pipe(report: Report) -> None:
     """Raise an error of the operating system that no message explains."""
-    raise Unsent(1, "here")
+    raise UnsentError(1, "here")
 
 
 def sleep_long(marker: Path, report: Report) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import errno
 import functools
 import importlib
 import io
@@ -22,13 +21,12 @@ from typer.main import get_command
 
 from lagbench.addresses import REPOSITORY, describe
 from lagbench.errors import (
-    DISK_FULL_ERRORS,
-    VANISHED_ERRORS,
     LagbenchError,
     UnreadableFileError,
     UsageError,
     WorkFailedError,
     escape_unprintable,
+    explain_system_error,
     find_place_in_extension,
 )
 
@@ -615,41 +613,10 @@ def _output_errors() -> Iterator[None]:
             fix="install an older NumPy, which needs fewer: pip install 'numpy<2.4'",
         ) from error
     except OSError as error:
-        if isinstance(error, PermissionError) and error.filename is not None:
-            raise WorkFailedError(
-                "no permission",
-                where=os.fsdecode(error.filename),
-                expected="a file or folder that you may read or write",
-                got=error.strerror,
-                fix="see who owns it, or name another",
-            ) from error
-        if error.errno in VANISHED_ERRORS:
-            raise WorkFailedError(
-                "cannot read or write there",
-                where=os.fsdecode(error.filename or "the working folder"),
-                expected="a disk and a folder that stay there while lagbench works",
-                got=error.strerror,
-                fix="see that they are there and can be written to, then repeat the "
-                "command",
-            ) from error
-        if error.errno == errno.ENAMETOOLONG:
-            name = str(error.filename)
-            raise UsageError(
-                "no file can have that name",
-                where="an argument or an option",
-                expected="a name of at most 255 bytes",
-                got=f"{name[:60]!r}..., {len(os.fsencode(name))} bytes",
-                fix="use a shorter name",
-            ) from error
-        if error.errno not in DISK_FULL_ERRORS:
+        explained = explain_system_error(error)
+        if explained is None:
             raise
-        raise WorkFailedError(
-            "cannot write there",
-            where=error.filename or "standard output, or another output file",
-            expected="space on the disk",
-            got=error.strerror,
-            fix="free disk space",
-        ) from error
+        raise explained from error
 
 
 @contextmanager

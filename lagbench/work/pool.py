@@ -28,11 +28,9 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Self, TextIO
 
 from lagbench.errors import (
-    DISK_FULL_ERRORS,
-    PERMISSION_ERRORS,
-    VANISHED_ERRORS,
     LagbenchError,
     WorkFailedError,
+    explain_system_error,
     find_place_in_extension,
 )
 
@@ -268,22 +266,18 @@ class Pool:
         return Event(item=attempt.item, kind="lost", value=worker.progress)
 
 
-def error_to_send(error: Exception) -> Exception:
-    """Return an error of an item as the process that waits for it is to raise it.
+def error_to_send(error: Exception) -> LagbenchError:
+    """Return an exception of an item as an error of ours, which can be sent.
 
-    Errors of ours stay as they are, and so do a full disk, a vanished one and a missing
-    permission, which the program explains. A package's errors and all others become an
-    error that holds their traceback.
+    A full disk or a missing permission has the same message in a worker as elsewhere.
+    Errors of other packages and unexpected ones hold their traceback.
     """
     if isinstance(error, LagbenchError):
         return error
-    is_in_extension = find_place_in_extension(error) is not None
-    if isinstance(error, OSError) and not is_in_extension:
-        is_full = error.errno in DISK_FULL_ERRORS
-        is_lost = error.errno in VANISHED_ERRORS | PERMISSION_ERRORS
-        if is_full or (is_lost and error.filename is not None):
-            # A new one: not every subclass can be sent to another process.
-            return OSError(error.errno, error.strerror, error.filename)
+    if isinstance(error, OSError) and find_place_in_extension(error) is None:
+        explained = explain_system_error(error)
+        if explained is not None:
+            return explained
     return crash_error(error)
 
 

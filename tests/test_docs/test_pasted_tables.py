@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from benchmarks.references import main as print_references
 from benchmarks.season_grinding import main as print_season_grinding
@@ -39,6 +43,77 @@ def table_like(tables: list[list[str]], heading: str) -> list[str]:
     """Return the only table with a heading."""
     (found,) = (table for table in tables if table[0] == heading)
     return found
+
+
+def cells_of(row: str) -> list[str]:
+    """Return the texts between the bars of a row."""
+    return [cell.strip() for cell in row.strip("|").split("|")]
+
+
+def active_records() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield data set, method and line of verified.yaml of each active entry."""
+    verified = yaml.safe_load((BOARD / "verified.yaml").read_text())
+    for place, record in verified.items():
+        entry = yaml.safe_load((BOARD / place).read_text())
+        if "status" not in entry:
+            yield f"{entry['split']} {entry['size']}", entry["method"], record
+
+
+def test_the_times_of_a_row_of_results_come_from_one_run() -> None:
+    """The time of the model and that of the classical solver, in README and results."""
+    runs: dict[str, list[tuple[float, dict[str, float]]]] = {}
+    for data_set, _, record in active_records():
+        cost = record.get("cost")
+        if cost is not None:
+            run = (cost["seconds_per_frame"], cost["classical"])
+            runs.setdefault(data_set, []).append(run)
+
+    tables = tables_in((CLONE / "README.md").read_text())
+    (rows,) = (table for table in tables if table[0].startswith("| data set | metric"))
+    assert rows in tables_in((DOCS / "results.md").read_text())
+    assert len(rows) > 20
+    for row in rows[1:]:
+        data_set, _, _, classical, _, model, *_ = cells_of(row)
+        solver, solver_time = re.findall(r"^(\S+): .* \((\S+) ms\)", classical)[0]
+        (model_time,) = re.findall(r"\((\S+) ms\)", model)
+        times = []
+        for seconds, solvers in runs[data_set]:
+            times.append((f"{1000 * seconds:.3g}", f"{1000 * solvers[solver]:.3g}"))
+        assert (model_time, solver_time) in times
+
+
+def test_the_times_of_hybrids_are_those_of_verified_yaml() -> None:
+    """The time of a frame over that of the solver that made the data."""
+    expected = {}
+    for data_set, method, record in active_records():
+        if method == "hybrid-projection":
+            cost = record["cost"]
+            ratio = cost["seconds_per_frame"] / cost["solver"]
+            expected[data_set] = f"{ratio:.1f}"
+    page = tables_in((DOCS / "baselines.md").read_text())
+    heading = "| data set | time of a frame, hybrid / solver that made the data |"
+    rows = table_like(page, heading)
+    assert dict(map(cells_of, rows[1:])) == expected
+
+
+def test_the_differences_of_reproduced_models_are_those_of_verified_yaml() -> None:
+    """How many models of active entries came back how exactly."""
+    counts = [0, 0, 0, 0]
+    for data_set, _, record in active_records():
+        for seed in record.get("reproduced", []):
+            if seed["difference"] == 0:
+                counts[0] += 1
+            elif seed["difference"] <= 1e-5:
+                counts[1] += 1
+            elif not data_set.startswith("fluid "):
+                counts[2] += 1
+            else:
+                counts[3] += 1
+    text = (DOCS / "reproduce.md").read_text()
+    heading = "| relative difference of the ranking metric | models |"
+    rows = table_like(tables_in(text), heading)
+    assert [int(cells_of(row)[1]) for row in rows[1:]] == counts
+    assert f"Together they have {sum(counts)} pairs of an entry and a model" in text
 
 
 def test_the_table_of_gates_has_what_gates_json_records() -> None:

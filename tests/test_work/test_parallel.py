@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pool_tasks
 import pytest
 from cluster_bench import local_cluster, scheduler_process
 from parallel_jobs import (
@@ -186,3 +187,14 @@ def test_an_error_of_a_job_is_not_a_lost_cluster(cluster: Any) -> None:
     """The time-out of a job itself arrives as it is."""
     with pytest.raises(WorkFailedError):
         run.run_all(time_out, {"job 0": 0}, scheduler=cluster.scheduler_address)
+
+
+@pytest.mark.slow
+def test_an_error_of_the_system_is_explained_on_a_cluster_too(cluster: Any) -> None:
+    jobs = {"job 0": Path("a file")}
+    with pytest.raises(WorkFailedError) as caught:
+        run.run_all(
+            pool_tasks.lack_permission, jobs, scheduler=cluster.scheduler_address
+        )
+    assert caught.value.what == "no permission"
+    assert caught.value.where == "a file"

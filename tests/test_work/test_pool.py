@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import functools
 import os
 import signal
@@ -194,16 +193,13 @@ def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> Non
     assert "ZeroDivisionError" in str(error.got)
 
 
-def test_errors_of_the_system_stay_what_they_are(tmp_path: Path) -> None:
+def test_an_error_of_the_system_is_explained_as_elsewhere() -> None:
     """A missing permission is no fault of lagbench, wherever it is missing."""
-    path = tmp_path / "file"
-    task = WorkItem(name="a", function=pool_tasks.lack_permission, arguments=(path,))
-    with Pool(1) as pool:
-        pool.submit(task)
-        with pytest.raises(PermissionError) as caught:
-            list(pool.events())
-    assert caught.value.filename == str(path)
-    assert caught.value.errno == errno.EACCES
+    task = functools.partial(pool_tasks.lack_permission, Path("a file"))
+    error = failure("a", task)
+    assert error.what == "no permission"
+    assert error.where == "a file"
+    assert error.exit_code == 5
 
 
 def test_errors_of_the_system_that_nobody_explains_bring_their_traceback(
