@@ -305,8 +305,8 @@ def compare(
 
     Raises:
         UsageError: an unknown metric, reference, entry or split, no leaderboard where
-            one is named, or the two belong to different splits or sizes, or
-            share a file.
+            one is named, or the two belong to different splits or sizes, or share a
+            file.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
