@@ -138,7 +138,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "entry names; two active entries with the same weights, size and options of "
         "the prediction; options of a prediction that the model does not have; "
         "shared weights that differ from those of the entry in `shared_with`; more "
-        "than 60 MB of weights, or a file of more than 40 MB; a training log that "
+        "than 100 MB of weights, or a file of more than 40 MB; a training log that "
         "is too long or broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",

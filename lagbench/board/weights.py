@@ -49,7 +49,7 @@ from .sharing import (
 if TYPE_CHECKING:
     from lagbench.baselines.weights_file import WeightsFile
 
-MOST_BYTES = 60_000_000
+MOST_BYTES = 100_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
 good.
 """

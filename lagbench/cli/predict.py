@@ -49,8 +49,8 @@ PredictedSplitOption = Annotated[
     str | None,
     option(
         "--split NAME",
-        "Split to predict: the folder of a local split; or a name, for an ONNX file, "
-        "which does not state its split.",
+        "Split to predict: the folder of a local split; or a name, for an ONNX file "
+        "that does not state its split.",
     ),
 ]
 PredictedSizeOption = Annotated[
@@ -223,17 +223,9 @@ def _predict_onnx(
     time_solver: _SolverClock | None,
     quiet: bool,
 ) -> OnnxPredictionResult:
-    """Predict with an ONNX file, which does not state its split."""
+    """Predict with an ONNX file."""
     from lagbench.models.predict_onnx import predict_onnx
 
-    if split is None:
-        raise UsageError(
-            "an ONNX file does not state its split",
-            where="--split",
-            expected="the split that the model predicts",
-            got="nothing",
-            fix="name it: --split cavity --size mini",
-        )
     with progress_bar(quiet=quiet) as progress:
         return predict_onnx(
             model,

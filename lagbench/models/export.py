@@ -15,12 +15,12 @@ from torch.onnx import symbolic_helper
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import write_atomically
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, check_installed
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
-from .onnx_checks import LEAST_OPSET, OUTPUT
+from .onnx_checks import LEAST_OPSET, OUTPUT, SIZE_KEY, SPLIT_KEY
 from .onnx_model import check_onnx
 from .onnx_rollout import open_session
 
@@ -57,7 +57,7 @@ def export_onnx(
     """Write a model that `lagbench.torch.predict` could roll out as an ONNX file.
 
     The model is traced once on the given frames of a test scenario, so it must do the
-    same operations for every scenario.
+    same operations for every scenario. The metadata of the file state split and size.
 
     Args:
         step: the model.
@@ -117,6 +117,7 @@ def export_onnx(
     temporary = target.with_name(f".{target.stem}.exporting.onnx")
     try:
         _write(wrapped, inputs, temporary)
+        _state_data_set(temporary, data.size)
         check_onnx(temporary)
         _require_same(wrapped, inputs, temporary)
         write_atomically(target, temporary.read_bytes(), option="path")
@@ -159,6 +160,16 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
                 got=f"{type(error).__name__}: {reason}",
                 fix="name its networks: modules=[net]; use operations that ONNX has",
             ) from error
+
+
+def _state_data_set(path: Path, size: Size) -> None:
+    """Write the names of split and size into the metadata of an ONNX file."""
+    import onnx
+
+    model = onnx.load(path, load_external_data=False)
+    names = {SPLIT_KEY: size.split, SIZE_KEY: size.name}
+    onnx.helper.set_model_props(model, names)
+    onnx.save(model, path)
 
 
 @contextmanager

@@ -62,6 +62,13 @@ REQUIRED = "position"
 OUTPUT = "next_position"
 OUTPUT_TYPES = ("float32", "float64")
 
+SPLIT_KEY = "lagbench_split"
+SIZE_KEY = "lagbench_size"
+"""Keys of the metadata that state the data set of a model."""
+
+MOST_NAME = 64
+"""Longest name of a split or size; of a longer one only the beginning is returned."""
+
 TYPE_NAMES = {1: "float32", 7: "int64", 9: "bool", 11: "float64"}
 """Element types of the signature by their number in ONNX."""
 
@@ -77,7 +84,8 @@ def examine(path: str) -> dict[str, Any]:
 
     Returns:
         ``refused`` with the reason; else ``inputs`` (element type by name), ``output``
-        (its element type) and ``parameters`` (numbers in the initialisers).
+        (its element type), ``parameters`` (numbers in the initialisers), ``split`` and
+        ``size`` (the data set that the metadata state, unchecked, or None).
     """
     import onnx
 
@@ -93,6 +101,8 @@ def examine(path: str) -> dict[str, Any]:
         parameters = _check_graph(model.graph)
         inputs = _check_inputs(model.graph)
         output = _check_output(model.graph)
+        split = _stated_name(model, SPLIT_KEY)
+        size = _stated_name(model, SIZE_KEY)
     except RefusedError as error:
         return {"refused": str(error)[:300]}
     return {
@@ -100,7 +110,17 @@ def examine(path: str) -> dict[str, Any]:
         "inputs": inputs,
         "output": output,
         "parameters": parameters,
+        "split": split,
+        "size": size,
     }
+
+
+def _stated_name(model: Any, key: str) -> str | None:  # noqa: ANN401
+    """Return the name that the metadata of a model have under a key, or None."""
+    for entry in model.metadata_props:
+        if entry.key == key:
+            return str(entry.value[: MOST_NAME + 1])
+    return None
 
 
 def _check_versions(model: Any) -> None:  # noqa: ANN401

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.local import is_split_name
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import (
@@ -181,6 +182,7 @@ def open_onnx(
     root: Path,
     memory: int = MEMORY,
     seconds_per_call: float = SECONDS_PER_CALL,
+    declared: DeclaredModel | None = None,
 ) -> OnnxModel:
     """Check an ONNX file and return its model; nothing in it is run yet.
 
@@ -190,13 +192,15 @@ def open_onnx(
         root: folder of all data sets.
         memory: address space of a rollout [bytes].
         seconds_per_call: processor time of loading the model, and of each call [s].
+        declared: what :func:`check_onnx` returned for the file; it is called when None.
 
     Raises:
         UsageError: onnx or onnxruntime is not installed.
         UnreadableFileError: the file is no ONNX, or holds what is not allowed.
         WorkFailedError: the machine is too busy.
     """
-    declared = check_onnx(path)
+    if declared is None:
+        declared = check_onnx(path)
     return OnnxModel(
         path=path,
         size=size,
@@ -214,6 +218,8 @@ class DeclaredModel:
 
     inputs: tuple[str, ...]  # names of its inputs
     parameters: int  # numbers in its initialisers
+    split: str | None  # split that its metadata state
+    size: str | None  # size that its metadata state
 
 
 def check_onnx(path: Path) -> DeclaredModel:
@@ -248,6 +254,18 @@ def check_onnx(path: Path) -> DeclaredModel:
             got=reason,
             fix="export the model anew without that",
         )
+    for name in (declared["split"], declared["size"]):
+        if name is not None and not is_split_name(name):
+            raise UnreadableFileError(
+                "the metadata name no data set",
+                where=str(path),
+                expected="names of a split and a size, such as cavity and mini",
+                got=ascii(name),
+                fix="write the file with export_onnx, or without these metadata",
+            )
     return DeclaredModel(
-        inputs=tuple(declared["inputs"]), parameters=int(declared["parameters"])
+        inputs=tuple(declared["inputs"]),
+        parameters=int(declared["parameters"]),
+        split=declared["split"],
+        size=declared["size"],
     )

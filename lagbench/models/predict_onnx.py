@@ -8,12 +8,13 @@ from pathlib import Path
 
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress
 
-from .onnx_model import LEAST_SECONDS, open_onnx
+from .onnx_model import LEAST_SECONDS, DeclaredModel, check_onnx, open_onnx
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ def predict_onnx(
     output: str | Path = "predictions.nc",
     *,
     overwrite: bool = False,
-    split: str,
+    split: str | None = None,
     size: str | None = None,
     subset: str = "test",
     method: str | None = None,
@@ -53,8 +54,10 @@ def predict_onnx(
         output: the predictions.nc to write.
         overwrite: whether to replace predictions of that name; files of another kind,
             such as the model, are never replaced.
-        split: name of the split, or the folder of a local one.
-        size: name of the size; the only one that is there when None.
+        split: name of the split, or the folder of a local one; the split that the file
+            states when None.
+        size: name of the size. When None, the size that the file states for this split;
+            if it states none, the only size that is there.
         subset: the subset to predict: test, or shift, which lies outside train.
         method: name of the method; by default the stem of the file.
         seed: seed of the training.
@@ -66,17 +69,19 @@ def predict_onnx(
         progress: called as the work advances.
 
     Raises:
-        UsageError: no such split, size or subset, there is such a file, or onnx is not
-            installed.
+        UsageError: no such split, size or subset, neither ``split`` nor the file names
+            a split, there is such an output, or onnx is not installed.
         UnreadableFileError: the model is refused, or cannot be run.
         DataError: the subset is missing.
         WorkFailedError: the model needs more time or memory than allowed.
     """
     check_predictions_output(Path(output), overwrite=overwrite)
+    declared = check_onnx(Path(model))
+    split, size = _choose_data_set(split, size, declared, Path(model))
     any_tier, folder, known = locate(split, size, root=root, registry=registry)
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
-    runner = open_onnx(Path(model), size=tier, root=folder)
+    runner = open_onnx(Path(model), size=tier, root=folder, declared=declared)
     label = method or Path(model).stem
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
@@ -117,3 +122,22 @@ def predict_onnx(
         parameters=runner.parameters,
         solver_seconds_per_frame=solver_seconds,
     )
+
+
+def _choose_data_set(
+    split: str | None, size: str | None, declared: DeclaredModel, model: Path
+) -> tuple[str, str | None]:
+    """Return the split and size to predict: the named ones, or else the stated ones."""
+    if split is None:
+        split = declared.split
+    if split is None:
+        raise UsageError(
+            "the ONNX file does not state its split",
+            where=f"{model}, --split",
+            expected="the split that the model predicts",
+            got="nothing",
+            fix="name it: --split cavity --size mini",
+        )
+    if size is None and split == declared.split:
+        size = declared.size
+    return split, size

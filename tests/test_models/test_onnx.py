@@ -11,6 +11,8 @@ from typing import Any
 
 import h5py
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
 import torch
 from hostile_onnx import (
@@ -281,6 +283,54 @@ def test_an_exported_step_sees_the_viscosity(
     scenario, expected = first_prediction(step, generated.root)
     position = model.predict(SIZE.path(generated.root, scenario))
     assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_an_exported_file_states_its_data_set(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """So `predict` needs no --split; onnxruntime reads the same metadata."""
+
+    def step(window: Batch) -> torch.Tensor:
+        return window.position[:, -1]
+
+    path = export_onnx(
+        step,
+        tmp_path / "still.onnx",
+        split=SIZE.split,
+        size=SIZE.name,
+        history=2,
+        root=generated.root,
+    )
+    metadata = onnxruntime.InferenceSession(path).get_modelmeta().custom_metadata_map
+    assert metadata == {"lagbench_split": SIZE.split, "lagbench_size": SIZE.name}
+
+    predictions = tmp_path / "predictions.nc"
+    words = ["predict", str(path), "--root", str(generated.root), "--no-bench"]
+    result = CliRunner().invoke(app, [*words, "-o", str(predictions)])
+    assert result.exit_code == 0, result.output
+    with h5py.File(predictions) as file:
+        assert file.attrs["split"] == SIZE.split.encode()
+        assert file.attrs["size"] == SIZE.name.encode()
+
+
+@pytest.mark.parametrize("name", ["../cavity", "/tmp", "", "a" * 1000, "c\x1b[2J"])
+def test_a_stated_data_set_is_a_name(name: str, tmp_path: Path) -> None:
+    """The metadata of a stranger's file cannot lead to another folder."""
+    path = straight_on(tmp_path / "lines.onnx")
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"lagbench_split": name})
+    onnx.save(model, path)
+    with pytest.raises(UnreadableFileError) as caught:
+        check_onnx(path)
+    assert "\x1b" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_an_onnx_model_without_a_stated_split_needs_the_option(tmp_path: Path) -> None:
+    path = straight_on(tmp_path / "lines.onnx")
+    with pytest.raises(UsageError) as caught:
+        predict_onnx(path, tmp_path / "predictions.nc")
+    assert "--split" in str(caught.value.fix)
 
 
 def test_the_error_names_the_inputs_of_an_onnx_model(
