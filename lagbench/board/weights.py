@@ -78,13 +78,22 @@ def require_weights(
         place: split, size and method of the entry.
 
     Raises:
-        UsageError: the weights are too large; they did not make the predictions, or
-            the predictions do not say so; another entry has the weights and predicts
-            with them in the same way; or torch is not installed.
+        UsageError: the weights are too large, or more files than predictions; they did
+            not make the predictions, or the predictions do not say so; another entry
+            has the weights and predicts with them in the same way; or torch is not
+            installed.
         UnreadableFileError: a file is no file of weights.
     """
     paths = [Path(path) for path in weights]
     _require_small(paths)
+    if len(paths) > len(headers):
+        raise UsageError(
+            "more files of weights than predictions",
+            where="--weights",
+            expected=f"at most {len(headers)}, one for each prediction",
+            got=str(len(paths)),
+            fix="give the files of the models that made these predictions",
+        )
 
     seeds = [header.seed or 0 for header in headers]
     owners = _owners_of_weights(rivals)
@@ -93,7 +102,7 @@ def require_weights(
     for path in paths:
         keeper = find_keeper(folder, place, path)
         if path.suffix == ".onnx":
-            index = chosen.index(None) if None in chosen else 0
+            index = chosen.index(None)
             _require_onnx(path, headers[index], uses, keeper)
             chosen[index] = path
             continue

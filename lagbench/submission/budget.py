@@ -103,7 +103,9 @@ def track_of(size: str, budget: Budget) -> Track | None:
 def is_equal_compute(size: str, budget: Budget) -> bool:
     """Return whether the processor time is within that of equal compute."""
     allowed_minutes = EQUAL_MINUTES.get(size)
-    if allowed_minutes is None or budget.cpu_hours is None or budget.gpu_hours:
+    if allowed_minutes is None or budget.cpu_hours is None:
+        return False
+    if budget.gpu_hours != 0.0:  # a GPU was used, or nothing is stated
         return False
     minutes = 60.0 * budget.cpu_hours
     return minutes <= allowed_minutes * (1.0 + TOLERANCE)
@@ -112,7 +114,8 @@ def is_equal_compute(size: str, budget: Budget) -> bool:
 def is_converged(budget: Budget) -> bool:
     """Return whether the last doubling of the steps brought next to nothing."""
     start_steps = budget.start_steps or 0
-    if budget.epochs is not None and budget.epochs < 1.0 and not start_steps:
+    is_epoch_known = budget.epochs is not None and budget.epochs >= 1.0
+    if not is_epoch_known and not start_steps:
         return False
     if budget.best is None:
         return False

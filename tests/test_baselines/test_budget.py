@@ -69,12 +69,27 @@ def test_the_track_is_converged_when_the_last_doubling_gains_little(
     best = min((value for _, value in validations), default=None)
     long = Budget(
         steps=1000,
+        epochs=1.0,
         cpu_hours=5.0,
         gpu_hours=0.0,
         best=best,
         validations=validations,
     )
     assert track_of("mini", long) == track
+
+
+def test_what_is_not_stated_gives_no_track() -> None:
+    """Neither the use of a GPU nor the windows seen are assumed."""
+    assert track_of("mini", Budget(cpu_hours=0.1, gpu_hours=0.0)) == "equal compute"
+    assert track_of("mini", Budget(cpu_hours=0.1, device="NVIDIA H100")) is None
+    settled = Budget(
+        steps=1000,
+        epochs=1.0,
+        best=1.0,
+        validations=((500, 1.0), (1000, 1.0)),
+    )
+    assert track_of("mini", settled) == "converged"
+    assert track_of("mini", settled.model_copy(update={"epochs": None})) is None
 
 
 VALIDATIONS = [[i, 1.0] for i in range(MOST_VALIDATIONS + 1)]

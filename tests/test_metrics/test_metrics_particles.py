@@ -543,3 +543,18 @@ def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert near == pytest.approx(0.02, rel=1e-3)
     far = sinkhorn_divergence(x, x + 0.2)
     assert far == pytest.approx(0.08, rel=1e-3)
+    outside = sinkhorn_divergence(x, x + [9.0, 0.0])
+    assert outside == pytest.approx(81.0, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_sinkhorn_sees_a_particle_far_outside() -> None:
+    """One of n particles that lies d away costs about d^2 / n; NaN is no distance."""
+    pytest.importorskip("ot")
+    x = cloud(0)
+    stray = x.copy()
+    stray[0, 0] += 12.0
+    cost = sinkhorn_divergence(x, stray)
+    assert cost == pytest.approx(12.0**2 / len(x), rel=0.1)
+    stray[0, 0] = np.nan
+    assert math.isnan(sinkhorn_divergence(x, stray))

@@ -544,6 +544,8 @@ def test_an_entry_carries_an_onnx_model(
     }
     other = tmp_path / "other.onnx"
     straight_on(other)
+    with pytest.raises(UsageError):  # one of the two did not make the predictions
+        submit([predictions], meta, weights=[path, other], **options)
     hostile = pickle_as_onnx(other)
     with pytest.raises(UnreadableFileError):
         submit([predictions], meta, weights=[hostile], **options)
