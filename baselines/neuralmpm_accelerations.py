@@ -179,7 +179,6 @@ class StressAccelerations(Accelerations):
     def _wall_nearness(self) -> Tensor:
         """Return 1 at walls, falling to 0 at their reach, shape [x node, y node]."""
         reach = WALL_REACH * self.grid.spacing
-        distance = self.grid.wall_distance(reach)
-        nearest_distance = distance.amin(dim=0)
-        nearness = 1.0 - nearest_distance
+        relative_distance = self.grid.wall_distance(reach)
+        nearness = 1.0 - relative_distance.amin(dim=0)
         return nearness.clamp(0.0, 1.0)

@@ -317,10 +317,11 @@ class ParticleGrid(nn.Module):
         return place - position[:, None]
 
     def wall_distance(self, reach: float) -> Tensor:
-        """Return the nodes' distances to the walls, shape [wall, x node, y node].
+        """Return the nodes' distances to the walls over the reach [1], clipped to
+        [-1, 1].
 
         They are those of :func:`~lagbench.baselines.graph.wall_distance`. Periodic axes
-        have no walls.
+        have no walls. The shape is [wall, x node, y node].
         """
         coordinates = torch.meshgrid(*self.axes, indexing="ij")
         node = torch.stack(coordinates, dim=-1)

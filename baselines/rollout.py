@@ -1,17 +1,17 @@
 """Rollouts: a model fed with its own predictions, and their validation.
 
-A rollout is frozen where it ceases to be finite or leaves the box for far. One function
-serves predictions and validations. A validation rolls out every scenario of ``valid``
-and takes the metric that ranks. Files, metric and rounding are the scorer's: were
-``valid`` the test subset, the scores would have the same digits. A validation never
-reads ``test``. Scenarios are batches of whole scenarios; training windows are those of
-`lagbench.torch`.
+A rollout is frozen where it ceases to be finite or goes far outside the box. One
+function serves predictions and validations. A validation rolls out every scenario of
+``valid`` and takes the metric that ranks. Files, metric and rounding are the scorer's:
+were ``valid`` the test subset, the scores would have the same digits. A validation
+never reads ``test``. Scenarios are batches of whole scenarios; training windows are
+those of `lagbench.torch`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,9 +55,9 @@ class Rollout:
 def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     """Predict frames after the given ones, for every window.
 
-    A window that ceases to be finite is frozen at its last finite frame (the last given
-    one if need be). Where that happens beside other windows, all are predicted again
-    one by one, so that no window can disturb another.
+    A window that ceases to be finite or goes far outside the box is frozen at its last
+    frame before (the last given one if need be). Where that happens beside other
+    windows, all are predicted again one by one, so that no window can disturb another.
     """
     was_training = model.training
     model.eval()
@@ -329,7 +329,7 @@ class Validation:
 
     def _roll_out(
         self, model: Baseline, scenarios: Sequence[int], device: torch.device
-    ) -> Iterable[Rollout]:
+    ) -> list[Rollout]:
         """Return rollouts of scenarios side by side."""
         paths = [self.task.truth.path(scenario) for scenario in scenarios]
         input_frames = slice(0, self.task.config.input_frames)

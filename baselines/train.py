@@ -250,11 +250,13 @@ def _show_forcing(model: Baseline, unseen: Sequence[str]) -> str:
     """Return which option or model shows what drives the flow."""
     known_options = type(model.options).model_fields
     if all(name in known_options for name in unseen):
-        settings = [f"--set model.{name}=true" for name in unseen]
-        return f"to show it to the model, add {' '.join(settings)}"
+        options = " ".join(f"--set model.{name}=true" for name in unseen)
+        return f"to show it to the model, add {options}"
+    settings = " and ".join(f"model.{name}=true" for name in unseen)
+    networks = f"graph networks, MLP and LSTM see it with {settings}"
     if "body_force" in unseen:
-        return "graph networks and NeuralMPM with model.body_force=true see it"
-    return "graph networks with model.obstacle=true and NeuralMPM see it"
+        return f"{networks}, and NeuralMPM with model.body_force=true"
+    return f"{networks}, and NeuralMPM without an option"
 
 
 def _open_folder(

@@ -726,23 +726,23 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
 
     In three dimensions there are two of them: the others did not help in the plane.
     """
-    own = Predictors(library)
+    predictors = Predictors(library)
     barycentre = _barycentre(library)
     if library.size.box.dimension == 3:
-        return (_shipped_predictor(own), barycentre)
+        return (_shipped_predictor(predictors), barycentre)
     return (
-        *_variants_of_ballistic_analog(own),
-        *_attempts_with_other_analogs(own),
+        *_variants_of_ballistic_analog(predictors),
+        *_attempts_with_other_analogs(predictors),
         barycentre,
-        *_attempts_that_come_to_rest(own),
+        *_attempts_that_come_to_rest(predictors),
     )
 
 
-def _shipped_predictor(own: Predictors) -> Attempt:
+def _shipped_predictor(predictors: Predictors) -> Attempt:
     return Attempt(
         name="shipped",
         what="ballistic-analog as shipped, every fourth state",
-        predict=own.shared,
+        predict=predictors.shared,
         choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
     )
 
@@ -752,11 +752,11 @@ def _barycentre(library: Library) -> Attempt:
 
     That takes long, so fewer particles are matched together than in other attempts.
     """
-    own = Predictors(library, most_together=MATCHED_TOGETHER)
+    predictors = Predictors(library, most_together=MATCHED_TOGETHER)
     return Attempt(
         name="barycentre",
         what="Wasserstein mean of k analogs, matched again at each measured frame",
-        predict=own.barycentre,
+        predict=predictors.barycentre,
         choices=grid(
             lag=(0, 10),
             analogs=(2, 3, 5),
@@ -765,14 +765,14 @@ def _barycentre(library: Library) -> Attempt:
     )
 
 
-def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
+def _variants_of_ballistic_analog(predictors: Predictors) -> tuple[Attempt, ...]:
     """Return ballistic-analog as it is shipped, and with other settings."""
     return (
-        _shipped_predictor(own),
+        _shipped_predictor(predictors),
         Attempt(
             name="offset",
             what="the same, with other factors for the offset from the partner",
-            predict=own.shared,
+            predict=predictors.shared,
             choices=grid(
                 lag=(0, 10),
                 analogs=(1, 2),
@@ -782,7 +782,7 @@ def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
         Attempt(
             name="velocities",
             what="the same, with other weights of the velocities in the comparison",
-            predict=own.shared,
+            predict=predictors.shared,
             choices=grid(
                 lag=(0, 10),
                 analogs=(1, 2),
@@ -792,13 +792,13 @@ def _variants_of_ballistic_analog(own: Predictors) -> tuple[Attempt, ...]:
     )
 
 
-def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
+def _attempts_with_other_analogs(predictors: Predictors) -> tuple[Attempt, ...]:
     """Return attempts that choose or mix analogs in another way."""
     return (
         Attempt(
             name="weighted",
             what="mixture of k analogs; a nearer analog gets more particles",
-            predict=own.weighted,
+            predict=predictors.weighted,
             choices=grid(
                 lag=(0, 10),
                 analogs=(2, 4, 8),
@@ -808,19 +808,19 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
         Attempt(
             name="per-material",
             what="separate analogs for each material",
-            predict=own.per_material,
+            predict=predictors.per_material,
             choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
         ),
         Attempt(
             name="windows",
             what="a new analog for each window of frames, found from the prediction",
-            predict=own.windows,
+            predict=predictors.windows,
             choices=grid(lag=(0, 10), window=(20, 40, 80)),
         ),
         Attempt(
             name="from-the-start",
             what="mixture of the k scenarios with the most similar start",
-            predict=own.from_the_start,
+            predict=predictors.from_the_start,
             choices=grid(
                 analogs=(1, 2, 4, 8),
                 velocity_weight=(0.0, 20.0, 60.0),
@@ -829,19 +829,19 @@ def _attempts_with_other_analogs(own: Predictors) -> tuple[Attempt, ...]:
     )
 
 
-def _attempts_that_come_to_rest(own: Predictors) -> tuple[Attempt, ...]:
+def _attempts_that_come_to_rest(predictors: Predictors) -> tuple[Attempt, ...]:
     """Return attempts with friction, or drawn towards a cloud at rest."""
     return (
         Attempt(
             name="damped",
             what="free flight with bounces and friction",
-            predict=own.damped,
+            predict=predictors.damped,
             choices=grid(bounce=(0.0, 0.3, 0.6), friction=(0.0, 0.02, 0.1)),
         ),
         Attempt(
             name="pool",
             what="ballistic-analog, drawn towards a flat pool on the floor",
-            predict=own.to_the_pool,
+            predict=predictors.to_the_pool,
             choices=grid(
                 lag=(0, 10),
                 analogs=(2,),
@@ -852,7 +852,7 @@ def _attempts_that_come_to_rest(own: Predictors) -> tuple[Attempt, ...]:
         Attempt(
             name="with-climatology",
             what="ballistic-analog, drawn towards the mean cloud of train",
-            predict=own.with_climatology,
+            predict=predictors.with_climatology,
             choices=grid(
                 lag=(0, 10),
                 analogs=(2,),

@@ -160,17 +160,14 @@ def measure(row: ThesisRow, *, device: Device, repeats: int) -> TimedRow:
     )
 
 
-def exponents(
-    sizes: Sequence[ThesisRow],
-    substep_ms: Sequence[float],
-    frame_ms: Sequence[float],
+def _fit_exponents(
+    rows: Sequence[ThesisRow], times: Sequence[ThesisRow | TimedRow]
 ) -> Exponents:
-    """Fit straight lines to the logarithms (Eq. 3.1)."""
-    squares = []
-    particles = []
-    for row in sizes:
-        squares.append(row.q**2)
-        particles.append(row.particles)
+    """Fit straight lines to the logarithms of sizes and times of rows (Eq. 3.1)."""
+    squares = [row.q**2 for row in rows]
+    particles = [row.particles for row in rows]
+    substep_ms = [timed.substep_ms for timed in times]
+    frame_ms = [timed.frame_ms for timed in times]
     return Exponents(
         frame_q2=_slope(squares, frame_ms),
         frame_particles=_slope(particles, frame_ms),
@@ -185,26 +182,15 @@ def _slope(x: Sequence[float], y: Sequence[float]) -> float:
     return float(slope)
 
 
-def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
-    """Return the exponents of the thesis's own times."""
-    substep_ms = []
-    frame_ms = []
-    for row in rows:
-        substep_ms.append(row.substep_ms)
-        frame_ms.append(row.frame_ms)
-    return exponents(rows, substep_ms, frame_ms)
+def exponents_of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
+    """Return the exponents of the thesis's times."""
+    return _fit_exponents(rows, rows)
 
 
-def of_measured(measurements: Sequence[TimedRow]) -> Exponents:
-    """Return how our times grow with particles: a power law, fitted in logarithms."""
-    rows = []
-    substep_ms = []
-    frame_ms = []
-    for measurement in measurements:
-        rows.append(measurement.row)
-        substep_ms.append(measurement.substep_ms)
-        frame_ms.append(measurement.frame_ms)
-    return exponents(rows, substep_ms, frame_ms)
+def exponents_of_measurements(measurements: Sequence[TimedRow]) -> Exponents:
+    """Return the exponents of our times."""
+    rows = [measurement.row for measurement in measurements]
+    return _fit_exponents(rows, measurements)
 
 
 def describe(device: str, machine: str) -> list[str]:
@@ -258,8 +244,12 @@ def markdown(
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
     ]
-    same_rows = of_thesis([measurement.row for measurement in measurements])
-    columns = (of_measured(measurements), same_rows, of_thesis())
+    rows = [measurement.row for measurement in measurements]
+    columns = (
+        exponents_of_measurements(measurements),
+        exponents_of_thesis(rows),
+        exponents_of_thesis(),
+    )
     for name, words in (
         ("frame_q2", "t/frame against q^2"),
         ("frame_particles", "t/frame against particles"),

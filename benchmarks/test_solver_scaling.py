@@ -70,7 +70,8 @@ def test_exponents(timed_rows: list[table_3_1.TimedRow], tmp_path: Path) -> None
     figure = tmp_path / "figure_3_1.png"
     table_3_1.draw(timed_rows, DEVICE.value, figure)
     print(f"Fig. 3.1: {figure}")
-    exponent = table_3_1.of_measured(timed_rows).substep_particles
+    exponents = table_3_1.exponents_of_measurements(timed_rows)
+    exponent = exponents.substep_particles
     print(f"exponent of a substep: {exponent:.2f} (goal {GOAL}, limit {MOST_EXPONENT})")
     assert exponent <= MOST_EXPONENT
 
@@ -79,7 +80,7 @@ def test_the_thesis_exponents_follow_from_its_table() -> None:
     """Its text gives 1.41 for t/frame against q^2; against particles 1.35, per substep
     0.83.
     """
-    thesis = table_3_1.of_thesis()
+    thesis = table_3_1.exponents_of_thesis()
     assert thesis.frame_q2 == pytest.approx(1.41, abs=0.01)
     assert thesis.frame_particles == pytest.approx(1.35, abs=0.01)
     assert thesis.substep_particles == pytest.approx(0.83, abs=0.01)

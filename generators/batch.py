@@ -109,17 +109,17 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
     """
     rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     module = split_module(size)
-    place = f"{size.split} {size.name}, scenario {scenario}"
     with blamed_on_parameters(size, f"drawing scenario {scenario}"):
         try:
             state: object = module.initial_state(size, scenario, rng)
         except WorkFailedError as error:
             line = find_place_in_extension(error, size.generator)
             if line is None:
+                place = f"{place_of(size)}, scenario {scenario}"
                 raise _relocate(error, place) from error
             raise WorkFailedError(
                 error.what,
-                where=f"{place}, {line}",
+                where=f"{size.split} {size.name}, scenario {scenario}, {line}",
                 expected=error.expected,
                 got=error.got,
                 fix="mend this line of the module, or the parameters that it uses: "

@@ -111,10 +111,10 @@ def quantise(values: ArrayLike) -> Array:
     if not np.all(magnitude < _LARGEST):
         raise WorkFailedError(
             "a drawn value has no exact float32 form",
-            where="datasets.yaml",
+            where="a draw",
             expected=f"finite, magnitude below {_LARGEST}",
             got=float(np.max(magnitude)),
-            fix="check the ranges and scales of this split in datasets.yaml",
+            fix="check the ranges and scales in the file of the split",
         )
     rounded = np.rint(exact / QUANTUM) * QUANTUM
     # rint keeps the sign of -0.0, the addition of zero does not
@@ -158,10 +158,10 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
     if not 0.0 < low <= high:
         raise WorkFailedError(
             "a log-uniform range is empty",
-            where="datasets.yaml",
+            where="a draw",
             expected="0 < low <= high",
             got=(low, high),
-            fix="check the ranges of this split in datasets.yaml",
+            fix="check the ranges in the file of the split",
         )
     ratio = _PRECISE.divide(Decimal(high), Decimal(low))
     span = _PRECISE.ln(ratio)

@@ -191,7 +191,9 @@ def _liquid_at(
     velocity: Array,
     mean_velocity: tuple[float, float],
 ) -> InitialState:
-    """Return the initial state of one body of liquid, and what its file states."""
+    """Return the initial state of one body of liquid, with the parameters that its file
+    states.
+    """
     return InitialState(
         position=position,
         velocity=velocity,

@@ -164,21 +164,21 @@ class FreeSurfaceKernels:
         A node next to a wall counts its image, which no particle need touch.
         """
         first = ti.Vector([self.high] * self.dimension)
-        last = ti.Vector([0] * self.dimension)
+        end = ti.Vector([0] * self.dimension)
         for p in range(particles):
             x = self.x[0, p]
             for axis in ti.static(range(self.dimension)):
                 scaled = x[axis] * self.inv_dx
                 base = ti.cast(scaled - 0.5, i32)
-                end = base + 3
+                particle_end = base + 3
                 first[axis] = ti.min(first[axis], base)
-                last[axis] = ti.max(last[axis], end)
+                end[axis] = ti.max(end[axis], particle_end)
         for axis in ti.static(range(self.dimension)):
             if first[axis] <= self.low + 1:
                 first[axis] = self.low - 1
-            if last[axis] >= self.high:
-                last[axis] = self.high + 2
-        return first, last
+            if end[axis] >= self.high:
+                end[axis] = self.high + 2
+        return first, end
 
     @ti.func
     def image(self, index: i32) -> i32:

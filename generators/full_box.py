@@ -213,48 +213,27 @@ class FullBox(Driver[FullBoxParameters]):
             )
 
     def _check_obstacle(self, index: int, state: InitialState) -> None:
-        """Refuse an obstacle of other particles than the solver has room for."""
+        """Refuse an obstacle whose number of particles is not the solver's."""
         count = self.parameters.obstacle_particles
-        got = 0
+        particle_count = 0
         if state.obstacle is not None:
-            got = len(state.obstacle.position)
-        if got != count:
+            self._check_place(index, state.obstacle)
+            particle_count = len(state.obstacle.position)
+        if particle_count != count:
             raise UsageError(
                 "the obstacle does not fit the solver",
                 where=f"scenario {index}, obstacle",
                 expected=f"{count} particles",
-                got=f"{got} particles",
+                got=f"{particle_count} particles",
                 fix="correct what initial_state returns: docs/extending.md",
             )
-        if state.obstacle is not None:
-            self._check_place(index, state.obstacle)
 
     def _check_place(self, index: int, obstacle: Obstacle) -> None:
-        """Refuse an obstacle near a face of the box, or particles outside it.
-
-        Distances to the obstacle are not taken across periodic faces, and its particles
-        index nodes without a check.
-        """
-        box = self.parameters.box
-        gap = LEAST_GAP / self.parameters.grid
-        centre = np.asarray(obstacle.centre)
-        reach = obstacle.radius + gap
-        is_clear_below = centre - reach >= box.low
-        is_clear_above = centre + reach <= box.high
-        is_clear = is_clear_below & is_clear_above
-        position = obstacle.position
-        is_finite = np.isfinite(position)
-        if not is_clear.all():
-            expected = f"a centre {reach:g} or more from all faces of the box"
-            got = f"centre {obstacle.centre}"
-        elif not is_finite.all():
-            expected = "finite positions"
-            got = "NaN or infinity"
-        elif not is_inside(position, obstacle.centre, obstacle.radius).all():
-            expected = f"particles less than {obstacle.radius:g} from the centre"
-            got = "some farther away"
-        else:
+        """Refuse an obstacle that does not fit the box."""
+        misfit = self._find_misfit(obstacle)
+        if misfit is None:
             return
+        expected, got = misfit
         raise UsageError(
             "the obstacle does not fit the box",
             where=f"scenario {index}, obstacle",
@@ -262,6 +241,38 @@ class FullBox(Driver[FullBoxParameters]):
             got=got,
             fix="correct what initial_state returns: docs/extending.md",
         )
+
+    def _find_misfit(self, obstacle: Obstacle) -> tuple[str, str] | None:
+        """Return what is expected of an obstacle and what it has; None where it fits.
+
+        It has the axes of the box and a radius above 0, keeps a gap from all faces of
+        the box, and no particle lies outside its own radius. Distances to the obstacle
+        are not taken across periodic faces, and its particles index nodes without a
+        check.
+        """
+        box = self.parameters.box
+        axes = (self.dimension,)
+        centre = np.asarray(obstacle.centre)
+        position = np.asarray(obstacle.position)
+        if centre.shape != axes or position.shape[1:] != axes:
+            expected = f"centre of {self.dimension} axes, positions [particle, axis]"
+            got = f"centre of shape {centre.shape}, positions of shape {position.shape}"
+            return expected, got
+        if not obstacle.radius > 0.0:
+            return "a radius above 0", f"radius {obstacle.radius:g}"
+        reach = obstacle.radius + LEAST_GAP / self.parameters.grid
+        is_clear_below = centre - reach >= box.low
+        is_clear_above = centre + reach <= box.high
+        is_clear = is_clear_below & is_clear_above
+        if not is_clear.all():
+            expected = f"a centre {reach:g} or more from all faces of the box"
+            return expected, f"centre {obstacle.centre}"
+        if not np.isfinite(position).all():
+            return "finite positions", "NaN or infinity"
+        if not is_inside(position, obstacle.centre, obstacle.radius).all():
+            expected = f"particles less than {obstacle.radius:g} from the centre"
+            return expected, "some farther away"
+        return None
 
     def _check_stream(self, index: int, state: InitialState) -> None:
         """Refuse a stream where no fringe is, a fringe without one, or a fast one."""

@@ -186,7 +186,7 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
         where=f"{size.split} {size.name}",
         expected=f"a gap of {gap} within {_ATTEMPTS} attempts",
         got="bodies that touch or overlap, in every attempt",
-        fix="lower the areas or lengths of this split in datasets.yaml",
+        fix="lower the areas or lengths in the file of the split",
     )
 
 

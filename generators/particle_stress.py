@@ -375,20 +375,20 @@ class ParticleStress(FreeSurfaceKernels):
     def _serial_substeps(self, substeps: i32, solid: Template) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            # Read first, so that the address of the fields stays out of the loops: else
-            # no vectors.
+            # Read here: an address of a field inside the loops would keep them from
+            # being vectorised.
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
-            first, last = self.touched_nodes(self.particles)
-            for i in range(first[0], last[0]):
-                for j in range(first[1], last[1]):
+            first, end = self.touched_nodes(self.particles)
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
                     self.clear(0, i, j)
             for p in range(self.particles):
                 self.prepare(0, p, solid)
             for p in range(self.particles):
                 self.p2g(0, p)
-            for i in range(first[0], last[0]):
-                for j in range(first[1], last[1]):
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
                     self.update(0, i, j, particle_volume, friction)
             for p in range(self.particles):
                 self.g2p(0, p)

@@ -692,15 +692,15 @@ class ParticleStress3D(FreeSurfaceKernels):
         for _ in range(substeps):
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
-            first, last = self.touched_nodes(particles)
-            for i in range(first[0], last[0]):
-                for j in range(first[1], last[1]):
-                    for k in range(first[2], last[2]):
+            first, end = self.touched_nodes(particles)
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
+                    for k in range(first[2], end[2]):
                         node = self.at(i, j, k)
                         self.clear(0, node)
                     # A row has the number of its last node. So the numbers of rows with
                     # a touched node are larger by at most two.
-                    for k in range(first[2], last[2] + 2):
+                    for k in range(first[2], end[2] + 2):
                         node = self.at(i, j, k)
                         self.clear_row(0, node)
             for p in range(particles):
@@ -717,9 +717,9 @@ class ParticleStress3D(FreeSurfaceKernels):
                 self.stress(0, p, solid)
             for p in range(particles):
                 self.p2g(0, p)
-            for i in range(first[0], last[0]):
-                for j in range(first[1], last[1]):
-                    for k in range(first[2], last[2]):
+            for i in range(first[0], end[0]):
+                for j in range(first[1], end[1]):
+                    for k in range(first[2], end[2]):
                         self.update(0, i, j, k, particle_volume, friction)
             for p in range(particles):
                 self.g2p(0, p)

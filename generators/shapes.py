@@ -231,10 +231,10 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
         if room < extent:
             raise WorkFailedError(
                 "a body does not fit between the walls",
-                where="datasets.yaml",
+                where=f"{type(shape).__name__} between {low:.4f} and {high:.4f}",
                 expected=f"extent up to {room:.4f}",
                 got=f"{extent:.4f}",
-                fix="lower the areas or lengths of this split in datasets.yaml",
+                fix="lower the areas or lengths in the file of the split",
             )
         coordinate = uniform(rng, low + reach, high - reach)
         centre.append(coordinate)

@@ -146,19 +146,18 @@ class SoundnessRecorder:
         )
 
     def _count_clamped(self, least: Singles, greatest: Singles) -> int:
+        """Return how many particles reached a numerical bound at any substep."""
         p = self._parameters
-        # Jp at which the hardening factor meets its caps [1]
-        greatest_exponent = math.log(p.snow_hardening_max)
-        least_exponent = math.log(p.snow_hardening_min)
-        stiffest_jp = 1.0 - greatest_exponent / p.snow_hardening
-        softest_jp = 1.0 - least_exponent / p.snow_hardening
-        lowest_jp = max(p.snow_jp_min, stiffest_jp)
+        # Exponents xi (1 - Jp) are compared, because exp may overflow.
+        largest_exponent = p.snow_hardening * (1.0 - least.astype(np.float64))
+        smallest_exponent = p.snow_hardening * (1.0 - greatest.astype(np.float64))
+        is_hard = largest_exponent >= math.log(p.snow_hardening_max)
+        is_soft = smallest_exponent <= math.log(p.snow_hardening_min)
+        is_dense = least <= np.float32(p.snow_jp_min)
+        is_compressed = least <= np.float32(p.jacobian_min)
 
-        is_thin = least <= np.float32(p.jacobian_min)
-        is_hard = least <= np.float32(lowest_jp)
-        is_soft = greatest >= np.float32(softest_jp)
-        is_clamped_liquid = self._is_liquid & is_thin
-        is_clamped_snow = self._is_snow & (is_hard | is_soft)
+        is_clamped_liquid = self._is_liquid & is_compressed
+        is_clamped_snow = self._is_snow & (is_dense | is_hard | is_soft)
         return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
 
 

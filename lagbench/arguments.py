@@ -139,14 +139,14 @@ def check_arguments(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that it refuses arguments of a wrong kind.
 
-    What an argument may be follows from its annotation. Whether a value of the right
-    kind fits, the function checks itself, and so it does with ``*args`` and
-    ``**options``.
+    What an argument may be follows from its annotation, which is read as text: the
+    module needs ``from __future__ import annotations``. Whether a value of the right
+    kind fits, the function checks itself, and so it does with ``**options``.
 
     Raises:
         UsageError: by the decorated function, for an argument of a wrong kind.
         WrongCallError: by the decorated function, for an argument that is missing, has
-            an unknown name, or has none where it needs one.
+            an unknown name, or is given without its name, where it needs one.
     """
     signature = inspect.signature(function)
     kinds: dict[str, tuple[ArgumentKind, ...]] = {}

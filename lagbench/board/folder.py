@@ -23,6 +23,7 @@ from pathlib import Path
 
 from lagbench.errors import UsageError
 from lagbench.scoring.boards import SUBMISSIONS, require_board
+from lagbench.submission.other_files import MODEL_ENDINGS
 
 Place = tuple[str, str, str]  # split, size and method
 
@@ -40,11 +41,6 @@ SHIFT = "shift.yaml"  # scores on the subset shift (lagbench leaderboard shift)
 README = "README.md"
 LOCK = ".lock"  # held while the folder is written
 STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
-
-MODEL_ENDINGS = (".pt", ".safetensors", ".onnx")
-"""Endings of models: weights of `lagbench train` or of a registered architecture, and
-ONNX files.
-"""
 
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
@@ -202,7 +198,7 @@ class Folder:
     def claimed_places(self) -> set[Place]:
         """Return split, size and method of every path that has the name of an entry.
 
-        The path may also be a link, a folder or a file that cannot be read.
+        The path may also be a link, or a file that cannot be read.
         """
         places = set()
         for path in self._files(SUBMISSIONS):
@@ -218,13 +214,9 @@ class Folder:
         known_paths = {Path(name) for name in names} | set(expected_paths)
         known_paths.update(self.season_files())
         for path in self._files(""):
-            if path in known_paths:
-                is_link = path == self.link_in(path)
-                reason = f"{path} is a symbolic link" if is_link else None
-            elif path.parts[0] in ENDINGS:
-                reason = self.reason_unfit(path)
-            else:
-                reason = "nothing here knows it"
+            reason = self._reason_irregular(path)
+            if reason is None and path not in known_paths:
+                reason = self._reason_misnamed(path)
             if reason is not None:
                 yield path, reason
 
@@ -234,16 +226,27 @@ class Folder:
 
     def reason_unfit(self, path: Path) -> str | None:
         """Return why a relative path cannot be an entry or a score file, else None."""
+        return self._reason_irregular(path) or self._reason_misnamed(path)
+
+    def _reason_irregular(self, path: Path) -> str | None:
+        """Return why a relative path is no regular file in the folder, else None."""
         link = self.link_in(path)
         if link is not None:
             return f"{link} is a symbolic link"
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"
+        return None
+
+    def _reason_misnamed(self, path: Path) -> str | None:
+        """Return why a relative path has no name of a submission's file, else None."""
+        top = path.parts[0]
+        if top not in ENDINGS:
+            return "no file of a leaderboard has this name"
         if not all(PART.fullmatch(part) for part in path.parts):
             return "a name with other characters than letters, digits, '-', '_' and '.'"
-        endings = ENDINGS[path.parts[0]]
+        endings = ENDINGS[top]
         if path.suffix not in endings or len(path.parts) != DEPTH:
-            return f"not {path.parts[0]}/<split>/<size>/<name>{' or '.join(endings)}"
+            return f"not {top}/<split>/<size>/<name>{' or '.join(endings)}"
         return None
 
     def link_in(self, path: Path) -> Path | None:

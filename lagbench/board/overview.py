@@ -19,7 +19,9 @@ LEARNS = (Kind.LEARNED, Kind.HYBRID)
 
 
 class LearningVerdict(enum.Enum):
-    """Whether the most accurate model of a data set beats the solvers of its cost."""
+    """Whether the most accurate model of a data set beats the classical solvers that
+    cost no more per frame.
+    """
 
     PAYS = enum.auto()  # the interval of the ratio lies below 1
     OPEN = enum.auto()  # it contains 1, or there is none
@@ -254,7 +256,9 @@ class Conclusion:
 
     @property
     def learned_verdict(self) -> LearningVerdict | None:
-        """Whether the most accurate purely learned model beats solvers of its cost."""
+        """Whether the most accurate purely learned model beats the solvers that cost no
+        more per frame.
+        """
         if self.learned is None:
             return None
         return _verdict_on(self.learned.against_classical)
@@ -293,7 +297,7 @@ def _most_accurate(rows: Sequence[BoardRow], tab: Tab) -> BoardRow:
 
 
 def _verdict_on(ratio: Value | None) -> LearningVerdict:
-    """Return the verdict of a row's ratio to the solvers of its cost."""
+    """Return the verdict of a row's ratio to a solver that costs no more per frame."""
     if ratio is None:
         return LearningVerdict.NO_SOLVER
     return verdict_of_interval(ratio.low, ratio.high)
@@ -450,7 +454,8 @@ def place_among_solvers(
 
 
 def _name_exception(tab: Tab) -> list[str]:
-    """Return the model that beats the solvers of its cost, where another one decides.
+    """Return the model that beats the solvers that cost no more per frame, where
+    another one decides.
 
     Of several the most accurate one.
     """

@@ -769,7 +769,10 @@ def _leader_tiles(
 
     if leader.against_classical is not None and leader.solver is not None:
         ratio = f"{text(leader.against_classical.mean, 2)}×"
-        label = "error of the leader beside the best classical solver of its cost"
+        label = (
+            "error of the leader beside the best classical solver that costs no more "
+            "per frame"
+        )
         yield _tile(label, ratio, leader.solver)
 
 

@@ -64,7 +64,7 @@ FIRST_SCENARIO = 1000
 MOST_SCENARIOS = 200
 """Most blind scenarios of a data set."""
 
-FEWEST_SCENARIOS = 4
+FEWEST_BLIND_SCENARIOS = 4
 """Fewest blind scenarios that a model predicts: a gap over fewer has no interval."""
 
 SCENARIOS = 8
@@ -80,7 +80,7 @@ RECORDED_DIGITS = 16
 Recorded = Mapping[tuple[str, str], Mapping[int, str]]
 """Content hashes of blind scenarios, by split and size, then by id."""
 
-_Count = Annotated[int, Field(ge=FEWEST_SCENARIOS, le=MOST_SCENARIOS)]
+_Count = Annotated[int, Field(ge=FEWEST_BLIND_SCENARIOS, le=MOST_SCENARIOS)]
 
 
 class FrozenModel(Strict):
@@ -417,13 +417,13 @@ def _check_options(
     Raises:
         UsageError: one of them does not fit.
     """
-    if not FEWEST_SCENARIOS <= scenarios <= MOST_SCENARIOS:
+    if not FEWEST_BLIND_SCENARIOS <= scenarios <= MOST_SCENARIOS:
         raise UsageError(
             "this number of blind scenarios is not possible",
             where="--scenarios",
-            expected=f"{FEWEST_SCENARIOS} to {MOST_SCENARIOS}",
+            expected=f"{FEWEST_BLIND_SCENARIOS} to {MOST_SCENARIOS}",
             got=scenarios,
-            fix=f"give a number from {FEWEST_SCENARIOS} on",
+            fix=f"give a number from {FEWEST_BLIND_SCENARIOS} on",
         )
     name_rule = "small letters, digits and single hyphens, as in spring-2027"
     _check_option(Name, name, where="NAME", expected=name_rule)
@@ -519,13 +519,19 @@ def _freeze(
 
 
 def _count_scenarios(
-    entry: Entry, size: Size, scenarios: int, budget: float | None
+    entry: Entry, size: Size, scenario_count: int, seconds_per_model: float | None
 ) -> int:
-    """Return how many blind scenarios the models of an entry predict."""
-    if budget is None or entry.cost is None:
-        return scenarios
-    seconds = entry.cost.seconds_per_frame * size.task.horizon
-    return max(min(scenarios, int(budget / seconds)), FEWEST_SCENARIOS)
+    """Return how many blind scenarios the models of an entry predict.
+
+    As many as the budget of a model [s] allows, FEWEST_BLIND_SCENARIOS at least; all
+    without a budget or a stated cost.
+    """
+    if seconds_per_model is None or entry.cost is None:
+        return scenario_count
+    seconds_per_scenario = entry.cost.seconds_per_frame * size.task.horizon
+    affordable_count = seconds_per_model / seconds_per_scenario  # may be infinite
+    count = int(min(scenario_count, affordable_count))
+    return max(count, FEWEST_BLIND_SCENARIOS)
 
 
 def _frozen_models(folder: Folder, entry: Entry) -> tuple[FrozenModel, ...]:

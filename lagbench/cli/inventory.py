@@ -41,7 +41,7 @@ TEXT_WIDTH = 79  # characters of a line of text
 
 LEGEND = (
     "scenarios: of train/valid/test, then of extra and shift",
-    "particles: of one scenario; frames: of all scenarios",
+    "particles: of the largest scenario; frames: of all scenarios",
     "disk: space that the scenarios need at most",
     "here: whether the scenarios are on this machine, or how many of them are",
 )

@@ -34,10 +34,10 @@ def format_bytes(count: float) -> str:
     '4.7 GB'
     """
     for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000 or unit == "GB":
+        if round(count) < 1000 or unit == "GB":
             break
         count /= 1000
-    if count >= 100 or unit == "B":
+    if round(count, 1) >= 100 or unit == "B":
         return f"{count:.0f} {unit}"
     return f"{count:.1f} {unit}"
 
@@ -191,6 +191,7 @@ def print_table(
     )
     last = len(columns) - 1
     for number, heading in enumerate(columns):
+        # also where all cells are empty, or where there are no rows
         is_numeric = all(row[number][:1] in "0123456789-" for row in cells)
         table.add_column(
             Text(heading),
@@ -209,7 +210,7 @@ def print_table(
     if title:
         # beside the table, not in it: a table wraps its title to its own width
         console.print(Text(title, style="table.title"))
-    console.print(table, "")
+    console.print(table, "")  # and an empty line
 
 
 def _output_width() -> int:

@@ -135,7 +135,7 @@ def close_command(
 
 
 def _refuse_closing_options(options: Mapping[str, object]) -> None:
-    """Refuse options that a season is closed with, where it is closed already.
+    """Refuse options of closing a season beside --value, which is given after it.
 
     Args:
         options: values by option; None where an option was not given.
@@ -151,8 +151,8 @@ def _refuse_closing_options(options: Mapping[str, object]) -> None:
         where="--value",
         expected="the name of the season and --value alone",
         got=f"{', '.join(given)} and --value",
-        fix=f"give {given[0]} as the season is closed, and --value when the value is "
-        "known",
+        fix=f"give {given[0]} when you close the season, and --value alone when the "
+        "value is known",
     )
 
 

@@ -44,6 +44,7 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
     has_mistake = False
     is_setting = False
     for number, word in enumerate(words):
+        following = "".join(words[number + 1 : number + 2])
         if word.startswith("-") and not NEGATIVE_NUMBER.fullmatch(word):
             is_setting = word == "--set"
         elif not is_setting:
@@ -56,7 +57,7 @@ def advise_on_settings(words: Sequence[str]) -> str | None:
         elif "=" not in settings[-1]:
             settings[-1] += f"={word}"
             has_mistake = True
-        elif "=" in word:
+        elif "=" in word or following.startswith("="):
             settings.append(word)
             has_mistake = True
         else:

@@ -32,6 +32,9 @@ AXES = ("x", "y", "z")
 WALL_NAMES = ("left", "right", "bottom", "top", "front", "back")
 """Names of the walls: the lower and the upper one of each axis, axis by axis."""
 
+SMALL_SIDE = 1.0 / 16.0
+"""Longest side below which a box is far smaller than the unit box [length]."""
+
 LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 """Largest coordinate or diameter that an obstacle may have [length]."""
 

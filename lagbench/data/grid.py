@@ -387,7 +387,10 @@ def _part_of_pair(pair: NDArray[np.complex128], row: int) -> Floats:
 
 
 def _fold(padded: Floats, grid: Grid) -> Floats:
-    """Return sums without margins; those of periodic axes belong to the other end."""
+    """Return the sums at the nodes of the grid.
+
+    Margins of periodic axes are added at the other end, those of walls are dropped.
+    """
     for axis, is_periodic in enumerate(grid.box.periodic):
         along = np.moveaxis(padded, axis, 0)
         end = _ROWS_BELOW + grid.shape[axis]

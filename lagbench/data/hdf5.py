@@ -190,7 +190,10 @@ def read_layout(creation_properties: h5py.h5p.PropDCID) -> str:
 
 
 def read_dimensions(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of netCDF's dimension scales, one per dimension."""
+    """Return the names of netCDF's dimension scales, one per dimension.
+
+    A dimension has an empty name without a scale, and with one that is not there.
+    """
     rank: int = dataset.id.rank
     unnamed = ("",) * rank
     if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):

@@ -39,6 +39,7 @@ from .local_split import (
 from .metadata import (
     DROP,
     ENDINGS,
+    FORCE,
     Format,
     SourceMetadata,
     find_materials,
@@ -139,7 +140,8 @@ def adopt(
         subsets[subset] = map(open_row, rows)
     stated_fields: dict[str, Any] = {**options}
     stated_fields.pop("axes", None)
-    if options.get("rescale") and "bounds" not in options:
+    needs_bounds = options.get("rescale") and not options.get("periodic")
+    if needs_bounds and "bounds" not in options:
         stated_fields["bounds"] = find_bounds(map(open_row, chain(*rows_of.values())))
     description = Description(
         name=folder.name,
@@ -271,8 +273,8 @@ def import_split(
     """Make a local split of train, valid and test in another code base's format.
 
     Positions are taken over as they are, as float32; velocities are their differences
-    over the frame interval. No pickle is run. A ``force.py`` beside the data is left
-    alone.
+    over the frame interval. No pickle is run. A ``force.py`` beside the data is not
+    read; a note says so.
 
     Args:
         source: folder of the three files and metadata.json.
@@ -323,9 +325,13 @@ def import_split(
     subsets = {}
     for subset, name in zip(HASHED_SUBSETS, names, strict=True):
         subsets[subset] = read(folder / name, user_kinds)
-    return make_local_split(
+    local_split = make_local_split(
         description, subsets, output, command="import", progress=progress
     )
+    if not (folder / FORCE).is_file():
+        return local_split
+    note = f"{FORCE} is a program and is not read: the split has no body force"
+    return replace(local_split, notes=(*local_split.notes, note))
 
 
 def _file_names(form: Format) -> list[str]:

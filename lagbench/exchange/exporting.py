@@ -31,6 +31,7 @@ from lagbench.work.progress import Meter, Progress
 from . import gns_npz
 from .metadata import (
     ENDINGS,
+    FORCE,
     NAME,
     WALL_NUMBERS,
     ExportInfo,
@@ -42,9 +43,6 @@ from .metadata import (
     write_metadata,
 )
 from .trajectory import Bounds, Run
-
-FORCE = "force.py"
-"""Name of the program beside the data that LagrangeBench would run."""
 
 WALL_LAYERS = 3
 """Layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them."""
@@ -132,7 +130,7 @@ def export(
         next(iter(frames_by_subset["train"])), tier
     )
     if from_walls is None:
-        is_measured_from_walls = has_moving_walls or tier.box.is_periodic
+        is_measured_from_walls = tier.is_full_box
     else:
         is_measured_from_walls = from_walls
     walls = None

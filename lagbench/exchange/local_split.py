@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
-from lagbench.data.box import AXES, Box, unit_box
+from lagbench.data.box import AXES, SMALL_SIDE, Box, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
 from lagbench.data.layout import (
@@ -248,7 +248,7 @@ def _summarise(
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=tuple(_describe_motion(manifest.statistics)),
+        notes=(*_describe_motion(manifest.statistics), *_describe_size(size.bounds)),
     )
 
 
@@ -268,6 +268,16 @@ def _describe_motion(statistics: Mapping[str, Sequence[float]]) -> Iterator[str]
         yield (
             "no particle of train moves from one frame to the next: check the order of "
             "the axes, and that the frames differ"
+        )
+
+
+def _describe_size(bounds: Bounds) -> Iterator[str]:
+    """Yield a note for the user if the box is far smaller than the unit box."""
+    side = max(high - low for low, high in bounds)
+    if side < SMALL_SIDE:
+        yield (
+            f"the longest side of the box is {side:.2g}: score grids and models are "
+            "made for sides near 1. --rescale enlarges the box"
         )
 
 
@@ -847,7 +857,9 @@ class SplitBuilder:
         if description.full_box:
             placement = Placement.CELL_CENTRES
         cells = description.cells
-        if not cells:
+        if cells:
+            self._check_cells(cells)
+        else:
             ends = (description.input_frames, last)
             cells = self._suitable_cells(placement, ends)
         return {
@@ -857,6 +869,19 @@ class SplitBuilder:
             "score_grid": {"cells": cells, "placement": placement.value},
             "radius": description.radius / description.transform.scale,
         }
+
+    def _check_cells(self, cells: int) -> None:
+        """Refuse a stated score grid that does not fit the periods."""
+        if self._box.has_whole_cells(cells):
+            return
+        raise UsageError(
+            "the score grid has no whole cells along the periodic axes",
+            where="--cells",
+            expected="cells that divide each period into three or more of them",
+            got=f"{cells} across a length of 1, in the box "
+            f"{format_bounds(self._box.bounds)}",
+            fix="leave --cells out, and add --rescale if the periods need it",
+        )
 
     def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
         """Return cells across a score grid that suits the spacing.
@@ -876,9 +901,10 @@ class SplitBuilder:
         raise UsageError(
             "no score grid has whole cells along the periodic axes",
             where="--periodic and --bounds",
-            expected="a box whose periods are whole numbers of one cell",
-            got=box.bounds,
-            fix="other bounds, or --cells",
+            expected="periods that are whole numbers of one cell",
+            got=format_bounds(box.bounds),
+            fix="--rescale makes the longest period 1; if that does not help, the "
+            "ratios of the periods need other --bounds",
         )
 
     def _read_clouds(self, frames: tuple[int, int]) -> Iterator[Cloud]:

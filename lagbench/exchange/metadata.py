@@ -46,6 +46,9 @@ from lagbench.errors import (
     suggest_name,
 )
 
+FORCE = "force.py"
+"""Name of the program beside the data that LagrangeBench would run."""
+
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20

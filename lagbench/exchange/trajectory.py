@@ -25,7 +25,7 @@ from pydantic_core import ErrorDetails
 # pydantic reads the TypedDict of Python 3.12 and later only
 from typing_extensions import TypedDict
 
-from lagbench.data.box import Box, parse_periodic, unit_box
+from lagbench.data.box import SMALL_SIDE, Box, parse_periodic, unit_box
 from lagbench.data.checksums import round_digits
 from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.limits import FRAMES, NEEDED
@@ -80,11 +80,29 @@ FEWEST_CELLS = 4
 MOST_CELLS = 4096
 """Cells across a score grid."""
 
+MOST_CELLS_OF_PERIODS = 64
+"""Cells across a length of 1 of which one number must fit the periods."""
+
 NEIGHBOUR_RADII = 3.0
-"""Radii within which neighbours are counted to estimate the spacing."""
+"""Radii within which a particle must have neighbours, to estimate the spacing."""
+
+KERNEL_REACHES = (2.5, 6.0)
+"""Least and most radius of the kernel that measures the density [spacing].
+
+A small one fits into small bodies, a large one averages over random positions.
+"""
+
+REACHES_ACROSS = 4.0
+"""Radii of the kernel across a square or cube of all particles, between the limits."""
+
+KERNEL_ROUNDS = 10
+"""Rounds in which spacing and reach of the kernel come to agree."""
+
+MOST_SAMPLES = 2_000
+"""Particles around which the density is measured, at most."""
 
 INTERIOR_QUANTILE = 0.75
-"""Quantile of neighbour counts that stands for the inside of the material."""
+"""Quantile of densities that stands for the inside of the material."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,29 +123,36 @@ class Trajectory:
 
 @dataclass(frozen=True, kw_only=True)
 class BoxTransform:
-    """How lengths of the source become the unit box's: ``(x - corner) / scale``.
-
-    A scale that is a power of two loses no bit.
-    """
+    """How lengths of the source become the unit box's: ``(x - corner) / scale``."""
 
     scale: float = 1.0
     corner: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the axes that there are
 
     @classmethod
-    def fit(cls, bounds: Bounds) -> BoxTransform:
-        """Return the transform of the least scale by which a box fits.
+    def fit(cls, bounds: Bounds, periodic: Sequence[str] = ()) -> BoxTransform:
+        """Return the transform that brings a box into the unit box.
 
-        The corner is 0 where that is enough.
+        The scale is a power of two, which loses no bit: the least that is not below the
+        longest side, but 1 for sides from 1/16 to 1. It is the longest period instead
+        where else no score grid would fit the periods, as in a box of side 2 pi. The
+        corner is 0 where that is enough.
+
+        Args:
+            bounds: the box [length].
+            periodic: names of the axes without walls.
         """
         low, high = np.array(bounds, dtype=np.float64).T
+        sides = high - low
+        scale = _fitting_power_of_two(float(sides.max()))
+        is_periodic = parse_periodic(periodic, len(bounds))
+        if any(is_periodic):
+            scaled_bounds = [(0.0, float(side / scale)) for side in sides]
+            if not _has_grid(Box.from_bounds(scaled_bounds, is_periodic)):
+                scale = float(sides.max())
         corner = low
-        scale_from_origin = power_of_two(float(high.max()))
-        if (low >= 0.0).all() and (high <= scale_from_origin).all():
+        if (low >= 0.0).all() and (high <= scale).all():
             corner = np.zeros(len(bounds))
-        return cls(
-            scale=power_of_two(float((high - corner).max())),
-            corner=tuple(float(value) for value in corner),
-        )
+        return cls(scale=scale, corner=tuple(float(value) for value in corner))
 
     def transform_positions(self, position: Array) -> NDArray[np.float32]:
         """Return positions in the unit box, float32."""
@@ -146,11 +171,17 @@ class BoxTransform:
         return tuple(sides)
 
 
-def power_of_two(length: float) -> float:
-    """Return the least power of two that is not below a length, at least 1."""
-    if length > 1.0:
-        return 2.0 ** max(0, math.ceil(math.log2(length)))
-    return 1.0
+def _fitting_power_of_two(side: float) -> float:
+    """Return the least power of two that is not below a side; 1 from 1/16 to 1."""
+    if SMALL_SIDE <= side <= 1.0:
+        return 1.0
+    return 2.0 ** math.ceil(math.log2(side))
+
+
+def _has_grid(box: Box) -> bool:
+    """Tell whether some score grid has whole cells along the periodic axes."""
+    numbers = range(FEWEST_CELLS, MOST_CELLS_OF_PERIODS + 1)
+    return any(box.has_whole_cells(cells) for cells in numbers)
 
 
 Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
@@ -338,7 +369,8 @@ class Description:
                     got="none",
                     fix="add --bounds",
                 )
-            object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
+            transform = BoxTransform.fit(self.bounds, self.periodic)
+            object.__setattr__(self, "transform", transform)
 
     def _check_quantities(self, mistakes: UsageErrorCollector) -> None:
         for option, value in (
@@ -444,27 +476,73 @@ class Description:
 def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> float:
     """Return the distance of neighbouring particles in one frame.
 
-    It is ``(volume / particles)^(1/d)``, counted around particles inside the material.
-    A box with periodic axes has the lengths of the positions.
+    It is ``(volume / particles)^(1/d)`` inside the material, by the density that a
+    cubic spline kernel measures (Monaghan 1992, Annu. Rev. Astron. Astrophys. 30) with
+    a reach of 2.5 to 6 spacings. A box with periodic axes has the lengths of the
+    positions.
+
+    Args:
+        position: particles [length], shape [particle, axis].
+        radius: connectivity radius, within which neighbours are expected [length].
+        box: the box of the particles; the unit box when None.
+
+    Raises:
+        UsageError: most particles have no neighbour within three radii.
     """
-    reach = NEIGHBOUR_RADII * radius
-    box = box or unit_box(position.shape[1])
+    count, dimension = position.shape
+    if count == 1:
+        return radius
+    box = box or unit_box(dimension)
     points = box.tree_points(position.astype(np.float64))
-    counts = box.tree(points).query_ball_point(points, reach, return_length=True)
-    # This quantile leaves surfaces out.
-    inside_count = float(np.quantile(counts, INTERIOR_QUANTILE))
-    if inside_count < 2.0 and len(points) > 1:  # a particle counts itself
+    samples = points
+    if count > MOST_SAMPLES:
+        samples = points[np.linspace(0, count - 1, MOST_SAMPLES).astype(int)]
+    particles_across = count ** (1.0 / dimension)
+    relative_reach = float(np.clip(particles_across / REACHES_ACROSS, *KERNEL_REACHES))
+    # twice the neighbours within the reach, so that the reach may grow
+    reached = _volume_of_unit_ball(dimension) * relative_reach**dimension
+    neighbours = min(count, math.ceil(2.0 * reached))
+    query = box.tree(points).query(samples, k=neighbours)
+    distances = np.asarray(query[0])  # [sample, neighbour]; the first one is itself
+    nearest = float(np.quantile(distances[:, 1], 1.0 - INTERIOR_QUANTILE))
+    if not 0.0 < nearest <= NEIGHBOUR_RADII * radius:
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",
             where="--radius",
-            expected=f"neighbours within {NEIGHBOUR_RADII:g} radii",
+            expected=f"neighbours within {NEIGHBOUR_RADII:g} radii, at other places",
             got=radius,
             fix="a larger --radius, or say in a file how far particles are apart: "
             "--describe, key spacing",
         )
-    if points.shape[1] == 2:
-        return math.sqrt(math.pi * reach**2 / inside_count)
-    return math.cbrt(4.0 / 3.0 * math.pi * reach**3 / inside_count)
+
+    spacing = nearest
+    for _ in range(KERNEL_ROUNDS):
+        reach = relative_reach * spacing
+        weights = _cubic_spline(distances / reach, dimension) / reach**dimension
+        # This quantile leaves surfaces out.
+        density = float(np.quantile(weights.sum(axis=1), INTERIOR_QUANTILE))
+        spacing = density ** (-1.0 / dimension)
+    return spacing
+
+
+def _volume_of_unit_ball(dimension: int) -> float:
+    """Return the volume of a ball of radius 1, in two or three dimensions."""
+    return math.pi if dimension == 2 else 4.0 / 3.0 * math.pi
+
+
+def _cubic_spline(distance: Array, dimension: int) -> Array:
+    """Return the cubic spline kernel of reach 1, whose integral is 1.
+
+    Args:
+        distance: distances over the reach [1].
+        dimension: 2 or 3.
+    """
+    q = 2.0 * distance
+    inner = 1.0 - 1.5 * q**2 + 0.75 * q**3
+    outer = 0.25 * np.maximum(2.0 - q, 0.0) ** 3
+    shape = np.where(q < 1.0, inner, outer)
+    norm = 40.0 / (7.0 * math.pi) if dimension == 2 else 8.0 / math.pi
+    return np.asarray(norm * shape)
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:

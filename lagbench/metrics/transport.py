@@ -40,7 +40,7 @@ def sliced_wasserstein2(x: ArrayLike, y: ArrayLike) -> float:
 
     Of two clouds of as many particles [length], shape [particle, axis]; the projections
     on each direction d_k are sorted. The directions are fixed: nothing is drawn. A
-    shift by s gives ``|s| / sqrt(2)``, in three dimensions ``|s| / sqrt(3)`` within 1 %.
+    shift by s gives ``|s| / sqrt(2)``, in three dimensions ``|s| / sqrt(3)`` to 1 %.
     """
     return _distance(sorted_projections(x), sorted_projections(y))
 
@@ -83,7 +83,7 @@ def _sinkhorn_cost(a: NDArray[np.float64], b: NDArray[np.float64], box: Box) -> 
         distances = np.sum(ways**2, axis=-1)
     else:
         distances = ot.dist(a, b, metric="sqeuclidean")
-    # the plain method is faster, but far particles get the weight exp(-distance^2 / reg)
+    # The plain method is faster, but its weights exp(-distance^2 / reg) underflow.
     method = "sinkhorn"
     if distances.max() > MOST_EXPONENT * BLUR:
         method = "sinkhorn_log"

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.data.box import SMALL_SIDE
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.registry import Size
 from lagbench.errors import LagbenchError
@@ -59,6 +60,12 @@ def _suggest_grid(task: ScoredTask) -> str:
     cells = fitting_cells(
         lambda: _all_clouds(task), grid.placement, near=grid.cells, box=grid.box
     )
+    longest_side = float(max(grid.box.lengths))
+    if cells is None and longest_side < SMALL_SIDE:
+        return (
+            f"lengths in another unit: the longest side of the box is "
+            f"{longest_side:.2g}; adopt or import the data anew with --rescale"
+        )
     if cells is None:
         return "more particles: they cover enough nodes of no grid"
 

@@ -61,7 +61,9 @@ class Skill:
 
 @dataclass(frozen=True, kw_only=True)
 class AgainstClassical:
-    """Score of a submission over that of the best classical solver of its cost."""
+    """Score of a submission over that of the best classical solver that costs no more
+    per frame.
+    """
 
     metric: str  # name of the ranking metric
     reference: str  # name of the classical solver
@@ -129,7 +131,8 @@ def compute_against_classical(
     seconds: Mapping[str, float],
     seconds_per_frame: float,
 ) -> AgainstClassical | None:
-    """Return a method's score over that of the best classical solver of its cost.
+    """Return a method's score over that of the best classical solver that costs no more
+    per frame.
 
     Args:
         seeds: score of each seed, over the same scenarios.
@@ -187,7 +190,8 @@ def compare_with_solvers(
     submission: Score,
     classical: Mapping[str, ReferenceScores],
 ) -> tuple[AgainstClassical | None, str | None]:
-    """Return the submission's score over that of the best classical solver of its cost.
+    """Return the submission's score over that of the best classical solver that costs
+    no more per frame.
 
     Where there is no such ratio, the reason comes instead.
 

@@ -157,8 +157,8 @@ def fetch_archive(
 ) -> Generator[FileEntry, None, None]:
     """Fetch scenarios from the archive in a store; yield the entry of each right file.
 
-    Hold the lock of the data set. Other members are skipped. Right files stay, whatever
-    comes after.
+    The caller holds the lock of the data set. Other members are skipped. Right files
+    stay, whatever comes after.
 
     Args:
         size: the data set.

@@ -396,7 +396,7 @@ def fetch_entries(
 ) -> None:
     """Fetch objects into the working copy; each appears whole and right.
 
-    Hold the lock of the working copy.
+    The caller holds the lock of the working copy.
 
     Raises:
         DataError: the store holds wrong data.

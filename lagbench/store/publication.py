@@ -186,10 +186,11 @@ def check_address(url: str) -> None:
 
 @contextmanager
 def publish(size: Size, root: Path, url: str) -> Iterator[Publication]:
-    """Write a data set to a store.
+    """Yield a publication, through which the caller writes a data set to a store.
 
-    Hold the lock of the working copy. Until the end nothing is fetched into it
-    unasked.
+    The caller holds the lock of the working copy. While the publication lasts, nothing
+    is fetched into the working copy unasked. After an error the store gets a manifest
+    of the objects that it has.
 
     Args:
         size: the data set.

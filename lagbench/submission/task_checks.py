@@ -228,9 +228,13 @@ def format_numbers(numbers: Sequence[int]) -> str:
     """
     if not numbers:
         return "none"
-    if min(numbers) < 0:
-        return quote(list(numbers[:MAX_QUOTED_NUMBERS]))
-    return format_ranges(numbers)
+    if min(numbers) >= 0:
+        return format_ranges(numbers)
+    text = quote(list(numbers[:MAX_QUOTED_NUMBERS]))
+    if len(numbers) <= MAX_QUOTED_NUMBERS:
+        return text
+    start = text.removesuffix("...")  # of a text that is cut off already
+    return f"{start}... ({len(numbers)} numbers)"
 
 
 def format_ranges(numbers: Sequence[int]) -> str:

@@ -477,6 +477,7 @@ DAMAGE: dict[str, Damage] = {
     "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to(
         "/etc/passwd"
     ),
+    "folder: page that is a pipe": lambda b: os.mkfifo(b.folder / "index.html"),
     "folder: name that a log would obey": text("a: 1", f"{PLACE}/a\n::warning::x.yaml"),
     "folder stray: entry at another depth": move_entry("submissions/noisy.yaml"),
     "readable: entry of 100 MB": lambda b: os.truncate(b.entry("noisy"), 100_000_000),
@@ -503,6 +504,16 @@ def test_damage_is_found(name: str, own: BoardBench) -> None:
     damage = DAMAGE[name]
     damage(own)
     assert set(found(own)) == checks_of(name)
+
+
+def test_a_link_is_called_a_link(own: BoardBench, tmp_path: Path) -> None:
+    """At the top of the folder too, whatever its name."""
+    for name in ("seasons", "README.md", "other"):
+        (own.folder / name).symlink_to(tmp_path)
+    result = check_board(own.folder, registry=own.registry, isolated=False)
+    places = {str(finding.where) for finding in result.findings}
+    assert places == {"seasons", "README.md", "other"}
+    assert all("link" in str(finding.got) for finding in result.findings)
 
 
 def test_all_checks_have_damage() -> None:

@@ -411,7 +411,7 @@ GOOD = (0.4, 0.5, 0.6)
 
 
 def test_the_most_accurate_model_decides_whether_learning_pays(board: Board) -> None:
-    """A less accurate one that beats the solvers of its cost is named behind it."""
+    """A less accurate one that beats solvers of at most its cost is named behind it."""
     accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
     cheap = compared(board, "Cheap", error=2.0, ratio=GOOD)
     sentences = conclude(first_tab(board, cheap, accurate))

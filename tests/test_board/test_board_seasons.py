@@ -209,6 +209,38 @@ def test_a_repeated_season_has_the_same_bytes(
     assert (folder / scores).read_bytes() == expected
 
 
+@pytest.mark.parametrize(
+    ("budget", "count"),
+    [(1e308, 9), (6.5, 6), (1e-9, 4)],
+    ids=["beyond what there is", "six and a half scenarios", "none"],
+)
+def test_a_model_predicts_as_many_scenarios_as_its_budget_allows(
+    budget: float, count: int, own: ModelBoard
+) -> None:
+    """Its entry states what a frame costs: here, a scenario costs a second; four
+    scenarios are the fewest.
+    """
+    horizon = load().size("curl-noise", "tiny").task.horizon
+
+    def state_cost(content: dict[str, Any]) -> None:
+        seconds_per_frame = 1e-7 if budget == 1e308 else 1.0 / horizon
+        content["cost"] = {"seconds_per_frame": seconds_per_frame, "device": "cpu"}
+
+    own.edit(own.folder / PATH, state_cost)
+    season = close(
+        own.folder,
+        "next",
+        scenarios=9,
+        budget=budget,
+        root=own.root,
+        lagbench="0.1.0",
+    )
+    (data_set,) = season.data_sets
+    (entry,) = data_set.entries
+    assert data_set.scenarios == 9
+    assert entry.scenarios == count
+
+
 def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     """Only an option predicts them again; the scores are the same."""
     saved = run_again(master)

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 import lagbench
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
-from lagbench.cli.output import print_table
+from lagbench.cli.output import format_bytes, print_table
 from lagbench.cli.program import app
 from lagbench.data.registry import default_path
 
@@ -384,6 +384,26 @@ def test_the_leaderboard_is_shown_in_one_table_for_each_data_set(
     (line,) = [line for line in lines[start : start + 30] if " var-stable " in line]
     assert f"{stated.cost.seconds_per_frame:.2g}*" in line.split()
     assert "*: self-reported" in lines[start + 1]
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0 B"),
+        (999, "999 B"),
+        (999.6, "1.0 kB"),
+        (1000, "1.0 kB"),
+        (99_940, "99.9 kB"),
+        (99_960, "100 kB"),
+        (100_000, "100 kB"),
+        (999_499, "999 kB"),
+        (999_500, "1.0 MB"),
+        (999_960_000, "1.0 GB"),
+        (12_345_000_000_000, "12345 GB"),
+    ],
+)
+def test_bytes_are_rounded_before_their_unit_is_chosen(count: float, text: str) -> None:
+    assert format_bytes(count) == text
 
 
 def test_a_title_is_not_wrapped_to_the_width_of_its_table(

@@ -220,6 +220,12 @@ HINTS = {
     f"{TRAIN} gns --set training.steps =10": "blanks: --set training.steps=10",
     f"{TRAIN} gns --set training.rate -1": "blanks: --set training.rate=-1",
     f"{TRAIN} gns --set training.rate = -1e-3": "blanks: --set training.rate=-1e-3",
+    f"{TRAIN} gns --set training.steps = 1 training.batch = 2": (
+        "--set training.steps=1 --set training.batch=2"
+    ),
+    f"{TRAIN} gns --set training.steps=1 training.batch =2": (
+        "--set training.steps=1 --set training.batch=2"
+    ),
     f"{TRAIN} gns --set training.steps 10 --set training.batch = 2 model.a=1": (
         "--set training.steps=10 --set training.batch=2 --set model.a=1"
     ),

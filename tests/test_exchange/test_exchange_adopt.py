@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from typer.testing import Result
 
 import lagbench
+from lagbench.data.box import Box
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate, locate_split
 from lagbench.data.manifest import read_manifest
@@ -703,7 +704,17 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
         ),
         (
             ((7.0, 7.5), (7.0, 7.25)),
-            8.0,
+            1.0,
+            (7.0, 7.0),
+        ),
+        (
+            ((1000.0, 1001.0), (1000.0, 1001.0)),
+            1.0,
+            (1000.0, 1000.0),
+        ),
+        (
+            ((0.0, 0.001), (0.0, 0.0005)),
+            2.0**-9,
             (0.0, 0.0),
         ),
     ],
@@ -720,13 +731,47 @@ def test_a_fitted_box_lies_in_the_unit_box(
     assert box.max() <= 1.0
 
 
-def test_the_spacing_of_a_lattice_is_found() -> None:
-    """On a square lattice the estimate is within 5 % of the lattice constant."""
-    axis = 0.2 + 0.01 * np.arange(40)
-    x, y = np.meshgrid(axis, axis)
-    lattice = np.stack([x, y], axis=-1).reshape(-1, 2)
-    spacing = estimate_spacing(lattice, 0.015)
-    assert math.isclose(spacing, 0.01, rel_tol=0.05)
+def test_periods_that_no_grid_fits_become_one() -> None:
+    """As 2 pi; a period of 1.12, which is 14 cells of 0.08, is halved without loss."""
+    cube = ((0.0, 2.0 * math.pi),) * 3
+    transform = BoxTransform.fit(cube, ("x", "y", "z"))
+    assert transform.transform_box(cube) == ((0.0, 1.0),) * 3
+    assert BoxTransform.fit(cube).scale == 8.0
+    assert BoxTransform.fit(((0.0, 1.12),) * 2, ("x", "y")).scale == 2.0
+
+
+@pytest.mark.parametrize("radius", [0.012, 0.026, 0.06])
+@pytest.mark.parametrize(("dimension", "across"), [(2, 6), (2, 40), (3, 6), (3, 12)])
+def test_the_spacing_of_a_lattice_is_found(
+    dimension: int, across: int, radius: float
+) -> None:
+    """The estimate is within 1 % of the lattice constant, whatever the radius."""
+    axis = 0.2 + 0.01 * np.arange(across)
+    points = np.stack(np.meshgrid(*[axis] * dimension), axis=-1)
+    spacing = estimate_spacing(points.reshape(-1, dimension), radius)
+    assert math.isclose(spacing, 0.01, rel_tol=0.01)
+
+
+def test_the_spacing_in_a_periodic_box_is_found() -> None:
+    """In a cube of eight particles a side each has neighbours across the ends."""
+    axis = (np.arange(8) + 0.5) / 8
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    box = Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3)
+    for radius in (0.2, 0.45):
+        assert math.isclose(estimate_spacing(cube, radius, box), 0.125, rel_tol=0.01)
+
+
+def test_the_spacing_of_random_positions_is_near() -> None:
+    """Their mean volume is known; the estimate is at most 10 % off."""
+    positions = np.random.default_rng(0).random((4000, 2))
+    box = Box.from_bounds([(0.0, 1.0)] * 2, [True] * 2)
+    spacing = estimate_spacing(positions, 0.03, box)
+    assert math.isclose(spacing, 4000**-0.5, rel_tol=0.1)
+
+
+def test_particles_at_one_place_have_no_spacing() -> None:
+    with pytest.raises(UsageError):
+        estimate_spacing(np.full((50, 2), 0.5), 0.1)
 
 
 def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.float32]:

@@ -215,9 +215,12 @@ def test_lagrangebench_bounds(
         assert_array_equal(position.astype(np.float64) + origin, run.astype(np.float64))
 
 
-def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> None:
+@pytest.mark.parametrize("full_box", [False, True])
+def test_walls_at_0_are_the_bounds_too(
+    mixed: LocalSplit, tmp_path: Path, full_box: bool
+) -> None:
     """Measured from walls that lie at 0 nothing is taken off, and the bounds are still
-    the walls.
+    the walls; so they are by default where matter fills the box.
     """
     bounds = ((0.0, 0.95), (0.0, 0.95))
     paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
@@ -227,8 +230,10 @@ def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> Non
         radius=0.1,
         frame_interval=0.1,
         bounds=bounds,
+        full_box=full_box,
     )
-    for from_walls, high in ((True, 0.95), (False, 1.0)):
+    by_default = 0.95 if full_box else 1.0
+    for from_walls, high in ((True, 0.95), (False, 1.0), (None, by_default)):
         folder = tmp_path / f"{from_walls}"
         export(
             str(own.folder),

@@ -19,6 +19,8 @@ import lagbench
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
 from lagbench.data.local import locate
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import UsageError
 from lagbench.exchange import adopt, import_split
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.scoring.card import ScoreCard
@@ -64,21 +66,26 @@ def carried(side: int) -> NDArray[np.float32]:
     return np.where(wrapped >= 1.0, zero, wrapped)
 
 
-def write_set(folder: Path) -> Path:
-    """Write train.h5, valid.h5, test.h5 and metadata.json as LagrangeBench does."""
+def write_set(folder: Path, length: float = 1.0) -> Path:
+    """Write train.h5, valid.h5, test.h5 and metadata.json as LagrangeBench does.
+
+    Args:
+        folder: folder to make.
+        length: side of the periodic square.
+    """
     folder.mkdir()
     for subset in SUBSETS:
         with h5py.File(folder / f"{subset}.h5", "w") as file:
             for number, side in enumerate(SIDES[subset]):
-                position = carried(side)
+                position = (length * carried(side)).astype(np.float32)
                 particle_count = position.shape[1]
                 group = file.create_group(f"{number:05d}")
                 group["position"] = position
                 group["particle_type"] = np.zeros(particle_count, np.int64)
     changes = {
-        "bounds": [[0.0, 1.0], [0.0, 1.0]],
+        "bounds": [[0.0, length], [0.0, length]],
         "sequence_length": FRAMES,
-        "default_connectivity_radius": 0.08,
+        "default_connectivity_radius": 0.08 * length,
         "periodic_boundary_conditions": [True, True],
     }
     write_metadata(folder, changes)
@@ -143,6 +150,76 @@ def test_the_box_and_the_numbers_of_particles_are_theirs(made: LocalSplit) -> No
     assert size.box.periodic == (True, True)
     counts = {size.particle_count(number) for number in size.scenarios}
     assert counts == {324, 400, 484, 676}
+
+
+def test_a_square_of_side_2_pi_is_rescaled(tmp_path: Path) -> None:
+    """LagrangeBench's Taylor-Green cube has this side. No power of two makes it whole
+    cells; divided by the period the positions are those of the unit square.
+    """
+    source = write_set(tmp_path / "theirs", 2.0 * math.pi)
+    own_split = import_split(
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "round",
+        input_frames=GIVEN,
+        full_box=True,
+        rescale=True,
+    )
+    size = locate(own_split.folder).size
+    assert size.box.bounds == ((0.0, 1.0), (0.0, 1.0))
+    assert size.task.radius == pytest.approx(0.08)
+    first = size.subsets["valid"][0]
+    with read_scenario(size.path(tmp_path, first)) as file:
+        position = file.read("position", slice(0, FRAMES))
+    way = size.box.displacement(carried(20), position.astype(np.float64))
+    assert np.abs(way).max() < 1e-6
+    lagbench.submission.template(own_split.folder, output=tmp_path / "kept.nc")
+    card = score_predictions(own_split, tmp_path / "kept.nc")
+    assert card.scores
+
+
+def test_cells_that_no_period_fits_are_refused(tmp_path: Path) -> None:
+    """Before anything is written; nor are there periods without bounds."""
+    source = write_set(tmp_path / "theirs", 0.7853981633974483)
+    with pytest.raises(UsageError) as caught:
+        import_split(
+            source,
+            format="lagrangebench-h5",
+            output=tmp_path / "seven",
+            input_frames=GIVEN,
+            full_box=True,
+            cells=7,
+        )
+    assert caught.value.where == "--cells"
+    assert not (tmp_path / "seven").exists()
+
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    for number in range(4):
+        np.save(runs / f"{number}.npy", carried(18))
+    for rescale in (False, True):
+        with pytest.raises(UsageError) as caught:
+            adopt(
+                runs,
+                output=tmp_path / "own",
+                radius=0.08,
+                frame_interval=0.1,
+                periodic=("x", "y"),
+                rescale=rescale,
+            )
+        assert caught.value.where == "--periodic"
+
+
+def test_a_force_beside_the_data_is_not_read(tmp_path: Path) -> None:
+    """It is a program; a note says that the split lacks its force."""
+    source = write_set(tmp_path / "theirs")
+    force = source / "force.py"
+    force.write_text(f"open({str(tmp_path / 'run')!r}, 'w')")
+    own_split = import_split(
+        source, format="lagrangebench-h5", output=tmp_path / "own", input_frames=GIVEN
+    )
+    assert any("force.py" in note for note in own_split.notes)
+    assert not (tmp_path / "run").exists()
 
 
 def test_positions_adopted_with_the_same_axes_are_the_same(

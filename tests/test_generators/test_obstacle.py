@@ -174,6 +174,39 @@ def test_an_obstacle_lies_within_the_box(
     assert expected in str(caught.value.expected)
 
 
+def test_an_obstacle_has_a_radius_above_zero() -> None:
+    """With a negative one, a centre outside the box and its particles would fit."""
+    state = channel_state()
+    assert state.obstacle is not None
+    centre = (1.2, 0.5)
+    position = np.full_like(state.obstacle.position, 0.5)
+    position[:, 0] = 1.1
+    for radius in (-0.3, 0.0, np.nan):
+        disc = misplaced(centre=centre, radius=radius, position=position)
+        with pytest.raises(UsageError) as caught:
+            serial_solver().load([disc])
+        assert "radius" in str(caught.value.expected)
+
+
+def test_an_obstacle_has_the_axes_of_the_box() -> None:
+    """Its centre and the positions of its particles."""
+    state = channel_state()
+    assert state.obstacle is not None
+    position = state.obstacle.position
+    in_space = np.pad(position, ((0, 0), (0, 1)))
+    for changes in (
+        {"centre": (0.3, 0.5, 0.5)},
+        {"centre": (0.3,)},
+        {"position": in_space},
+        {"position": position[:, :1]},
+        {"position": position[:, 0]},
+    ):
+        with pytest.raises(UsageError) as caught:
+            serial_solver().load([misplaced(**changes)])
+        assert "obstacle" in str(caught.value.where)
+        assert "2 axes" in str(caught.value.expected)
+
+
 def test_positions_of_an_obstacle_are_numbers() -> None:
     state = channel_state()
     assert state.obstacle is not None

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from scenario_draws import changed
 from typer.testing import Result
 
 from lagbench.data.registry import Registry, Size, load
@@ -82,6 +83,32 @@ def test_a_drawn_value_without_exact_form_names_file_and_line(
     assert line_of(module_file, change) in where
     assert "scenario 3" in where
     assert str(size.file) in str(caught.value.fix)
+
+
+@pytest.mark.parametrize(
+    ("split", "scenario", "values"),
+    [
+        ("fluid", 0, {"area_min": 1.5, "area_max": 1.6}),
+        ("fluid", 1, {"thrown_velocity_x_min": 90.0, "thrown_velocity_x_max": 99.0}),
+        ("multimaterial", 5, {"area_min": 0.45, "area_max": 0.45}),
+        ("cavity", 0, {"reynolds_min": 50.0, "reynolds_max": 20.0}),
+    ],
+    ids=["no room", "too fast", "no room side by side", "empty range"],
+)
+def test_a_value_that_cannot_be_drawn_names_the_file_of_the_split(
+    split: str, scenario: int, values: dict[str, float], tmp_path: Path
+) -> None:
+    """The generator is ours, but a file of the user describes the split."""
+    own_file = tmp_path / "mine.yaml"
+    size = changed(load().size(split, "tiny"), **values)
+    own_size = size.model_copy(update={"file": own_file})
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(own_size, scenario)
+    where = str(caught.value.where)
+    assert str(own_file) in where
+    assert split in where
+    assert f"scenario {scenario}" in where
+    assert "datasets.yaml" not in str(caught.value)
 
 
 def test_a_missing_parameter_names_both_places(

@@ -543,7 +543,7 @@ def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     assert near == pytest.approx(0.02, rel=1e-3)
     far = sinkhorn_divergence(x, x + 0.2)
     assert far == pytest.approx(0.08, rel=1e-3)
-    outside = sinkhorn_divergence(x, x + [9.0, 0.0])
+    outside = sinkhorn_divergence(x, x + np.array([9.0, 0.0]))
     assert outside == pytest.approx(81.0, rel=1e-2)
 
 

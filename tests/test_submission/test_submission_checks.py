@@ -40,6 +40,7 @@ from lagbench.scoring.score import score
 from lagbench.submission import Severity, ValidationResult, template, validate
 from lagbench.submission.checks import ScenarioScan, check_domain
 from lagbench.submission.issues import IssueCollector
+from lagbench.submission.task_checks import format_numbers
 from lagbench.submission.truth import Truth
 
 bench = small
@@ -272,6 +273,18 @@ def hashed() -> Iterator[mock.Mock]:
         module, "check_scenario", side_effect=module.check_scenario
     ) as listening:
         yield listening
+
+
+@pytest.mark.parametrize("first", [0, 10**9])
+def test_a_list_of_numbers_that_is_cut_says_how_many_there_are(first: int) -> None:
+    """A negative number among them, as a damaged file may have, changes nothing."""
+    numbers = range(first, first + 100, 2)
+    for negative in ([], [-7]):
+        listing = [*numbers, *negative]
+        text = format_numbers(listing)
+        assert f"({len(listing)} numbers)" in text
+        assert len(text) < 120
+    assert "numbers" not in format_numbers([3, 5, -7])
 
 
 @pytest.mark.parametrize(

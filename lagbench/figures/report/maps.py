@@ -164,7 +164,10 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
 
 
 def _masked_speeds(moment: Moment) -> list[Floats]:
-    """Return the speed of truth and entries at the nodes, NaN where none counts."""
+    """Return the speed of truth and entries at the nodes.
+
+    It is NaN at nodes that are not compared (the truth's).
+    """
     flows = [moment.truth.fields.section]
     for pair in moment.pairs:
         flows.append(pair.predicted_fields.section)
