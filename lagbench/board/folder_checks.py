@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lagbench.data.checksums import file_sha256
 from lagbench.data.hdf5 import SIGNATURE
+from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     LagbenchError,
@@ -297,11 +298,13 @@ class FolderChecks:
         entry: Entry,
         prediction: Prediction,
     ) -> None:
-        """Check that a score file belongs to the entry's data set and predictions."""
+        """Check that a score file belongs to the entry's data set and predictions.
+
+        Seeds that came later may have a newer minor version of the same data.
+        """
         expected = {
             "split": entry.split,
             "size": entry.size,
-            "dataset_version": entry.dataset.version,
             "dataset_sha256": entry.dataset.sha256,
             "predictions_sha256": prediction.sha256,
         }
@@ -313,6 +316,12 @@ class FolderChecks:
             if identity[name] != value:
                 got = ascii(identity[name])[:80]
                 self._add("score_file", path, f"{name} {got}, not {value!a}")
+
+        version = identity["dataset_version"]
+        major = major_of(entry.dataset.version)
+        if not version.startswith(f"{major}."):
+            got = ascii(version)[:80]
+            self._add("score_file", path, f"dataset_version {got}, not {major}")
 
     def _check_score_block(
         self, path: Path, entry: Entry, scores: Sequence[SubmissionStatistics]

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import netCDF4
 import pytest
 from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
@@ -905,6 +906,18 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     other = copied(home, other_folder)
     submitted(other, first, *others)
     assert own.state() == other.state()
+
+
+@pytest.mark.slow
+def test_seeds_may_come_after_a_minor_version_of_the_data(own: BoardBench) -> None:
+    """A minor version leaves the data of this size as they are: the hash says so."""
+    first, later = [trained(own, seed) for seed in (0, 3)]
+    with netCDF4.Dataset(first / "predictions.nc", "a") as file:
+        version = file.getncattr("dataset_version")
+        file.setncattr("dataset_version", version.partition(".")[0] + ".0.0")
+    submitted(own, first)
+    submitted(own, later, add=True)
+    assert_sound(own)
 
 
 @pytest.mark.slow
