@@ -175,7 +175,10 @@ def _fitting_power_of_two(side: float) -> float:
     """Return the least power of two that is not below a side; 1 from 1/16 to 1."""
     if SMALL_SIDE <= side <= 1.0:
         return 1.0
-    return 2.0 ** math.ceil(math.log2(side))
+    mantissa, exponent = math.frexp(side)  # exact; the mantissa is from 1/2 to 1
+    if mantissa == 0.5:
+        exponent -= 1
+    return math.ldexp(1.0, exponent)
 
 
 def _has_grid(box: Box) -> bool:

@@ -717,6 +717,11 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
             2.0**-9,
             (0.0, 0.0),
         ),
+        (
+            ((0.0, 1024.0), (0.0, 1024.0 * (1.0 + 2.0**-52))),
+            2048.0,
+            (0.0, 0.0),
+        ),
     ],
 )
 def test_a_fitted_box_lies_in_the_unit_box(
