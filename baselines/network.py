@@ -154,9 +154,10 @@ class EncodeProcessDecode(nn.Module):
         edge: Tensor,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the prediction, shape [particle, 2], and the operators' own losses.
+        """Return the prediction and the operators' own losses.
 
-        Losses are means over the layers.
+        The prediction has the shape [particle, output]. Losses are means over the
+        layers.
         """
         input_dtype = node.dtype
         node = self.node_encoder(node)

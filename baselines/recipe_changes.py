@@ -26,6 +26,7 @@ from .recipe import (
 # options that do not change the learned weights' meaning, or are told elsewhere
 UNLISTED = ("seed", "compile", "log_every", "checkpoint_every")
 LONGEST_VALUE = 200  # letters of a value; longer ones become dots
+_NOT_SET = object()  # stands for an option that a recipe does not state
 
 
 def list_settings(recipe: object) -> tuple[str, ...]:
@@ -134,24 +135,56 @@ def describe_start(start: Mapping[str, Any] | None) -> str:
     return ""
 
 
-def first_difference(
-    expected: Mapping[str, Any], logged: object, path: str = ""
-) -> str:
-    """Return the first key whose value differs, with both values."""
+def first_difference(expected: Mapping[str, Any], logged: object) -> str:
+    """Return the first key whose value differs, with both values.
+
+    Options that a log leaves out have the values of :data:`LATER_OPTIONS`.
+    """
     if not isinstance(logged, Mapping):
         logged = {}
+    return _describe_difference(
+        _fill_later_options(expected, logged), _fill_later_options(logged, expected)
+    )
+
+
+def _fill_later_options(
+    recipe: Mapping[str, Any], other: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a recipe with those options that only the other one states."""
+    filled = dict(recipe)
+    for group, defaults in LATER_OPTIONS.items():
+        options = recipe.get(group)
+        other_options = other.get(group)
+        if not isinstance(options, Mapping) or not isinstance(other_options, Mapping):
+            continue
+        filled_options = dict(options)
+        for name in other_options:
+            if name in defaults:
+                filled_options.setdefault(name, defaults[name])
+        filled[group] = filled_options
+    return filled
+
+
+def _describe_difference(
+    expected: Mapping[str, Any], logged: Mapping[str, Any], path: str = ""
+) -> str:
+    """Return the first key whose value differs, below a path, with both values."""
     for key in sorted({*expected, *logged}):
-        expected_value = expected.get(key)
-        logged_value = logged.get(key)
+        expected_value = expected.get(key, _NOT_SET)
+        logged_value = logged.get(key, _NOT_SET)
         if expected_value == logged_value:
             continue
         if isinstance(expected_value, Mapping) and isinstance(logged_value, Mapping):
-            return first_difference(expected_value, logged_value, f"{path}{key}.")
+            return _describe_difference(expected_value, logged_value, f"{path}{key}.")
         return (
-            f"{path}{key} = {expected_value!r}, as asked for; the folder has "
-            f"{logged_value!r}"
+            f"{path}{key} = {_describe_value(expected_value)}, as asked for; the "
+            f"folder has {_describe_value(logged_value)}"
         )
     return "the same recipe"
+
+
+def _describe_value(value: object) -> str:
+    return "not set" if value is _NOT_SET else repr(value)
 
 
 def _find_changes(

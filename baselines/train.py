@@ -138,10 +138,11 @@ def train(
             None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
-        output: folder of the run; ``runs/<split>/<size>/<baseline>[-further]-<seed>``
-            by default.
+        output: folder of the run; by default
+            ``runs/<split>/<size>[-<variant>]/<baseline>[-further]-<seed>``.
         resume: go on with what an earlier run left there.
-        fresh: train anew, and remove an earlier training there.
+        fresh: train anew, and remove an earlier training there; it wins over
+            ``resume``.
         device: ``cpu``, ``cuda`` or ``auto``.
         processes: processes, one device each (torchrun's own number where that started
             us).

@@ -333,8 +333,26 @@ def solve(blocks: LaggedRows) -> LeastSquares:
     regressor_count = x.shape[1]
     response_count = y.shape[1]
     if blocks.rows < regressor_count:
-        return _solve_underdetermined(blocks)
-    return _solve_overdetermined(blocks, (regressor_count, response_count))
+        solution = _solve_underdetermined(blocks)
+    else:
+        shape = (regressor_count, response_count)
+        solution = _solve_overdetermined(blocks, shape)
+    # responses that are not finite make coefficients that are not
+    _require_finite(solution.coefficients)
+    return solution
+
+
+def _require_finite(values: Matrix) -> None:
+    """Refuse sums or solutions of rows with values that are not finite."""
+    if np.isfinite(values).all():
+        return
+    raise WorkFailedError(
+        "values are not finite",
+        where="rows to fit",
+        expected="finite positions",
+        got="NaN or infinite",
+        fix="check the data: lagbench verify",
+    )
 
 
 def _solve_overdetermined(blocks: LaggedRows, shape: tuple[int, int]) -> LeastSquares:
@@ -390,6 +408,7 @@ def _solve_underdetermined(blocks: LaggedRows) -> LeastSquares:
         y_blocks.append(y_block)
     x = np.concatenate(x_blocks)
     y = np.concatenate(y_blocks)
+    _require_finite(y)  # NumPy would warn of infinite ones
 
     def gram() -> Matrix:
         transposed = np.ascontiguousarray(x.T)
@@ -444,15 +463,7 @@ def _factor(
     """
     matrix = gram()
     size = len(matrix)
-    diagonal = matrix.diagonal()
-    if not np.isfinite(diagonal).all():
-        raise WorkFailedError(
-            "values are not finite",
-            where="rows to fit",
-            expected="finite positions",
-            got="NaN or infinite",
-            fix="check the data: lagbench verify",
-        )
+    _require_finite(matrix.diagonal())
     multiply = partial(blas.dsymv, 1.0, matrix)
     largest = _largest_eigenvalue(multiply, size)
 

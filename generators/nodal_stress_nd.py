@@ -122,7 +122,11 @@ class NodalStressND:
         self._fill_tables()
 
     def _make_stencils(self) -> None:
-        """List the neighbours of a node, which the kernels unroll."""
+        """List the rows that a particle touches, the pairs of a node's neighbours, and
+        the weights of the pairs in a gradient.
+
+        The kernels unroll them.
+        """
         # the rows of three nodes that a particle touches: steps along all but the last
         # axis
         row_axes = self.dimension - 1
@@ -350,7 +354,7 @@ class NodalStressND:
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
+        """Store the stencil of a particle for P2G and G2P: its nodes and weights."""
         x = self.x[s, p]
         number = 0
         offset = vec3(0.0)

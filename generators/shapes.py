@@ -196,8 +196,8 @@ class Blobs:
         disc = Disc(self.radius)
         distances = []
         for centre in self.centres:
-            way = position - np.array(centre)
-            distances.append(disc.distance(way))
+            from_centre = position - np.array(centre)
+            distances.append(disc.distance(from_centre))
         return np.asarray(np.minimum.reduce(distances))
 
 
@@ -274,5 +274,5 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
         blocks.append(points)
         missing_count -= len(points)
         start += block_size
-    way = np.concatenate(blocks)  # from the centre
-    return quantise(body.centre + way)
+    from_centre = np.concatenate(blocks)
+    return quantise(body.centre + from_centre)

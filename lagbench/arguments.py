@@ -380,7 +380,10 @@ def list_members(annotation: str) -> list[str]:
 
 
 def find_kind(member: str) -> ArgumentKind:
-    """Return the kind of a member of a union; of an unknown name, that of a class."""
+    """Return the kind of a member of a union.
+
+    A name that is unknown here is taken for that of a class.
+    """
     head, _, items = member.partition("[")
     if head in PLAIN_KINDS:
         return PLAIN_KINDS[head]

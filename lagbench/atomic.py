@@ -189,9 +189,12 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
     Call it only while holding the lock of the data set.
     """
-    leftovers = sorted(folder.rglob(f".*{SUFFIX}"))
-    for path in leftovers:
+    leftovers = []
+    for path in sorted(folder.rglob(f".*{SUFFIX}")):
+        if path.is_dir():
+            continue  # no writer of ours makes it
         path.unlink(missing_ok=True)
+        leftovers.append(path)
     return leftovers
 
 

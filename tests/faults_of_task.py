@@ -24,6 +24,8 @@ from submission_data import FRAMES, GIVEN, PARTICLES, Bench
 
 attribute("unknown_split", "split", "cavty", check="split", says="cavity")
 attribute("unknown_size", "size", "huge", check="split", says="full")
+attribute("unknown_subset", "subset", "shift", check="split", says="'subset'")
+attribute("endless_subset", "subset", "x" * 60000, check="split")
 attribute("path_as_split", "split", "../../etc", check="split")
 attribute("wrong_split", "split", "curl-noise", check="particles", says="506")
 attribute(

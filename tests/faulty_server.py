@@ -64,6 +64,8 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send(403, b"no")
         if fault == "elsewhere":
             return self._send(302, b"", {"Location": "file:///etc/passwd"})
+        if fault == "other kind":
+            return self._send(302, b"", {"Location": "ftp://localhost/data"})
         if fault == "nowhere":
             return self._send(302, b"", {"Location": "http://[::1"})
         if fault == "busy once" and self.mirror.count(self.path) == 1:

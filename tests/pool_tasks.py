@@ -6,6 +6,7 @@ import atexit
 import errno
 import os
 import signal
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -48,6 +49,11 @@ def crash(report: Report) -> None:
 def lack_permission(path: Path, report: Report) -> None:
     """Raise an error of the operating system."""
     raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+
+def lock(report: Report) -> object:
+    """Return what no process can send to another one."""
+    return threading.Lock()
 
 
 class UnsentError(OSError):

@@ -44,7 +44,7 @@ from lagbench.scoring.score_file_checks import (
     read_score_file,
     reported_frames,
 )
-from lagbench.scoring.score_layout import Preview
+from lagbench.scoring.score_layout import Preview, spaced
 from lagbench.scoring.skill import (
     AgainstClassical,
     Skill,
@@ -78,7 +78,7 @@ from .model import (
 )
 from .page import links_in, links_to, render, same_page
 from .ranking import CombinedScore, combine, read_references
-from .sampling import coarsen, spaced
+from .sampling import coarsen
 from .selection import is_current
 from .shift import (
     SUBSET,

@@ -446,19 +446,30 @@ ENTRY_COLUMNS = (
 """Columns that show no metric."""
 
 
+def comparisons_of(tab: Tab) -> tuple[Column, ...]:
+    """Return the columns of a tab that compare with other methods or other data.
+
+    Of the skill, the score divided by the classical one, and the skill on shift, those
+    that a row has.
+    """
+    columns = []
+    if any(row.skill is not None for row in tab.rows):
+        columns.append(SKILL)
+    if any(row.against_classical is not None for row in tab.rows):
+        columns.append(AGAINST_CLASSICAL)
+    if any(row.on_shift is not None for row in tab.rows):
+        columns.append(SKILL_ON_SHIFT)
+    return tuple(columns)
+
+
 def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
     """Return all columns of a tab by key.
 
     The skill comes first, then the metrics to show at first, the other metrics, and the
     columns that show no metric.
     """
-    columns = {}
-    if any(row.skill for row in tab.rows):
-        columns[SKILL.key] = SKILL
-    if any(row.against_classical for row in tab.rows):
-        columns[AGAINST_CLASSICAL.key] = AGAINST_CLASSICAL
-    if any(row.on_shift for row in tab.rows):
-        columns[SKILL_ON_SHIFT.key] = SKILL_ON_SHIFT
+    columns = {column.key: column for column in comparisons_of(tab)}
+    if SKILL_ON_SHIFT.key in columns:
         columns[SCORE_ON_SHIFT.key] = SCORE_ON_SHIFT
     for name in dict.fromkeys((*tab.columns, *metrics)):
         if any(name in row.values for row in tab.lines):

@@ -107,7 +107,7 @@ def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Pa
 
     Args:
         place: split, size and method of the entry.
-        seed: the seed.
+        seed: seed of the training; None, where none is stated, is written as 0.
         like: a file name; the path ends as it does, where models may end so.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()

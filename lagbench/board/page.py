@@ -31,10 +31,7 @@ from lagbench.figures.html import (
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (
-    AGAINST_CLASSICAL,
-    SKILL,
-    SKILL_ON_SHIFT,
-    Column,
+    comparisons_of,
     cost_of,
     format_ranks,
     format_value,
@@ -461,7 +458,9 @@ def draw_empty(board: Board) -> Markup:
 
 
 def draw_overview(overviews: Sequence[SizeOverview]) -> Markup:
-    """Return one table per size: a row per method, by mean skill over all data sets."""
+    """Return a section with the findings, the verdicts and a table of methods for each
+    size.
+    """
     if not overviews:
         return Markup("")
     parts = [
@@ -854,7 +853,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "Click a row for curves, maps, a film, every number and the command that makes "
         "it again. Ranks follow the ranking metric."
     )
-    for column in _columns_to_explain(tab):
+    # their headings alone say too little
+    for column in comparisons_of(tab):
         yield _explain(column.label, column.meaning)
     if tab.pictured is not None:
         count = _count(tab.pictured, "method", "methods")
@@ -916,16 +916,6 @@ def _notes(tab: Tab) -> Iterator[Markup]:
             raised.add(flag.name)
     for name in sorted(raised.intersection(LABELS)):
         yield _explain(*LABELS[name])
-
-
-def _columns_to_explain(tab: Tab) -> Iterator[Column]:
-    """Yield the columns of the first view whose heading alone says too little."""
-    if any(row.skill is not None for row in tab.rows):
-        yield SKILL
-    if any(row.against_classical is not None for row in tab.rows):
-        yield AGAINST_CLASSICAL
-    if any(row.on_shift is not None for row in tab.rows):
-        yield SKILL_ON_SHIFT
 
 
 def _explain(label: str, meaning: str) -> Markup:

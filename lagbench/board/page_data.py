@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
 from lagbench.figures.html import MISSING, text, words
+from lagbench.scoring.score_layout import spaced
 
 from .columns import describe_check, format_ranks
 from .encoding import ArrayStore, Reference
@@ -34,7 +35,6 @@ from .model import (
     Tab,
     Value,
 )
-from .sampling import spaced
 from .table import heading_of
 from .table_view import Line, TableView, describe_verification, target_loss
 

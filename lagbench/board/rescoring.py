@@ -220,7 +220,7 @@ class Rescoring:
                 expected=f"what {file.score_path} holds",
             )
 
-        issues = list(_compare_remarks(path, card, new_file, file))
+        issues = list(_compare_annotations(path, card, new_file, file))
         yield from issues
         if not differing and not issues:
             self.confirmations.append(
@@ -270,7 +270,7 @@ def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:
     )
 
 
-def _compare_remarks(
+def _compare_annotations(
     path: Path, card: ScoreCard, new_file: ScoredFile, file: EntryFile
 ) -> Iterator[ValidationIssue]:
     """Yield where flags, warnings, diverged scenarios or the budget differ."""
@@ -287,7 +287,10 @@ def _compare_remarks(
     for name, (new_value, old_value) in pairs.items():
         if new_value != old_value:
             yield make_issue(
-                "rescored", path, new_value, expected=f"{name} {old_value}"
+                "rescored",
+                path,
+                f"{name} {new_value}",
+                expected=f"{name} {old_value}",
             )
 
 

@@ -1,4 +1,4 @@
-"""Fewer frames, particles and nodes, as much as a page needs."""
+"""Fewer nodes, as many as a page needs."""
 
 from __future__ import annotations
 
@@ -6,24 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-
-
-def spaced(length: int, count: int) -> list[int]:
-    """Return at most so many evenly spaced indices, first and last included.
-
-    >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
-    ([0, 3, 6, 9], [0, 1, 2], [6])
-    """
-    if length <= count:
-        return list(range(length))
-    last = length - 1
-    if count == 1:
-        return [last]
-    indices = []
-    for number in range(count):
-        index = number * last // (count - 1)
-        indices.append(index)
-    return indices
 
 
 def coarsen(field: NDArray[np.floating], nodes: int) -> NDArray[np.float64]:

@@ -288,17 +288,33 @@ def _check_measures(data_set: SeasonDataSet, file: Path) -> None:
 
 
 def _check_seeds(season: Season, file: Path, name: str) -> None:
-    expected = with_seeds(season)
-    if season.season != name or expected != season:
+    """Refuse a season of another name, or with seeds that do not follow from its
+    frozen models.
+    """
+    if season.season != name:
+        raise ChecksFailedError(
+            "the file is of another season",
+            where=f"{file}, key season",
+            expected=name,
+            got=season.season,
+            fix="restore the file that `lagbench season close` wrote",
+        )
+    right_seeds = []
+    wrong_seeds = []
+    for data_set, seeded in zip(
+        season.data_sets, with_seeds(season).data_sets, strict=True
+    ):
+        if data_set.draw_seed == seeded.draw_seed:
+            continue
+        place = f"{data_set.split} {data_set.size}"
+        right_seeds.append(f"{place}: {seeded.draw_seed}")
+        wrong_seeds.append(f"{place}: {data_set.draw_seed}")
+    if wrong_seeds:
         raise ChecksFailedError(
             "the seeds of a season do not follow from its frozen models",
             where=str(file),
-            expected=", ".join(
-                str(data_set.draw_seed)[:16] for data_set in expected.data_sets
-            ),
-            got=", ".join(
-                str(data_set.draw_seed)[:16] for data_set in season.data_sets
-            ),
+            expected=", ".join(right_seeds),
+            got=", ".join(wrong_seeds),
             fix="restore the file that `lagbench season close` wrote",
         )
 

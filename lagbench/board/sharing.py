@@ -136,20 +136,20 @@ def require_weights_stay(folder: Folder, entry: Entry, previous: Entry | None) -
 
 
 def check_sharing(
-    entry: Entry, number: int, keepers: Mapping[Place, Entry]
+    entry: Entry, number: int, entries_by_place: Mapping[Place, Entry]
 ) -> Iterator[ValidationIssue]:
     """Yield why a prediction may not share the weights that another entry keeps.
 
     Args:
         entry: the entry that shares them.
         number: the prediction in it.
-        keepers: all entries, by place.
+        entries_by_place: all entries.
     """
     weights = entry.predictions[number].weights
     if weights is None or weights.shared_with is None:
         return
     where = weights_key(entry, number)
-    keeper = keepers.get(weights.place_of(entry.place))
+    keeper = entries_by_place.get(weights.place_of(entry.place))
     if keeper is None or weights.sha256 not in _hashes_of_kept_weights(keeper):
         yield make_issue(
             "weights",

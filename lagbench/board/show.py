@@ -18,6 +18,7 @@ from .columns import (
     SKILL,
     SKILL_ON_SHIFT,
     TableRow,
+    comparisons_of,
     cost_of,
     describe_check,
     format_ranks,
@@ -155,14 +156,11 @@ HEADINGS = {"against_classical": "÷class.", "skill_on_shift": "shift"}
 
 
 def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
-    names = [tab.ranking]
-    if any(row.against_classical for row in tab.rows):
-        names.append("against_classical")
-    if any(row.on_shift for row in tab.rows):
-        names.append(SHIFT)
-    names += metrics
-    if any(row.skill for row in tab.rows):
-        names.insert(0, "skill")
+    comparisons = [column.key for column in comparisons_of(tab)]
+    names = [tab.ranking, *comparisons, *metrics]
+    if SKILL.key in comparisons:
+        # the skill stands before the score
+        names.insert(0, SKILL.key)
     if wide:
         names += tab.columns
     return list(dict.fromkeys(names))

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lagbench.data.local import locate_new
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, format_count
 
 from .options import (
     JsonFlag,
@@ -55,8 +55,10 @@ def bench_command(
             fix="name a split of ours; `lagbench list` shows them",
         )
     result = bench_solver(tier.split, tier.name, frames=frames)
+    particles = format_count(result.particles, "particle")
+    substeps = format_count(result.substeps, "substep")
     line = (
         f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of "
-        f"{result.particles} particles, {result.substeps} substeps, on one core"
+        f"{particles}, {substeps}, on one core"
     )
     print_result(result, [line], as_json=as_json, quiet=quiet)

@@ -31,7 +31,6 @@ from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
 from lagbench.errors import (
     DataError,
-    LagbenchError,
     UsageError,
     check_regular,
     format_count,
@@ -62,10 +61,9 @@ from .output import (
     print_line,
     print_result,
     print_tables,
-    print_warning,
 )
 from .progress import note_at_start, progress_bar
-from .solver_bench import bench_in_own_process
+from .solver_bench import try_bench
 
 REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
 
@@ -370,11 +368,10 @@ def reproduce_command(
 
 def _time_solver(split: str, size: str) -> float | None:
     """Return the solver's time of a frame [s], None where it cannot run."""
-    try:
-        return bench_in_own_process(split, size).seconds_per_frame
-    except LagbenchError as error:
-        print_warning(f"the solver is not timed: {error}")
+    solver = try_bench(split, size, warning="the solver is not timed")
+    if solver is None:
         return None
+    return solver.seconds_per_frame
 
 
 def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterator[str]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from lagbench.data.layout import parse_ids
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, format_count
 from lagbench.exchange.adoption import adopt, import_split
 from lagbench.exchange.local_split import LocalSplit, format_bounds
 from lagbench.exchange.metadata import parse_kinds
@@ -265,14 +265,14 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
     for subset, count in local_split.scenarios.items():
         counts.append(f"{count} {subset}")
     fewest, most = local_split.particles
-    particles = f"{fewest} to {most}"
+    particles = f"{fewest} to {most} particles"
     if fewest == most:
-        particles = f"{fewest}"
+        particles = format_count(fewest, "particle")
+    frames = format_count(local_split.frames, "frame")
+    given_frames = format_count(local_split.input_frames, "frame")
     lines = [
-        f"{local_split.folder}: {', '.join(counts)}, {local_split.frames} frames, "
-        f"{particles} particles",
-        f"  task    {local_split.input_frames} frames given, "
-        f"{local_split.horizon} to predict",
+        f"{local_split.folder}: {', '.join(counts)}, {frames}, {particles}",
+        f"  task    {given_frames} given, {local_split.horizon} to predict",
         f"  box     {format_bounds(local_split.bounds)}",
         f"  hash    {local_split.dataset_sha256}",
         *_next_steps(local_split),

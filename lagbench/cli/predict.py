@@ -11,7 +11,7 @@ import typer
 
 from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, UsageError, check_regular, format_count
+from lagbench.errors import UsageError, check_regular, format_count
 from lagbench.work.machine import available_cores
 
 from .model_options import (
@@ -28,9 +28,9 @@ from .options import (
     ScoredSubsetOption,
     option,
 )
-from .output import print_result, print_warning
+from .output import print_result
 from .progress import progress_bar
-from .solver_bench import SolverBench, bench_in_own_process
+from .solver_bench import SolverBench, try_bench
 
 LARGEST_SEED = 2**31 - 1
 
@@ -251,26 +251,11 @@ class _SolverClock:
 
     def __call__(self, split: str, size: str) -> float | None:
         """Return the time of a frame [s]; None where the solver cannot run."""
-        self.bench = _bench_solver(split, size, quiet=self.quiet)
+        warning = None if self.quiet else "no speed-up over the solver"
+        self.bench = try_bench(split, size, warning=warning)
         if self.bench is None:
             return None
         return self.bench.seconds_per_frame
-
-
-def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:
-    """Return the cost of our solver on this machine.
-
-    None stands for local splits, and for machines where the solver cannot run, with a
-    warning.
-    """
-    if split not in load().splits:
-        return None
-    try:
-        return bench_in_own_process(split, size)
-    except LagbenchError as error:
-        if not quiet:
-            print_warning(f"no speed-up over the solver: {error}")
-        return None
 
 
 def _describe_onnx(

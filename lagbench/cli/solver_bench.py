@@ -6,11 +6,13 @@ import time
 from dataclasses import dataclass
 
 from lagbench.data.registry import load
-from lagbench.errors import check_installed
+from lagbench.errors import LagbenchError, check_installed
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.solver import build
 from lagbench.work.pool import Pool, Report, WorkItem
+
+from .output import print_warning
 
 WARM_UP_FRAMES = 2  # before the clock starts: kernels compile when they first run
 LEAST_SECONDS = 0.5  # shortest processor time over which the mean is taken [s]
@@ -83,6 +85,27 @@ def bench_in_own_process(split: str, size: str) -> SolverBench:
         results = [event.value for event in pool.events() if event.kind == "done"]
     result: SolverBench = results[0]
     return result
+
+
+def try_bench(split: str, size: str, *, warning: str | None) -> SolverBench | None:
+    """Time the solver in a process of its own; None where it cannot run.
+
+    Local splits have no solver, which is no reason for a warning.
+
+    Args:
+        split: name of a split.
+        size: name of a size.
+        warning: what is missing without the time, to warn of it with the reason; None
+            warns of nothing.
+    """
+    if split not in load().splits:
+        return None
+    try:
+        return bench_in_own_process(split, size)
+    except LagbenchError as error:
+        if warning is not None:
+            print_warning(f"{warning}: {error}")
+        return None
 
 
 def _bench_in_worker(split: str, size: str, report: Report) -> SolverBench:

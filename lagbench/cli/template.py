@@ -41,11 +41,11 @@ def template_command(
     first, last = result.frames
     scenarios = format_count(len(result.scenarios), "scenario")
     fewest, most = result.particle_range
-    particles = str(most)
+    particles = format_count(most, "particle")
     if fewest < most:
-        particles = f"{fewest} to {most}"
+        particles = f"{fewest} to {most} particles"
     line = (
         f"{result.path}: {scenarios}, frames {first} to {last}, "
-        f"{particles} particles, {format_bytes(result.bytes)}"
+        f"{particles}, {format_bytes(result.bytes)}"
     )
     print_result(result, [line], as_json=as_json, quiet=quiet)

@@ -21,6 +21,9 @@ LIST_FORMS = {
 LIST_OPTIONS = ("--subset", *LIST_FORMS)
 """Options that take several values in one word."""
 
+BENCH_OPTIONS = ("--size", "--frames")
+"""Options of the command bench whose value is the next word, beside the split."""
+
 MOST_LETTERS = 60
 """Letters of a word of the command line in a message."""
 
@@ -140,13 +143,20 @@ def advise_on_splits(words: Sequence[str]) -> str | None:
 
     >>> advise_on_splits(["lagbench", "bench", "solver", "cavity"])
     'name the split by an option: --split cavity'
+    >>> advise_on_splits(["lagbench", "bench", "solver", "cavity", "--split", "fluid"])
     """
-    if list(words[1:3]) != ["bench", "solver"] or len(words) == 3:
+    if list(words[1:3]) != ["bench", "solver"]:
         return None
-    word = words[3]
-    if word.startswith("-"):
+    is_named = any(word.startswith("--split") for word in words)
+    if is_named:
         return None
-    return f"name the split by an option: --split {shorten_word(word)}"
+    for number, word in enumerate(words[3:], start=3):
+        is_value = words[number - 1] in BENCH_OPTIONS
+        if word.startswith("-") or is_value:
+            continue
+        name = shlex.quote(shorten_word(word))
+        return f"name the split by an option: --split {name}"
+    return None
 
 
 def check_typed_settings(words: Sequence[str]) -> None:

@@ -309,19 +309,16 @@ def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
     """
     names = AXES[:dimension]
     unknown_axes = sorted(map(repr, set(axes) - set(names)))
+    fault = None
     if unknown_axes:
+        fault = f"periodic axes: the box has no axis {', '.join(unknown_axes)}"
+    elif len(set(axes)) != len(axes):
+        fault = "periodic axes are named once each"
+    if fault is not None:
         raise UsageError(
-            f"periodic axes: the box has no axis {', '.join(unknown_axes)}",
+            fault,
             where="periodic",
-            expected=f"axes of the box: {', '.join(names)}",
-            got=", ".join(map(str, axes)),
-            fix=f"name axes of the box, as in {names[0]} or {','.join(names)}",
-        )
-    if len(set(axes)) != len(axes):
-        raise UsageError(
-            "periodic axes are named once each",
-            where="periodic",
-            expected=f"some of {', '.join(names)}",
+            expected=f"axes of the box, each at most once: {', '.join(names)}",
             got=", ".join(map(str, axes)),
             fix=f"name axes of the box, as in {names[0]} or {','.join(names)}",
         )

@@ -141,10 +141,14 @@ def describe_expectation(detail: ErrorDetails) -> str:
 
 
 def describe_input(detail: ErrorDetails) -> str:
-    """Return what pydantic found, shortened; the name of its class if it is long."""
+    """Return what pydantic found, shortened."""
     if detail["type"] in {"missing", "missing_argument"}:
         return "no such key"
-    value = detail["input"]
+    return describe_value(detail["input"])
+
+
+def describe_value(value: object) -> str:
+    """Return a value of a file, shortened; of a list and the like only the class."""
     # Python prints no thousands of digits.
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a whole number of {value.bit_length()} bits"

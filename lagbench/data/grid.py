@@ -232,7 +232,7 @@ class Fields:
         """Return the fields in one plane across z, in three dimensions.
 
         Args:
-            layer: number of its nodes along z.
+            layer: index along z of the plane's nodes, from 0.
         """
         return Fields(
             self.grid.section,

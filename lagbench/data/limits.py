@@ -9,10 +9,13 @@ one.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lagbench.errors import suggest_name
+
+from .field_errors import describe_value
 
 Value = int | float | bool | str
 
@@ -37,7 +40,8 @@ class Limit:
         """Tell whether a value is a finite number within the limit."""
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return False
-        if not math.isfinite(value):
+        # also an integer may be larger than any float; no comparison holds for NaN
+        if not abs(value) <= sys.float_info.max:
             return False
         if self.whole and not isinstance(value, int):
             return False
@@ -90,7 +94,8 @@ def check_parameters(
         declared: default value of each parameter of the split; None without one.
 
     Raises:
-        ValueError: a parameter is unknown, missing or outside its limit.
+        ValueError: a parameter is unknown, missing or outside its limit, or the split
+            does not declare one that every split needs.
     """
     for name in values:
         if name not in declared:
@@ -118,7 +123,7 @@ def check_parameters(
         is_own_choice = isinstance(value, bool | str) and name not in NEEDED
         limit = NEEDED.get(name, Limit())
         if not is_own_choice and not limit.holds(value):
-            raise ValueError(f"{key}: expected {limit}; got {value!r}")
+            raise ValueError(f"{key}: expected {limit}; got {describe_value(value)}")
 
 
 def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:

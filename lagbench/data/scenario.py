@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import DataError, LagbenchError
 
+from . import MATERIALS
 from .checksums import ContentHasher, to_plain
 from .hdf5 import (
     DEFLATE_RATIO,
@@ -237,6 +238,25 @@ class ScenarioFile:
         for start in range(0, length, step):
             yield self.read(name, slice(start, start + step))
 
+    def check_material(self) -> None:
+        """Refuse numbers that stand for no material.
+
+        Raises:
+            DataError: there is such a number, or the file is damaged.
+        """
+        if "material" not in self._variables:
+            return
+        for block in self.blocks("material"):
+            is_known = np.isin(block, range(len(MATERIALS)))
+            if not is_known.all():
+                raise DataError(
+                    "a particle has an unknown material",
+                    where=f"{self.path}, variable 'material'",
+                    expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
+                    got=block[~is_known][0],
+                    fix=_repair_hint(self.path),
+                )
+
     def check_attributes(self) -> None:
         """Refuse attributes that make other readers read other values."""
         with _damage_errors(self.path):
@@ -313,7 +333,7 @@ def rehash(path: Path) -> str:
 
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
-    """Recompute a file's content hash, compare it, and check what is not hashed.
+    """Recompute a file's content hash, compare it, and check materials and attributes.
 
     Args:
         path: the scenario file.
@@ -323,39 +343,41 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
         The content hash.
 
     Raises:
-        DataError: a hash differs, or the attributes are not those of the format.
+        DataError: a hash differs, a material is unknown, or the attributes are not
+            those of the format.
     """
     with read_scenario(path) as file:
         stored_hashes = file.stored_hashes()
         stored_content_hash = file.header.content_sha256
         hasher = file.computed_hasher()
         file.check_attributes()
-    for name, variable_hash in hasher.digests().items():
-        if stored_hashes.get(name) != variable_hash:
+        for name, variable_hash in hasher.digests().items():
+            if stored_hashes.get(name) != variable_hash:
+                raise _hash_error(
+                    "values differ from their hash",
+                    where=f"{path}, variable {name!r}",
+                    expected=stored_hashes.get(name),
+                    got=variable_hash,
+                    path=path,
+                )
+        content_hash = hasher.hexdigest()
+        if content_hash != stored_content_hash:
             raise _hash_error(
-                "values differ from their hash",
-                where=f"{path}, variable {name!r}",
-                expected=stored_hashes.get(name),
-                got=variable_hash,
+                "attributes differ from their hash",
+                where=f"{path}, attributes",
+                expected=stored_content_hash,
+                got=content_hash,
                 path=path,
             )
-    content_hash = hasher.hexdigest()
-    if content_hash != stored_content_hash:
-        raise _hash_error(
-            "attributes differ from their hash",
-            where=f"{path}, attributes",
-            expected=stored_content_hash,
-            got=content_hash,
-            path=path,
-        )
-    if expected is not None and not content_hash.startswith(expected):
-        raise _hash_error(
-            "the file has another content hash",
-            where=str(path),
-            expected=expected,
-            got=content_hash,
-            path=path,
-        )
+        if expected is not None and not content_hash.startswith(expected):
+            raise _hash_error(
+                "the file has another content hash",
+                where=str(path),
+                expected=expected,
+                got=content_hash,
+                path=path,
+            )
+        file.check_material()
     return content_hash
 
 

@@ -7,10 +7,11 @@ generation workers stay small.
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
+from . import MATERIALS
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
 from .layout import ScenarioKey
@@ -95,9 +97,14 @@ class ScenarioWriter:
             is none.
         licence: licence of the data; not hashed.
         dimension: number of axes of the box, 2 or 3.
-        periodic: names of the axes without walls. They are the hashed attribute
-            ``periodic``, which files without such axes do not have.
+        periodic: names of the axes without walls, in any order. They are the hashed
+            attribute ``periodic``, which files without such axes do not have.
         has_velocity: whether velocities of the solver are stored.
+
+    Raises:
+        DataError: there are too many particles, their material is unknown, or a
+            parameter cannot be stored.
+        UsageError: a periodic axis is that of no box, or named twice.
     """
 
     def __init__(
@@ -138,8 +145,9 @@ class ScenarioWriter:
             all_parameters["reynolds_number"] = reynolds
         self._parameters = _check_parameters(all_parameters, path)
         if periodic:
-            parse_periodic(periodic, dimension)
-            self._parameters["periodic"] = " ".join(periodic)
+            is_periodic = parse_periodic(periodic, dimension)
+            names = itertools.compress(AXES, is_periodic)
+            self._parameters["periodic"] = " ".join(names)
         self._labels = {
             "seed": seed,
             "device": device,
@@ -159,7 +167,7 @@ class ScenarioWriter:
         self._add_constant(
             "space", ("space",), np.array(AXES[:dimension], dtype=object)
         )
-        materials = np.asarray(material, dtype=np.int8)
+        materials = _check_material(material, particles, path)
         self._add_constant("material", ("particle",), materials)
         mass = np.asarray(particle_mass, dtype=np.float64)
         self._add_constant("particle_mass", (), mass)
@@ -297,7 +305,9 @@ class ScenarioWriter:
     ) -> None:
         """Finish and rename the file, or remove it when the body raised."""
         if error is not None:
-            self._stack.__exit__(kind, error, trace)
+            # the error of the body goes on as it is, whatever its kind
+            with suppress(WorkFailedError):
+                self._stack.__exit__(kind, error, trace)
             return
         with self._stack:  # its exit closes and renames the file
             digests = self._hasher.digests()
@@ -334,6 +344,31 @@ def _chunk_shape(
     if "particle" in dims and "frame" in dims:
         return (1, min(shape[1], PARTICLES_PER_CHUNK), *shape[2:])
     return shape or None
+
+
+def _check_material(
+    material: ArrayLike, particles: int, path: Path
+) -> NDArray[np.int8]:
+    """Return the material of each particle; refuse other shapes and other numbers."""
+    numbers = np.asarray(material)
+    where = f"{path}, variable 'material'"
+    if numbers.shape != (particles,):
+        raise DataError(
+            "the materials have the wrong shape",
+            where=where,
+            expected=(particles,),
+            got=numbers.shape,
+        )
+    # before the cast, which wraps
+    is_known = np.isin(numbers, range(len(MATERIALS)))
+    if not is_known.all():
+        raise DataError(
+            "a particle has an unknown material",
+            where=where,
+            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
+            got=numbers[~is_known][0],
+        )
+    return numbers.astype(np.int8)
 
 
 def _check_parameters(

@@ -20,6 +20,9 @@ from lagbench.errors import UnreadableFileError, check_regular
 MAX_BYTES = 4 * 2**20
 """Largest YAML file that is read [bytes]."""
 
+MOST_LETTERS = 80
+"""Letters of a key in a message."""
+
 MAX_DEPTH = 32
 """Deepest nesting of mappings and lists that is read."""
 
@@ -48,8 +51,13 @@ class _StrictLoader(yaml.CSafeLoader):
         mapping: dict[Hashable, Any] = {}
         for key_node, value_node in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, Hashable) or key in mapping:
-                message = f"key {key!r} is given twice or cannot be a key"
+            mistake = None
+            if not isinstance(key, Hashable):
+                mistake = "cannot be a key"
+            elif key in mapping:
+                mistake = "is given twice"
+            if mistake is not None:
+                message = f"key {ascii(key)[:MOST_LETTERS]} {mistake}"
                 raise yaml.constructor.ConstructorError(
                     None, None, message, key_node.start_mark
                 )

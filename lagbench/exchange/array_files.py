@@ -335,7 +335,10 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as archive:
-        names = Counter(member.filename for member in archive.infolist())
+        # numpy reads position.npy and position as one array
+        names = Counter(
+            member.filename.removesuffix(".npy") for member in archive.infolist()
+        )
         repeated_names = [name for name, count in names.items() if count > 1]
         if repeated_names:
             raise UnreadableFileError(
@@ -346,13 +349,14 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 fix="write it again with numpy.savez",
             )
         for member in archive.infolist():
+            if member.filename.removesuffix(".npy") not in ARRAYS:
+                continue  # it is never read
             name = f"{path}, {member.filename}"
             check_inflation(
                 name, packed=member.compress_size, unpacked=member.file_size
             )
-            if member.filename.removesuffix(".npy") in ARRAYS:
-                with archive.open(member) as stream:
-                    _check_header(name, stream, member.file_size)
+            with archive.open(member) as stream:
+                _check_header(name, stream, member.file_size)
     with np.load(path, allow_pickle=False) as file:
         _require_positions(path, file.files)
         arrays = {}

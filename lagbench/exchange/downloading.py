@@ -410,9 +410,9 @@ class DownloadJob:
             hint=HINT,
         )
         try:
-            with closing(archive) as claims:
-                for claim in claims:
-                    self._record_file(url, claim.scenario, claim)
+            with closing(archive) as arrived_entries:
+                for entry in arrived_entries:
+                    self._record_file(url, entry.scenario, entry)
         except NotInStoreError:
             return False
         return True

@@ -91,7 +91,8 @@ def export(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         format: "gns-npz" or "lagrangebench-h5".
         output: folder for the files.
         root: folder of all data sets, see :func:`lagbench.data.local.resolve_root`.

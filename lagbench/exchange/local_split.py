@@ -6,20 +6,22 @@ there whole or not at all. One frame of one trajectory is in memory at a time.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import temporary_name
-from lagbench.data.box import AXES, SMALL_SIDE, Box, unit_box
+from lagbench.atomic import SUFFIX, check_writable, temporary_name, write_atomically
+from lagbench.data.box import AXES, SMALL_SIDE, Box, parse_periodic, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
 from lagbench.data.layout import (
@@ -69,6 +71,9 @@ HEAD = (
     "# A local split of lagbench, written by `lagbench {}`; "
     'its hashes stand under "measured".\n'
 )
+
+LOCK_NAME = ".lock"
+"""File in a folder beside the target that the process which builds it has locked."""
 
 SPACINGS_PER_CELL = 2.5
 """Spacings of particles across a cell of the score grid; our splits have 1.8 to 2.6."""
@@ -285,16 +290,17 @@ def _describe_size(bounds: Bounds) -> Iterator[str]:
 def _staging_folder(folder: Path) -> Iterator[Path]:
     """Yield a folder beside the target that vanishes at the end.
 
+    Those that killed calls for the same target left are removed first.
+
     Raises:
         WorkFailedError: it cannot be made or written to, or another call has it.
     """
+    check_writable(folder, option="--output")
+    _remove_abandoned(folder)
     root = temporary_name(folder)
     try:
         root.mkdir(parents=True)
     except FileExistsError as error:
-        # a parent folder that is a dangling link raises it too
-        if not os.path.lexists(root):
-            raise _write_error(folder, error.strerror or error) from error
         raise WorkFailedError(
             "another call makes this folder",
             where=str(folder),
@@ -305,14 +311,47 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
     except OSError as error:
         raise _write_error(folder, error.strerror or error) from error
 
+    lock = filelock.FileLock(root / LOCK_NAME)
+    # without a lock, as on disks that have none, no call removes the folder
+    with suppress(OSError, NotImplementedError):
+        lock.acquire(timeout=0)
     try:
         yield root
     except WorkFailedError as error:
+        if not _is_below(root, error.where):
+            raise
         raise _write_error(folder, error.got) from error
     except OSError as error:
+        # others come from the source, or from who watches the progress
+        if not _is_below(root, error.filename):
+            raise
         raise _write_error(folder, error.strerror or error) from error
     finally:
+        lock.release()
         shutil.rmtree(root, ignore_errors=True)
+
+
+def _is_below(root: Path, place: object) -> bool:
+    """Return whether an error is about a place in a folder."""
+    return str(place).startswith(f"{root}{os.sep}")
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Remove the folders that killed calls for the same target left beside it.
+
+    The system has dropped the lock of a killed process, on whatever machine it was.
+    """
+    for leftover in folder.parent.glob(f".{folder.name}.*{SUFFIX}"):
+        lock_path = leftover / LOCK_NAME
+        if not lock_path.is_file():
+            continue
+        lock = filelock.FileLock(lock_path)
+        try:
+            lock.acquire(timeout=0)
+        except (OSError, NotImplementedError):  # its process works, or is not known
+            continue
+        lock.release()
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 def _write_error(folder: Path, reason: object) -> WorkFailedError:
@@ -669,7 +708,7 @@ class SplitBuilder:
             "measured": {name: {SIZE: measured}},
         }
         text = HEAD.format(command) + format_yaml(registry)
-        (self.root / name / DESCRIPTION).write_text(text, encoding="utf-8")
+        write_atomically(self.root / name / DESCRIPTION, text.encode())
         return manifest
 
     def _describe_split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
@@ -784,9 +823,10 @@ class SplitBuilder:
 
     def _describe_periodic(self) -> dict[str, object]:
         """Return the key of the periodic axes; none where there are only walls."""
-        if not self.description.periodic:
+        is_periodic = parse_periodic(self.description.periodic, self.dimension)
+        if not any(is_periodic):
             return {}
-        return {"periodic": list(self.description.periodic)}
+        return {"periodic": list(itertools.compress(AXES, is_periodic))}
 
     def _describe_particle_counts(self) -> dict[str, object]:
         """Return the key of the numbers of particles; none where all are alike."""

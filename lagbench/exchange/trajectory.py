@@ -229,7 +229,7 @@ class DataOptions(TypedDict, total=False):
 
 def read_options(path: Path) -> DataOptions:
     """Return what a YAML file says of the data."""
-    return _validate_options(read_yaml(path), where=f"{path}, key ")
+    return _validate_options(read_yaml(path), path)
 
 
 def check_options(options: DataOptions) -> DataOptions:
@@ -243,36 +243,37 @@ def check_options(options: DataOptions) -> DataOptions:
             plain[name] = value.tolist()
         elif value is not None:
             plain[name] = value
-    return _validate_options(plain, where="")
+    return _validate_options(plain, None)
 
 
-def _validate_options(options: object, *, where: str) -> DataOptions:
-    plain: DataOptions = {}
+def _validate_options(options: object, path: Path | None) -> DataOptions:
+    """Return checked options, from a file or, without a path, from a caller."""
+    checked_options: DataOptions = {}
     details: list[ErrorDetails] = []
     try:
-        plain = TypeAdapter(DataOptions).validate_python(options)
+        checked_options = TypeAdapter(DataOptions).validate_python(options)
     except ValidationError as error:
         details = error.errors()
 
     mistakes = UsageErrorCollector()
     for detail in details[:MOST_MISTAKES]:
         with mistakes:
-            raise _option_error(detail, where=where)
-    untold = len(details) - MOST_MISTAKES
-    if untold > 0:
+            raise _option_error(detail, path)
+    omitted_count = len(details) - MOST_MISTAKES
+    if omitted_count > 0:
         with mistakes:
             raise UsageError(
                 "there are more mistakes",
-                where=where or "the options",
+                where="the options" if path is None else str(path),
                 expected="options as docs/exchange.md has them",
-                got=f"{untold} more",
-                fix="mend those that are told, then try again",
+                got=f"{omitted_count} more",
+                fix="correct those above, then try again",
             )
     mistakes.raise_errors()
-    return plain
+    return checked_options
 
 
-def _option_error(detail: ErrorDetails, *, where: str) -> UsageError:
+def _option_error(detail: ErrorDetails, path: Path | None) -> UsageError:
     """Return what is wrong with one key of the options."""
     key = quote(".".join(map(str, detail["loc"])))[1:-1]
     expected = describe_expectation(detail)
@@ -280,9 +281,12 @@ def _option_error(detail: ErrorDetails, *, where: str) -> UsageError:
     if detail["type"] == "extra_forbidden":
         expected = "a key of a description"
         fix = suggest_name(key, DataOptions.__annotations__)
+    where = key or "(whole file)"
+    if path is not None:
+        where = f"{path}, key {where}"
     return UsageError(
         "this does not describe data",
-        where=f"{where}{key or '(whole file)'}",
+        where=where,
         expected=expected,
         got=describe_input(detail),
         fix=fix,
@@ -596,12 +600,13 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
-    """Refuse an array [bytes] that is far larger than what a file holds of it."""
-    if unpacked > max(HARMLESS_BYTES, MOST_INFLATION * packed):
+    """Refuse an array that unpacks to far more bytes than its file holds of it."""
+    most = max(HARMLESS_BYTES, MOST_INFLATION * packed)
+    if unpacked > most:
         raise UnreadableFileError(
             "the file would unpack to far more than it holds",
             where=where,
-            expected=f"at most {MOST_INFLATION} times {packed} bytes",
+            expected=f"at most {most} bytes",
             got=f"{unpacked} bytes",
             fix="save it without compression if it is yours; else leave it out",
         )

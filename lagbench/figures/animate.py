@@ -31,7 +31,9 @@ from .panels import (
     colour_bar,
     draw_material_key,
     limit_of,
+    median_limit,
     name_slice,
+    strongest_limit,
 )
 from .plot import SEPARATOR, describe
 from .recording import Recording, open_recording
@@ -297,13 +299,15 @@ def _common_limit(recordings: Sequence[Recording], panel: Panel) -> float:
         limits = []
         for number in _sample_frames(recording):
             limits.append(limit_of(panel, recording.scene(number)))
+        if not any(limits):
+            continue  # nothing moves: the others have the scale
         if panel is Panel.VORTICITY:
             # No vorticity is white: on the scale of the strongest frame most of a film
             # would be pale.
-            tops.append(float(np.median(limits)))
+            tops.append(median_limit(limits))
         else:
-            tops.append(max(limits))
-    return max(tops)
+            tops.append(strongest_limit(limits))
+    return strongest_limit(tops)
 
 
 def _check_vorticity(recording: Recording, frames: Sequence[int]) -> None:

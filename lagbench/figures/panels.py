@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -110,7 +110,10 @@ _ARROWHEADS = (-0.4, -0.2, 0.0, 0.2, 0.4)
 
 
 def limit_of(panel: Panel, scene: Scene) -> float:
-    """Return the top of the colour scale: the 99th percentile of what is shown."""
+    """Return the top of the colour scale: the 99th percentile of what is shown.
+
+    It is 0 where nothing moves; see :func:`strongest_limit` and :func:`median_limit`.
+    """
     if panel is Panel.SPEED or panel in VIEWS:
         values = scene.speed
     elif panel is Panel.VORTICITY:
@@ -118,8 +121,24 @@ def limit_of(panel: Panel, scene: Scene) -> float:
     else:
         values = _grid_speed(scene)[scene.fields.counted]
     if values.size == 0:
+        return 0.0
+    return float(np.percentile(values, 99.0))
+
+
+def strongest_limit(limits: Sequence[float]) -> float:
+    """Return one top of the colour scales of frames: the largest; 1 if none moves."""
+    return max(limits, default=0.0) or 1.0
+
+
+def median_limit(limits: Sequence[float]) -> float:
+    """Return one top of the colour scales of frames: their median; 1 if none moves.
+
+    Frames in which nothing moves do not count.
+    """
+    moving = [limit for limit in limits if limit > 0.0]
+    if not moving:
         return 1.0
-    return float(np.percentile(values, 99.0)) or 1.0
+    return float(np.median(moving))
 
 
 def draw(

@@ -32,7 +32,9 @@ from .panels import (
     draw,
     draw_material_key,
     limit_of,
+    median_limit,
     moving_walls,
+    strongest_limit,
     title_of,
 )
 from .recording import Recording, Scene, open_recording
@@ -157,7 +159,7 @@ def plot_frame(
             if is_single:
                 title = f"{title}\nframe {scene.frame}, t = {scene.time:.2f} s"
             shrink(axes.set_title(title), SIDE)
-            limit = limit_of(panel, scene)
+            limit = strongest_limit([limit_of(panel, scene)])
             draw(axes, panel, scene, limit=limit)
 
             bar_bottom = (BAR - 0.2) / height
@@ -409,9 +411,10 @@ def _arrange_over_time(
     elif panel is None:
         panel = Panel.SPEED
 
-    limit = 0.0
+    limits = []
     for scene in itertools.chain(*rows):
-        limit = max(limit, limit_of(panel, scene))
+        limits.append(limit_of(panel, scene))
+    limit = strongest_limit(limits)
     cells = []
     for kind, row in zip(kinds, rows, strict=True):
         line = []
@@ -454,7 +457,7 @@ def _arrange_table(
                 scene = recording.scene(number)
                 scenes.append(scene)
                 limits.append(limit_of(panel, scene))
-    common_limit = float(np.median(limits))
+    common_limit = median_limit(limits)
 
     # speeds of driven flows are compared with the speed of the wall
     is_wall_scaled = is_driven and panel in (Panel.STREAMLINES, Panel.SPEED)

@@ -148,7 +148,8 @@ def verify(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         subset: some subsets only.

@@ -160,7 +160,7 @@ class Metric:
     statistic is NaN, the frame is undefined: left out of the mean and counted.
 
     Raises:
-        UsageError: both ``statistic`` and ``of`` are missing; ``of`` is a string; a
+        UsageError: both ``statistic`` and ``of`` are missing; ``of`` is no tuple; a
             target has no ``perfect`` value; the name does not consist of small letters,
             digits and underscores; or there is no direction.
     """
@@ -202,7 +202,7 @@ class Metric:
             raise UsageError(
                 f"metric {self.name!r} has no statistic, own or of other metrics",
                 where="statistic and of",
-                expected="one of the two",
+                expected="at least one of the two",
                 got="neither",
                 fix="decorate the function of the statistic, or name others by of=",
             )
@@ -243,6 +243,14 @@ class Metric:
                 expected=f"({statistics!r},)",
                 got=repr(statistics),
                 fix="add the comma",
+            )
+        if not isinstance(statistics, (tuple, list)):
+            raise UsageError(
+                f"metric {self.name!r} follows from no tuple of statistics",
+                where="of",
+                expected="a tuple of names",
+                got=repr(statistics)[:100],
+                fix="name statistics, as in of=('position_rmse',)",
             )
         for name in (self.name, *self.of):
             is_text = isinstance(name, str)

@@ -119,7 +119,9 @@ def _errors_of_material(
 def _over_rollouts(
     name: str, word: str, reduction: Callable[[Floats], float], source: str
 ) -> Iterator[Metric]:
-    """Yield a reduction of ``attribute_mse`` over the rollout and over each horizon."""
+    """Yield the metrics that reduce ``attribute_mse`` over the rollout, and over each
+    horizon.
+    """
     rollout = partial(
         _error, unit="1", source=source, of=("attribute_mse",), per_frame=False
     )

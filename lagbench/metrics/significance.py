@@ -9,6 +9,7 @@ the methods.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,12 @@ def sign_flip_p(differences: ArrayLike) -> float:
             expected=f"1 to {MOST_SCENARIOS} scenarios",
             got=d.size,
         )
+
+    # Sums of numbers near the largest float would be infinite. The factor is a power of
+    # two, so that no digit changes.
+    _, exponent = np.frexp(np.max(d))
+    signed = np.ldexp(signed, -exponent)
+    d = np.ldexp(d, -exponent)
 
     observed = abs(float(np.sum(signed))) - ROUNDING * float(np.sum(d))
     if observed <= 0.0:
@@ -210,6 +217,10 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
                 "pairs of different numbers of seeds", got=f"{len(a)} and {len(b)}"
             )
         a = a - b
+        # a scenario that no seed has in both methods compares nothing
+        is_defined = np.asarray(~np.isnan(a).all(axis=0))
+        a = a[:, is_defined]
+        common = tuple(itertools.compress(common, is_defined))
         b = np.zeros((1, len(common)))
 
     interval = (math.nan, math.nan)

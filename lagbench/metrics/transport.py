@@ -101,9 +101,10 @@ def _sinkhorn_cost(a: NDArray[np.float64], b: NDArray[np.float64], box: Box) -> 
 
 
 def at_cloud_frames(pair: FramePair) -> bool:
-    """Return whether this is every tenth frame in which a truth with a surface moves.
+    """Return whether clouds are compared at this frame.
 
-    Of fewer than ten moving frames it is the last one.
+    That is each tenth frame in which a truth with a surface moves. With fewer than ten
+    such frames it is the last one.
     """
     if pair.scenario.config.is_full_box:
         return False

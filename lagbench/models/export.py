@@ -63,7 +63,8 @@ def export_onnx(
         step: the model.
         path: file to write, named ``.onnx``.
         split: name of the split.
-        size: name of the size; the only one with data when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         modules: the networks whose weights ``step`` uses, if it is no module itself.
         history: how many of the last given frames the model sees; all by default.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.

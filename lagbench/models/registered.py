@@ -37,7 +37,8 @@ def build_registered(
     Args:
         baseline: name of the architecture, such as ``gns`` or ``neuralmpm``.
         split: name of the split.
-        size: name of the size; the only one with data when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         options: options of the model; those that are missing have their defaults.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         registry: where splits are described; ours when None.

@@ -193,11 +193,10 @@ def _give_back(constants: SolverParameters, solver: Solver) -> None:
 def spread_subset(
     position: Floats, material: NDArray[np.integer], count: int
 ) -> NDArray[np.intp]:
-    """Return the numbers of particles spread evenly over each material: one, drawn, of
-    each small group.
+    """Return which particles carry the mass: one, drawn, of each group of neighbours.
 
-    Groups are neighbours in columns of nearly equal counts, as the lattices of full
-    boxes are.
+    Groups follow material, column and height. A material with fewer particles than a
+    group may get none.
     """
     order = _order_of_columns(position, material, count)
     draws = np.random.Generator(np.random.PCG64(0)).random(count)

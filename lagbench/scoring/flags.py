@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
+from lagbench.errors import format_count
 from lagbench.metrics.frame import FramePair, Scenario, average, dot, mean_square
 from lagbench.metrics.metric import mean, quotient
 
@@ -217,6 +218,8 @@ def judge_copying(traces: Sequence[Trace]) -> Flag:
     for trace in traces:
         scenarios.append(analyse_error(trace))
     exact = sum(scenario.exact for scenario in scenarios)
+    verb = "is" if exact == 1 else "are"
+    exact_frames = format_count(exact, "predicted frame")
     best = min(scenarios, key=lambda scenario: scenario.shift_gain)
     is_independent = any(s.autocorrelation < AUTOCORRELATION for s in scenarios)
     is_reset = any(s.drop < DROP for s in scenarios)
@@ -224,7 +227,7 @@ def judge_copying(traces: Sequence[Trace]) -> Flag:
     is_bounded = any(s.growth < GROWTH and s.steps < 1.0 for s in scenarios)
 
     reasons = {
-        f"{exact} predicted frames are the truth, bit for bit": exact > 0,
+        f"{exact_frames} {verb} the truth, bit for bit": exact > 0,
         "the error of a frame does not follow from that of the frame before": (
             is_independent
         ),
@@ -267,22 +270,25 @@ def judge_predictability(
     """
     name = "below_twin_floor"
     if len(limit) != len(error):
-        return Flag(
-            name=name,
-            raised=None,
-            reasons=("no predictability limit is recorded",),
-            evidence={},
-        )
+        reason = "no predictability limit is recorded"
+        if len(limit):
+            reason = "no predictability limit of these frames is recorded"
+        return Flag(name=name, raised=None, reasons=(reason,), evidence={})
 
     perturbed = np.asarray(limit, np.float64)
     is_compared = perturbed < REGULAR_SHARE * persistence
     is_below = is_compared & (error < perturbed)
     count = int(np.count_nonzero(is_below))
-    reason = f"{count} frames are closer to the truth than the perturbed run"
     evidence = {
         "frames_below": float(count),
         "frames_compared": float(np.count_nonzero(is_compared)),
     }
+    if not is_compared.any():
+        reason = "the perturbed run has lost the truth in all frames"
+        return Flag(name=name, raised=None, reasons=(reason,), evidence=evidence)
+    verb = "is" if count == 1 else "are"
+    frames = format_count(count, "frame")
+    reason = f"{frames} {verb} closer to the truth than the perturbed run"
     return _make_flag(name, {reason: count > 0}, evidence)
 
 

@@ -67,6 +67,7 @@ class _ScoresContent(_Content):
     dataset_version: Text
     dataset_sha256: Text
     method: Text
+    subset: Text = "test"  # absent where it is test
     predictions_sha256: Text
     ranking_metric: Text
     task: _TaskContent
@@ -79,6 +80,7 @@ class PublishedScores:
 
     # split, size, version and hash of the data set, and the method
     identity: Mapping[str, str]
+    subset: str  # subset that was predicted
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     # scores by row and metric, over the horizon; values per frame are not in the file
@@ -132,6 +134,7 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
         identity[name] = getattr(checked, name)
     return PublishedScores(
         identity=identity,
+        subset=checked.subset,
         predictions_sha256=checked.predictions_sha256,
         ranking=checked.ranking_metric,
         scores=rows,

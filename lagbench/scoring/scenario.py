@@ -34,7 +34,7 @@ from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
 from .package_metrics import package_metric_errors
-from .score_layout import FRAMES, PARTICLES, SUBMISSION, Preview
+from .score_layout import FRAMES, PARTICLES, SUBMISSION, Preview, spaced
 from .task import ScoredTask
 
 POSITION_LIMIT = 1e6
@@ -57,8 +57,8 @@ class PreviewRecorder:
         config = scenario.config
         frames = config.predicted_frames
         map_frames = tuple(sorted(config.slow_frames.intersection(frames)))
-        film_frames = _spaced(frames, FRAMES)
-        particles = _spaced(range(len(scenario.material)), PARTICLES)
+        film_frames = tuple(frames[i] for i in spaced(len(frames), FRAMES))
+        particles = tuple(spaced(len(scenario.material), PARTICLES))
 
         maps = (2, len(map_frames))
         nodes = config.grid.section.shape
@@ -116,20 +116,6 @@ class PreviewRecorder:
 
 def _clip_vorticity(vorticity: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(vorticity, -VORTICITY_LIMIT, VORTICITY_LIMIT)
-
-
-def _spaced(numbers: range, count: int) -> tuple[int, ...]:
-    """Return evenly spaced members of a range, first and last included.
-
-    All of them if there are few.
-
-    >>> _spaced(range(6, 16), 4)
-    (6, 9, 12, 15)
-    """
-    if len(numbers) <= count:
-        return tuple(numbers)
-    last = len(numbers) - 1
-    return tuple(numbers[i * last // (count - 1)] for i in range(count))
 
 
 @dataclass(frozen=True, kw_only=True)

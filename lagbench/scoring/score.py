@@ -59,7 +59,7 @@ from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics
-from .score_layout import SUBMISSION
+from .score_layout import IDENTITY, SUBMISSION
 from .skill import (
     compare_with_solvers,
     compute_skill,
@@ -368,23 +368,35 @@ def _require_validation_of(path: Path, result: ValidationResult) -> None:
 
 
 def _check_overwriting(path: Path, header: Header) -> None:
-    """Refuse to write over scores of another method or data set."""
+    """Refuse to write over scores of another method, data set or subset."""
     if not path.exists():
         return
+    identity = {}
+    for name in IDENTITY:
+        identity[name] = getattr(header, name)
+    expected = _describe_scored(identity, header.subset)
     try:
-        identity = read_scores(path).identity
-        present = f"{identity['method']} {identity['split']} {identity['size']}"
+        scores = read_scores(path)
+        present = _describe_scored(scores.identity, scores.subset)
     except UnreadableFileError:
         present = "something else"
-    expected = f"{header.method} {header.split} {header.size}"
     if present != expected:
         raise UsageError(
             "the folder holds the scores of another submission",
             where=str(path),
             expected=f"no such file, or the scores of {expected}",
             got=present,
-            fix="keep them: --output FOLDER",
+            fix="keep them: --output FOLDER; or remove them",
         )
+
+
+def _describe_scored(identity: Mapping[str, str], subset: str) -> str:
+    """Return method, data set and subset of scores in words."""
+    split = identity["split"]
+    size = identity["size"]
+    version = identity["dataset_version"]
+    sha256 = identity["dataset_sha256"]
+    return f"{identity['method']} {split} {size} {version} {subset}, data {sha256}"
 
 
 def _warn_of_few_nodes(

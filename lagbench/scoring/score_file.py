@@ -10,6 +10,7 @@ be formed again.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,6 +38,7 @@ class SubmissionStatistics:
 
     # split, size, version and hash of the data set, and the method
     identity: Mapping[str, str]
+    subset: str  # subset that was predicted
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     tallies: Mapping[int, Tally]  # statistics of the submission by scenario
@@ -104,8 +106,12 @@ def statistics_in(file: h5py.File) -> SubmissionStatistics:
     if layout != FORMAT:
         raise ValueError(f"layout {layout!r}, not {FORMAT}")
     reference, reference_values = _read_reference(file)
+    subset = "test"
+    if "subset" in file.attrs:
+        subset = _read_text(file, "subset")
     return SubmissionStatistics(
         identity={name: _read_text(file, name) for name in IDENTITY},
+        subset=subset,
         predictions_sha256=_read_text(file, "predictions_sha256"),
         ranking=_read_text(file, "ranking_metric"),
         tallies=_read_tallies(file),
@@ -142,6 +148,9 @@ def _read_tallies(file: h5py.File) -> dict[int, Tally]:
     names = tuple(statistics.split())
     frames = tuple(open_variable(file, "frame")[...].tolist())
     scenarios = open_variable(file, "scenario")[...].tolist()
+    # the scores of the reference are stored in the same order
+    if not all(first < second for first, second in itertools.pairwise(scenarios)):
+        raise ValueError("the ids of the scenarios do not ascend")
     # shape [statistic, scenario, frame]
     values = open_variable(file, "value")[...].astype(np.float64)
     is_measured = open_variable(file, "measured")[...] != 0  # of the same shape

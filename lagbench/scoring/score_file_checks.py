@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import MATERIALS
 from lagbench.data.checksums import round_digits
 from lagbench.data.hdf5 import open_hdf5, open_variable
 from lagbench.data.registry import Size
@@ -142,6 +143,7 @@ def read_published_scores(path: Path) -> PublishedScores:
         rows[statistics.best_reference] = {ranking: reference}
     return PublishedScores(
         identity=statistics.identity,
+        subset=statistics.subset,
         predictions_sha256=statistics.predictions_sha256,
         ranking=ranking,
         scores=rows,
@@ -166,11 +168,24 @@ def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
         ),
         film_frames=_read_integers(open_variable(group, "film_frame")),
         particles=_read_integers(open_variable(group, "film_particle")),
-        material=np.asarray(open_variable(group, "material")[...], np.int8),
+        material=_read_material(open_variable(group, "material")),
         film=film,
         obstacle=obstacle,
     )
     return preview, precision
+
+
+def _read_material(variable: h5py.Dataset) -> NDArray[np.int8]:
+    """Return the materials of the film's particles.
+
+    Raises:
+        ValueError: a number stands for no material.
+    """
+    numbers = variable[...]
+    # before the cast, which wraps
+    if not np.isin(numbers, range(len(MATERIALS))).all():
+        raise ValueError("a particle of the film has an unknown material")
+    return np.asarray(numbers, np.int8)
 
 
 def _read_obstacle(group: h5py.Group) -> NDArray[np.float32]:
@@ -186,7 +201,10 @@ def _read_obstacle(group: h5py.Group) -> NDArray[np.float32]:
 
 
 def _unpack(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
-    """Return packed values, NaN where missing, and the step of the packing."""
+    """Return packed values, NaN where missing, and the step of the packing.
+
+    Values beyond float32 are infinite.
+    """
     scale = float(_first_number(variable.attrs["scale_factor"]))
     offset = float(_first_number(variable.attrs["add_offset"]))
     fill = int(_first_number(variable.attrs["_FillValue"]))
@@ -195,10 +213,11 @@ def _unpack(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
     has_valid_scale = is_finite and scale > 0.0
     if steps.dtype != np.uint16 or not has_valid_scale:
         raise ValueError(f"{variable.name} is not packed as it should be")
-    unpacked = steps * scale + offset
     is_missing = steps == fill
-    values = np.where(is_missing, np.nan, unpacked)
-    return values.astype(np.float32), scale
+    with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+        unpacked = steps * scale + offset
+        values = np.where(is_missing, np.nan, unpacked)
+        return values.astype(np.float32), scale
 
 
 def _first_number(attribute: Any) -> Any:  # noqa: ANN401 (types of netCDF)
@@ -236,6 +255,8 @@ def _check_shapes(preview: Preview) -> None:
     for name, (got, expected) in shapes.items():
         if got != expected:
             raise ValueError(f"{name} has shape {got}, not {expected}")
+    if np.isinf(preview.vorticity).any() or np.isinf(preview.histogram).any():
+        raise ValueError("a map or a histogram has infinite values")
     _check_obstacle(preview.obstacle)
     _check_histograms(preview)
 

@@ -145,7 +145,7 @@ def _write_packed(
     limits: tuple[float, float],
     long_name: str,
 ) -> None:
-    """Write values as integers between two limits."""
+    """Write values that lie between two limits as 16-bit integers."""
     packed, packing = _pack(values, limits)
     _write_variable(group, name, dims, packed, {"long_name": long_name, **packing})
 

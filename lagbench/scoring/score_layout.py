@@ -36,6 +36,24 @@ PARTICLES = 200
 """Particles of the film, evenly spaced over the particle numbers."""
 
 
+def spaced(length: int, count: int) -> list[int]:
+    """Return at most so many evenly spaced indices, first and last included.
+
+    >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
+    ([0, 3, 6, 9], [0, 1, 2], [6])
+    """
+    if length <= count:
+        return list(range(length))
+    last = length - 1
+    if count == 1:
+        return [last]
+    indices = []
+    for number in range(count):
+        index = number * last // (count - 1)
+        indices.append(index)
+    return indices
+
+
 @dataclass(frozen=True, eq=False)
 class Preview:
     """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""

@@ -165,17 +165,18 @@ def _active_frames(file: ScenarioFile) -> int | None:
     raise DataError(
         "active_frames is no number of frames",
         where=str(file.path),
-        expected=">= 0",
+        expected="a whole number from 0",
         got=stated,
         fix="mend the parameter in the file, or make the data again",
     )
 
 
 def _materials(truth: Truth, scenario: int) -> set[str]:
-    """Return the materials of a scenario after a check of its length."""
+    """Return the materials of a scenario after a check of its length and of them."""
     needed = truth.size.task.input_frames + truth.size.task.horizon
     with truth.open(scenario) as file:
         frames = file.header.frames
+        file.check_material()
         material = file.read("material")
     if frames < needed:
         raise DataError(

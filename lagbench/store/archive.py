@@ -94,7 +94,8 @@ def write_archive(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one with data when None.
+        size: name of the size; None takes the only one with data, or mini where several
+            have data.
         output: folder for the archive.
         root: folder of all data sets.
 
@@ -381,7 +382,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=(__doc__ or "").partition("\n")[0],
     )
     parser.add_argument("--split", required=True, help="name of the split")
-    parser.add_argument("--size", help="name of the size; the only one with data")
+    parser.add_argument(
+        "--size",
+        help="name of the size; else the only one with data, or mini of several",
+    )
     parser.add_argument("--root", help="folder of all data sets")
     parser.add_argument(
         "--output", type=Path, default=Path(), help="folder for the archive"

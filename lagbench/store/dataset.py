@@ -88,7 +88,8 @@ def open_split(
     Returns:
         ``position`` and ``velocity`` with dims (scenario, frame, particle, space) as
         dask arrays, ``material`` (scenario, particle), ``particle_mass`` (scenario), in
-        a full box with walls ``wall_velocity`` (scenario, frame, wall, space), and
+        a full box with walls ``wall_velocity`` (scenario, frame, wall, space), where a
+        force drives the flow ``body_force`` (scenario, frame, layer, space), and
         ``frame_count`` and ``particle_count`` (scenario). Coordinate ``scenario`` holds
         the ids, ``viscosity`` (scenario) the kinematic viscosity that a model is given
         [length^2/s], NaN where none is known; where there is a fixed obstacle,
@@ -117,6 +118,7 @@ def open_split(
             obstacle = parse_obstacle(parameters, tier.dimension, where=str(path))
             if obstacle is not None:
                 obstacles.append(obstacle)
+        _check_layers(scenarios, list(paths.values()), hint)
         joined = _join_scenarios(scenarios, list(paths))
         # Lengths have no unit, as in scenario files.
         attributes = {"long_name": "given kinematic viscosity", "units": "s-1"}
@@ -133,6 +135,27 @@ def open_split(
         joined.encoding["source"] = str(first_path.absolute())
         joined.set_close(open_files.pop_all().close)
     return joined
+
+
+def _check_layers(
+    scenarios: Sequence[xr.Dataset], paths: Sequence[Path], fix: str
+) -> None:
+    """Refuse scenarios whose force has other layers than that of another scenario."""
+    expected = None
+    for scenario, path in zip(scenarios, paths, strict=True):
+        count = scenario.sizes.get("layer")
+        if count is None:
+            continue
+        if expected is None:
+            expected = count
+        if count != expected:
+            raise DataError(
+                "scenarios have forces in different numbers of layers",
+                where=f"{path}, variable 'body_force'",
+                expected=f"{expected} layers, as in the scenarios before",
+                got=f"{count} layers",
+                fix=fix,
+            )
 
 
 def _join_scenarios(

@@ -310,7 +310,7 @@ def _status_error(
 
 
 class _Redirections(urllib.request.HTTPRedirectHandler):
-    """Refuses a redirection to no address, as a fault of the store."""
+    """Refuses a redirection to no address of HTTP, as a fault of the store."""
 
     def redirect_request(
         self,
@@ -321,7 +321,10 @@ class _Redirections(urllib.request.HTTPRedirectHandler):
         headers: http.client.HTTPMessage,
         newurl: str,
     ) -> urllib.request.Request | None:
-        _check_host(urllib.parse.urlsplit(newurl).hostname)
+        target = urllib.parse.urlsplit(newurl)
+        if target.scheme not in ("http", "https"):
+            raise ValueError(f"an address of the kind {target.scheme[:40]!a}")
+        _check_host(target.hostname)
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
     def http_error_302(
@@ -551,8 +554,10 @@ def _file_system(url: str) -> tuple[Any, str]:
     for item in os.environ.items():
         if item[0].startswith("AWS_"):
             settings.append(item)
-    settings = sorted(settings)
-    key = (scheme, *settings)
+    # So is another host or account, where an address of its kind names one.
+    system_class = fsspec.get_filesystem_class(scheme)
+    place = system_class._get_kwargs_from_urls(url)
+    key = (scheme, *sorted(settings), *sorted(place.items()))
     if key not in _systems:
         system, _ = fsspec.core.url_to_fs(
             url,
@@ -605,7 +610,8 @@ def _translate_error(error: Exception, url: str) -> LagbenchError:
             got=message,
             fix=str(error),
         )
-    if isinstance(error, FileNotFoundError):
+    is_s3 = url.startswith(S3)
+    if isinstance(error, FileNotFoundError) and is_s3:
         return DataError(
             "there is no such bucket",
             where=url,
@@ -613,14 +619,24 @@ def _translate_error(error: Exception, url: str) -> LagbenchError:
             got=_bucket_of(url),
             fix="create the bucket, or correct the address: --root or LAGBENCH_ROOT",
         )
+    if isinstance(error, FileNotFoundError):
+        return DataError(
+            "the place is not there",
+            where=url,
+            expected="a folder that exists",
+            got=message,
+            fix="make the folder, or correct the address: --root or LAGBENCH_ROOT",
+        )
     if _is_permission_error(error, url):
-        keys = "AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+        user = "you"
+        if is_s3:
+            user = "AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
         return StoreUnreachableError(
             "the store refuses",
             where=url,
             expected="permission to read and write",
             got=message,
-            fix=f"see that {keys} may read it, and write to it",
+            fix=f"see that {user} may read it, and write to it",
         )
     return StoreUnreachableError(
         "the store does not answer or fails",

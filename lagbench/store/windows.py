@@ -153,8 +153,8 @@ class FrameStore:
     def body_force(self, scenario: int) -> Floats | None:
         """Return the force that drives the flow [length/s^2], if one does.
 
-        It is the acceleration of layers of equal height along y, lowest first, towards
-        each frame, shape [frame, layer, axis].
+        It is the acceleration of the fluid in layers of equal height along y, lowest
+        first, shape [frame, layer, axis]. Entry f acts from frame f-1 to frame f.
         """
         self._reset_after_fork()
         return self._open(scenario).body_force
@@ -237,7 +237,9 @@ class FrameStore:
         )
 
     def _check_positions(self, position: h5py.Dataset, scenario: int) -> None:
-        """Refuse positions that are no numbers, or have other axes than the box."""
+        """Refuse positions that are not float32, are empty, or have other axes than
+        the box.
+        """
         has_axes = position.ndim == 3 and position.shape[2] == self._size.dimension
         if position.dtype == np.float32 and has_axes and position.size:
             return

@@ -56,6 +56,8 @@ def quote(value: object) -> str:
         text = ascii(value)
     except ValueError:  # an integer inside, of more digits than Python prints
         return f"a {type(value).__name__}"
+    if not isinstance(value, (str, bytes)):
+        text = " ".join(text.split())  # arrays have several lines
 
     if len(text) <= MAX_TEXT:
         return text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lagbench.data.layout import format_ids, major_of, quote_root
@@ -27,14 +27,19 @@ MAX_QUOTED_NUMBERS = 20
 
 
 def check_split(
-    info: FileInfo, size: Size | None, *, hint: str, issues: IssueCollector
+    info: FileInfo,
+    size: Size | None,
+    *,
+    unknown_size: Mapping[str, str] | None,
+    issues: IssueCollector,
 ) -> Size | None:
-    """Check that the registry has the split and size that a file names; return it.
+    """Check that the registry has the split, size and subset of a file; return it.
 
     Args:
         info: what the file says.
         size: the entry of the registry of that name; None where there is none.
-        hint: what to do where there is none.
+        unknown_size: the parts of the error where there is none: what, where, expected,
+            got and fix.
         issues: where an issue is added.
     """
     split_name = info.attributes["split"]
@@ -45,14 +50,22 @@ def check_split(
     issues.complete("split")
     if size is not None and (size.split, size.name) == (split_name, size_name):
         return size
+    if unknown_size is None:
+        # somebody wrote the file between the two times that it was read
+        unknown_size = {
+            "what": "no such split and size",
+            "where": "attributes 'split' and 'size'",
+            "expected": "a split and size that `lagbench list` shows",
+            "got": f"{quote(split_name)}, {quote(size_name)}",
+            "fix": "validate the file again when it is written",
+        }
     issues.error(
         "split",
-        "no such split and size",
-        where="attributes 'split' and 'size'",
-        expected="a split and size that `lagbench list` shows",
-        got=f"{quote(split_name)}, {quote(size_name)}",
-        fix=f"{hint}; predictions for a split of your own are scored with"
-        " lagbench score FILE --split own/, and cannot be submitted",
+        unknown_size["what"],
+        where=unknown_size["where"],
+        expected=unknown_size["expected"],
+        got=unknown_size["got"],
+        fix=unknown_size["fix"],
     )
     return None
 

@@ -24,7 +24,12 @@ from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.local import load_rooted_registry, resolve_root, suggest_split_of
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+)
 from lagbench.store.copy import update_working_copy
 from lagbench.work.machine import ChildStopped, LimitedChild
 
@@ -36,6 +41,7 @@ from .checks import (
     scan_positions,
 )
 from .format import (
+    MAX_NAME,
     WRITE,
     FileInfo,
     check_dims,
@@ -172,9 +178,11 @@ def _open_caller(path: Path, *, isolated: bool) -> Iterator[Caller]:
     if not isolated:
         yield lambda function, request: function(request)
         return
-    extra = seconds_for(path)
+    extra_seconds = seconds_for(path)
     child = LimitedChild(
-        __name__, seconds=CPU_SECONDS + extra, wall=WALL_SECONDS + extra
+        __name__,
+        seconds=CPU_SECONDS + extra_seconds,
+        wall=WALL_SECONDS + extra_seconds,
     )
     with child:
         try:
@@ -204,7 +212,7 @@ def _examine(
     be fetched, and that is no work for a child that reads what a stranger wrote.
     """
     names = caller(read_names, {"path": str(path)})
-    size, hint = _find_size(names, registry)
+    size, unknown_size = _find_size(names, registry)
     size_json = None
     if size is not None:
         update_working_copy(size, root, size.scored_scenarios)
@@ -213,7 +221,7 @@ def _examine(
         "path": str(path),
         "root": str(root),
         "size": size_json,
-        "hint": hint,
+        "unknown_size": unknown_size,
         "require_truth": require_truth,
     }
     return size, caller(run_checks, request)
@@ -238,16 +246,40 @@ def read_names(request: Request) -> Answer:
     return names
 
 
-def _find_size(names: Answer, registry: Registry) -> tuple[Size | None, str]:
-    """Return the size that a file names, or None and a hint."""
+def _find_size(
+    names: Answer, registry: Registry
+) -> tuple[Size | None, Mapping[str, str] | None]:
+    """Return the size that a file names, or None and what is wrong with the names."""
     if names["split"] is None or names["size"] is None:
-        return None, ""
+        return None, None
     try:
         size = registry.size(names["split"], names["size"])
-        return size.scored_on(names["subset"] or "test"), ""
     except (UsageError, UnreadableFileError) as error:
-        hint = error.fix or error.what
-        return None, hint.splitlines()[0]
+        parts = _parts_of(error, where="attributes 'split' and 'size'")
+        parts["fix"] += (
+            "; predictions for a split of your own are scored with"
+            " lagbench score FILE --split own/, and cannot be submitted"
+        )
+        return None, parts
+    try:
+        return size.scored_on(names["subset"] or "test"), None
+    except UsageError as error:
+        return None, _parts_of(error, where="attribute 'subset'")
+
+
+def _parts_of(error: LagbenchError, *, where: str) -> dict[str, str]:
+    """Return the parts of an error as JSON holds them, with another place.
+
+    Texts with names of the file are cut where they are long.
+    """
+    fix = error.fix or "name one that there is"
+    return {
+        "what": error.what[:MAX_NAME],
+        "where": where,
+        "expected": str(error.expected),
+        "got": str(error.got)[:MAX_NAME],
+        "fix": fix.splitlines()[0],
+    }
 
 
 def run_checks(request: Request) -> Answer:
@@ -270,7 +302,9 @@ def run_checks(request: Request) -> Answer:
                 if isinstance(value, str):
                     names[name] = value
             issues.complete("readable")
-            size = check_split(info, size, hint=request["hint"], issues=issues)
+            size = check_split(
+                info, size, unknown_size=request["unknown_size"], issues=issues
+            )
             if _check_headers(info, size, root=root, issues=issues) and size:
                 content_hash = _check_values(
                     file,

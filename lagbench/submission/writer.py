@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -258,7 +259,8 @@ class PredictionsWriter:
         """Add the predictions of a scenario, in any order of scenarios.
 
         Args:
-            scenario: id of a test scenario.
+            scenario: id of a test scenario, also as an array of one number without
+                dimensions.
             position: positions [length] at the frames to predict, shape [frame,
                 particle, space].
             velocity: velocities [length/s], same shape.
@@ -277,7 +279,7 @@ class PredictionsWriter:
                 got="a writer that is closed or was not entered",
                 fix="with PredictionsWriter(...) as writer:",
             )
-        self._check_scenario(scenario)
+        scenario = self._check_scenario(scenario)
         arrays = {"position": position}
         if velocity is not None:
             arrays["velocity"] = velocity
@@ -307,19 +309,20 @@ class PredictionsWriter:
             self._diverged_at[row] = diverged_at
         self._written.add(scenario)
 
-    def _check_scenario(self, scenario: int) -> None:
-        """Refuse a scenario that is unknown or written already."""
-        where = f"scenario {scenario!r}"
+    def _check_scenario(self, scenario: object) -> int:
+        """Return the id; refuse a scenario that is unknown or written already."""
+        where = f"scenario {quote(scenario)}"
         expected = f"whole numbers: {format_ids(self._row_of)}"
-        if scenario in self._written:
+        number = _whole_number(scenario)
+        if number in self._written:
             raise UsageError(
                 "a scenario is written twice",
                 where=where,
                 expected=expected,
-                got=f"{scenario} once more",
+                got=f"{number} once more",
                 fix="add every scenario once, with all of its frames",
             )
-        if scenario not in self._row_of:
+        if number is None or number not in self._row_of:
             raise UsageError(
                 "no such test scenario",
                 where=where,
@@ -328,6 +331,7 @@ class PredictionsWriter:
                 fix="name scenarios by id, not by row; predictions for other subsets "
                 "are not stored",
             )
+        return number
 
     def _check_frozen(
         self, scenario: int, position: NDArray[np.float32], diverged_at: int
@@ -368,7 +372,9 @@ class PredictionsWriter:
         """Finish and rename the file, or remove it when the body raised."""
         self._is_open = False
         if error is not None:
-            self._stack.__exit__(kind, error, trace)
+            # the error of the body goes on as it is, whatever its kind
+            with suppress(WorkFailedError):
+                self._stack.__exit__(kind, error, trace)
             return
         with self._stack:
             missing = sorted(set(self._row_of) - self._written)
@@ -488,6 +494,14 @@ def _recorded_hash(size: Size, root: Path) -> str:
             fix=f"{suggest_repair(size, root=root)}, or give dataset_sha256",
         )
     return recorded
+
+
+def _whole_number(value: object) -> int | None:
+    """Return a whole number, also that of an array without dimensions; None if not."""
+    try:
+        return operator.index(np.asarray(value)[()])
+    except (TypeError, ValueError, RuntimeError):
+        return None
 
 
 def _numbers_of(values: ArrayLike, where: str) -> NDArray[Any]:

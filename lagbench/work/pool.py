@@ -304,7 +304,10 @@ def crash_error(error: Exception) -> WorkFailedError:
 
 
 def serve(descriptor: int) -> None:
-    """Run the items that arrive on a socket until the other end closes."""
+    """Run the items that arrive on a socket until the parent says farewell.
+
+    End at once if the parent is gone.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(descriptor)
     _forward_warnings(channel)
@@ -320,7 +323,11 @@ def serve(descriptor: int) -> None:
     threading.Thread(target=listen, daemon=True).start()
     message = inbox.get()
     while message != _FAREWELL:
-        channel.send(_run_item(message, channel))
+        reply = _run_item(message, channel)
+        try:
+            channel.send(reply)
+        except Exception as error:  # pickle raises nearly any type
+            channel.send(("error", error_to_send(error)))
         message = inbox.get()
 
     # Taichi keeps compiled kernels only where it ends; else they are compiled again.

@@ -26,7 +26,7 @@ from lagbench.baselines.recipe import (
     recipe_for,
     recipe_names,
 )
-from lagbench.baselines.recipe_changes import list_settings
+from lagbench.baselines.recipe_changes import first_difference, list_settings
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 
@@ -612,3 +612,23 @@ def test_the_page_of_the_baselines_is_complete() -> None:
     page = (Path(__file__).parents[2] / "docs/baselines.md").read_text()
     for word in (*list_names(), *TrainingOptions.model_fields):
         assert f"`{word}`" in page, word
+
+
+def test_a_difference_of_recipes_names_values_that_logs_leave_out() -> None:
+    """Logs leave out later options with the values of that time; other options may be
+    missing on one side.
+    """
+
+    def recipe(*settings: str) -> dict[str, Any]:
+        settings = ("training.steps=100", *settings)
+        return recipe_for(find("gns"), "cavity", "mini", settings=settings).as_json()
+
+    plain = recipe()
+    averaged = recipe("training.ema=0.99")
+    assert "training.ema = 0.0, " in first_difference(plain, averaged)
+    assert "training.ema = 0.99, " in first_difference(averaged, plain)
+    assert first_difference(averaged, plain).endswith(" 0.0")
+    older = {**plain, "training": dict(plain["training"])}
+    del older["training"]["batch"]
+    assert first_difference(plain, older).endswith("not set")
+    assert first_difference(plain, plain) == first_difference(older, older)

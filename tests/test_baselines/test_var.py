@@ -198,6 +198,17 @@ def test_values_that_are_not_finite_are_refused() -> None:
         solve(rows)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("frames", [30, 3])
+def test_responses_that_are_not_finite_are_refused(frames: int, value: float) -> None:
+    """The last frame is a response only; few rows are solved in another way."""
+    states = series(frames, 3)
+    states[-1, 1] = value
+    rows = LaggedRows([states], lags=1)
+    with pytest.raises(WorkFailedError, match="not finite"):
+        solve(rows)
+
+
 def noisy_orbits(
     scenarios: int,
     *,

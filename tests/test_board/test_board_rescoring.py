@@ -188,7 +188,7 @@ def test_flags_and_reference_scores_are_compared(
         scale("position_mse", 2.0)(file)
     result = rescored(own, predictions)
     got = [finding.got for finding in result.findings]
-    assert got == ["other position_mse", "[]", "{}"]
+    assert got == ["other position_mse", "flags []", "diverged_at {}"]
 
 
 def test_pictures_and_statistics_are_compared(

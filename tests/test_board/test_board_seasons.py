@@ -478,3 +478,26 @@ def test_the_commands_say_what_is_wrong(
     early = run("season", "show", SEASON, "--board", own.folder)
     assert early.exit_code == 1
     assert f"generate --season {SEASON} --board {own.folder}" in early.stderr
+
+
+def test_a_season_under_another_name_is_refused_by_its_name(own: ModelBoard) -> None:
+    folder = own.folder / "seasons"
+    shutil.copytree(folder / SEASON, folder / "copied")
+    with pytest.raises(ChecksFailedError) as caught:
+        read_season(Folder(own.folder), "copied")
+    assert caught.value.expected == "copied"
+    assert caught.value.got == SEASON
+
+
+def test_a_seed_that_differs_in_its_last_digit_is_shown_whole(own: ModelBoard) -> None:
+    season = read_season(Folder(own.folder), SEASON)
+    seed = season.data_sets[0].draw_seed
+    assert seed is not None
+    last_digit = "1" if seed[-1] == "0" else "0"
+    path = own.folder / "seasons" / SEASON / "season.yaml"
+    text = path.read_text()
+    path.write_text(text.replace(seed, seed[:-1] + last_digit))
+    with pytest.raises(ChecksFailedError) as caught:
+        read_season(Folder(own.folder), SEASON)
+    assert seed in str(caught.value.expected)
+    assert seed[:-1] + last_digit in str(caught.value.got)

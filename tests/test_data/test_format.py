@@ -403,6 +403,60 @@ def open_writer(path: Path, **changes: Any) -> ScenarioWriter:
     return ScenarioWriter(path, KEY, **(options | changes))
 
 
+@pytest.mark.parametrize(
+    "material",
+    [
+        0,
+        [0],
+        np.zeros((8, 1)),
+        np.full(8, len(MATERIALS)),
+        np.full(8, -1),
+        np.full(8, 256),
+        np.full(8, 0.5),
+    ],
+)
+def test_other_materials_are_not_written(tmp_path: Path, material: Any) -> None:
+    """One number for each particle, and no number that a cast would wrap or cut."""
+    with pytest.raises(DataError) as caught:
+        open_writer(tmp_path / "c.nc", material=material)
+    assert str(caught.value.where).endswith("c.nc, variable 'material'")
+
+
+@pytest.mark.parametrize("number", [len(MATERIALS), -1])
+def test_an_unknown_material_is_found_though_the_hashes_fit(
+    written: Written, number: int
+) -> None:
+    path, _ = written
+    with h5py.File(path, "r+") as file:
+        file["material"][0] = number
+        digest = independent_hash.variable_hash("material", file["material"])
+    with netCDF4.Dataset(path, "r+") as file:
+        file["material"].content_sha256 = digest
+    content = independent_hash.content_hash(path)
+    with netCDF4.Dataset(path, "r+") as file:
+        file.content_sha256 = content
+    assert_refused(path, "variable 'material'")
+
+
+def test_the_order_of_the_periodic_axes_changes_nothing(tmp_path: Path) -> None:
+    hashes = set()
+    for periodic in (("x", "y"), ("y", "x")):
+        with open_writer(tmp_path / "c.nc", periodic=periodic) as file:
+            for position in frames_of(3, 2, 8):
+                file.append(position, -position)
+        hashes.add(file.content_sha256)
+        with read_scenario(tmp_path / "c.nc") as stored:
+            assert stored.header.parameters["periodic"] == "x y"
+    assert len(hashes) == 1
+
+
+def test_an_error_of_the_caller_goes_on_as_it_is(tmp_path: Path) -> None:
+    """A pipe that broke is no disk that is full."""
+    with pytest.raises(BrokenPipeError), open_writer(tmp_path / "c.nc"):
+        raise BrokenPipeError
+    assert not list(tmp_path.iterdir())
+
+
 def test_other_readers_may_have_the_file_open(written: Written) -> None:
     """HDF5 opens a file twice in a process only if both openings treat locks alike."""
     path, _ = written

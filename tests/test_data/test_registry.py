@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from lagbench.data import registry
 from lagbench.data.box import Box
-from lagbench.data.limits import NEEDED, SUBSETS, Limit
+from lagbench.data.limits import NEEDED, SUBSETS, Limit, check_parameters
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
@@ -691,3 +691,16 @@ def test_statistics_of_train_are_those_of_the_thesis(
         spread = (uniform, uniform)
         assert statistics["position_std"] == pytest.approx(spread, rel=1e-3)
         assert uniform == pytest.approx(0.272, rel=0.02)
+
+
+def test_an_integer_beyond_every_float_is_no_finite_number() -> None:
+    """Python compares it, but it becomes no float; the message does not print it."""
+    huge = 16**5000
+    assert not Limit().holds(huge)
+    assert not Limit().holds(-huge)
+    values = dict.fromkeys(NEEDED, 4)
+    declared = dict.fromkeys(values)
+    check_parameters("tiny", values, declared)
+    with pytest.raises(ValueError, match=r"sizes\.tiny.*grid") as caught:
+        check_parameters("tiny", values | {"grid": huge}, declared)
+    assert len(str(caught.value)) < 200

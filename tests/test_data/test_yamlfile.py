@@ -66,6 +66,15 @@ def test_what_is_not_plain_is_refused(
         read_yaml(_write(tmp_path, text))
 
 
+def test_a_long_key_is_cut_in_the_message(tmp_path: Path) -> None:
+    words = ", ".join(["word"] * 5000)
+    key = "k" * 900
+    for text in (f"? [{words}]\n: 1\n", f"{key}: 1\n{key}: 2\n"):
+        with pytest.raises(UnreadableFileError) as caught:
+            read_yaml(_write(tmp_path, text))
+        assert len(str(caught.value.got)) < 200
+
+
 @pytest.mark.parametrize(
     ("text", "value"),
     [

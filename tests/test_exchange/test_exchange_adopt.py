@@ -9,6 +9,7 @@ import math
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import zipfile
@@ -21,6 +22,7 @@ import netCDF4
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
+from file_size_limit import largest_file
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from typer.testing import Result
@@ -28,7 +30,7 @@ from typer.testing import Result
 import lagbench
 from lagbench.data.box import Box
 from lagbench.data.checksums import dataset_hash, subset_hash
-from lagbench.data.local import locate, locate_split
+from lagbench.data.local import DESCRIPTION, locate, locate_split
 from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import (
@@ -41,7 +43,12 @@ from lagbench.errors import (
 from lagbench.exchange import adopt, import_split, local_split
 from lagbench.exchange.adoption import _divide_into_subsets
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
+from lagbench.exchange.trajectory import (
+    BoxTransform,
+    Description,
+    Trajectory,
+    estimate_spacing,
+)
 from lagbench.submission.predictions import open_predictions
 from lagbench.work.progress import Progress
 
@@ -605,6 +612,116 @@ def test_a_call_of_the_same_process_into_the_same_folder_is_refused(
     assert_says_what_happened(errors[0])
     assert split.folder == tmp_path / "mine"
     assert {path.name for path in tmp_path.iterdir()} == {"in", "mine"}
+
+
+KILLED = """
+import os, signal, sys
+from lagbench.exchange import adopt
+
+def die(progress):
+    if progress.done > 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+sources, output = sys.argv[1:]
+adopt(sources, output=output, radius=0.1, frame_interval=0.25, progress=die)
+"""
+
+
+def test_what_a_killed_call_left_is_removed_by_the_next_one(
+    tmp_path: Path, runs: Runs
+) -> None:
+    """The folder of a call that works, or of another target, is left alone."""
+    save_runs(tmp_path / "in", runs)
+    for name in ("mine", "other"):
+        command = [sys.executable, "-c", KILLED, tmp_path / "in", tmp_path / name]
+        assert subprocess.run(command, timeout=100).returncode == -signal.SIGKILL
+    leftovers = [path.name for path in tmp_path.glob(".*.partial")]
+    assert len(leftovers) == 2
+
+    adopted(tmp_path, runs)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"in", "mine"} < names
+    (left,) = names - {"in", "mine"}
+    assert left.startswith(".other.")
+
+
+def test_an_error_of_who_watches_goes_on_as_it_is(tmp_path: Path, runs: Runs) -> None:
+    """A pipe that broke, or a service that failed, is no disk that is full."""
+    failure = WorkFailedError("no answer", where="elsewhere", fix="wait")
+    for error in (BrokenPipeError(32, "Broken pipe"), failure):
+
+        def fail(_: Progress, error: Exception = error) -> None:
+            raise error
+
+        with pytest.raises(type(error)) as caught:
+            adopted(tmp_path, runs, progress=fail)
+        assert caught.value is error
+        assert {path.name for path in tmp_path.iterdir()} == {"in"}
+
+
+def test_a_full_disk_is_named_by_the_folder_to_make(tmp_path: Path, runs: Runs) -> None:
+    sources = save_runs(tmp_path / "in", runs)
+    with largest_file(3000), pytest.raises(WorkFailedError) as caught:
+        adopt(sources, output=tmp_path / "mine", **BASIC)
+    assert caught.value.where == str(tmp_path / "mine")
+    assert "--output" in str(caught.value.fix)
+    assert {path.name for path in tmp_path.iterdir()} == {"in"}
+
+
+def test_a_link_that_leads_nowhere_is_no_place_for_a_folder(
+    tmp_path: Path, runs: Runs
+) -> None:
+    (tmp_path / "gone").symlink_to(tmp_path / "nothing")
+    sources = save_runs(tmp_path / "in", runs)
+    with pytest.raises(WorkFailedError) as caught:
+        adopt(sources, output=tmp_path / "gone" / "mine", **BASIC)
+    assert caught.value.where == str(tmp_path / "gone" / "mine")
+    assert "--output" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("material", [9, -1])
+def test_unknown_materials_are_refused(
+    tmp_path: Path, runs: Runs, material: int
+) -> None:
+    """Also of who gives trajectories without a file, so that nothing checked them."""
+    subsets = {}
+    for number, subset in enumerate(("train", "valid", "test")):
+        positions = runs[number]
+        trajectory = Trajectory(
+            name=subset,
+            frames=len(positions),
+            material=np.full(positions.shape[1], material),
+            read=lambda positions=positions: ((frame, None) for frame in positions),
+        )
+        subsets[subset] = [trajectory]
+    description = Description(
+        name="mine", source="a test", radius=0.1, frame_interval=0.25
+    )
+    with pytest.raises(DataError) as caught:
+        local_split.make_local_split(
+            description, subsets, tmp_path / "mine", command="adopt"
+        )
+    assert str(caught.value.where).endswith("variable 'material'")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_order_of_the_periodic_axes_changes_nothing(
+    tmp_path: Path, runs: Runs
+) -> None:
+    sources = save_runs(tmp_path / "in", runs)
+    hashes = set()
+    descriptions = set()
+    for number, periodic in enumerate((("x", "y"), ("y", "x"))):
+        split = adopt(
+            sources,
+            output=tmp_path / str(number) / "mine",
+            periodic=periodic,
+            bounds=UNIT_SQUARE,
+            **BASIC,
+        )
+        hashes.add(split.dataset_sha256)
+        descriptions.add((split.folder / DESCRIPTION).read_text())
+    assert len(hashes) == len(descriptions) == 1
 
 
 def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
@@ -1207,6 +1324,24 @@ def test_more_mistakes_than_a_message_holds_are_counted(
     assert done.exit_code == 2
     assert "colour_9" in done.output
     assert "3 more" in done.output
+    places = [line for line in done.output.splitlines() if "where: " in line]
+    assert len(places) == 11
+    assert not places[-1].rstrip().endswith("key")
+
+
+def test_one_particle_is_counted_in_the_singular(tmp_path: Path, run: Run) -> None:
+    paths = save_runs(tmp_path / "in", straight_runs(4, particles=1))
+    description = tmp_path / "data.yaml"
+    description.write_text("{radius: 0.1, spacing: 0.1, frame_interval: 0.25}\n")
+    output = tmp_path / "mine"
+    done = run(
+        "adopt", *paths, "-o", output, "--describe", description, "--free-surface"
+    )
+    assert done.exit_code == 0, done.output
+    assert " 1 particle\n" in done.output
+    filled = run("template", "--split", output, "-o", tmp_path / "empty.nc")
+    assert filled.exit_code == 0, filled.output
+    assert " 1 particle, " in filled.output
 
 
 def drifting_runs(count: int) -> list[NDArray[np.float32]]:

@@ -232,6 +232,37 @@ def test_an_npz_file_that_unpacks_to_far_more_is_refused(
     assert caught.value.where.endswith("in/train.npz, key 'simulation_0'")
 
 
+def test_the_message_has_the_bound_of_an_array_that_unpacks_to_more() -> None:
+    bound = trajectory.HARMLESS_BYTES
+    trajectory.check_inflation("a small one", packed=10, unpacked=bound)
+    with pytest.raises(UnreadableFileError) as caught:
+        trajectory.check_inflation("a small one", packed=10, unpacked=bound + 1)
+    assert str(bound) in str(caught.value.expected)
+
+
+def test_an_array_that_is_not_read_may_unpack_to_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Adopting reads four arrays by their names; others take no memory."""
+    monkeypatch.setattr(trajectory, "HARMLESS_BYTES", 1 << 20)
+    source = tmp_path / "more.npz"
+    arrays = {"position": straight_runs(1)[0], "unrelated": np.zeros(1 << 21)}
+    np.savez_compressed(source, **arrays)  # type: ignore[arg-type]
+    split = adopted(source)
+    assert sum(split.scenarios.values()) == 3
+
+
+def test_an_array_is_not_given_under_two_names(tmp_path: Path) -> None:
+    """NumPy reads position.npy and position as the same array."""
+    bad = tmp_path / "bad.npz"
+    with array_file(bad, (12, 40, 2)) as stream:
+        stream.write(straight_runs(1)[0].tobytes())
+    with zipfile.ZipFile(bad, "a") as archive:
+        archive.writestr("position", archive.read("position.npy"))
+    with refused(tmp_path, bad.name):
+        adopted(bad)
+
+
 def test_an_empty_hdf5_file_of_many_particles_is_refused(
     h5: Path, tmp_path: Path
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import xarray
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -257,3 +258,22 @@ def test_rates_and_steps_out_of_range_are_refused(
         animate(swirl, tmp_path / "x.mp4", **options)
     assert caught.value.where == "--fps, --every"
     assert not list(tmp_path.iterdir())
+
+
+def test_frames_at_rest_do_not_set_the_colour_scale(
+    swirl: Path, tmp_path: Path
+) -> None:
+    """A film that begins at rest has the colours of one that moves all the time."""
+    with xarray.open_dataset(swirl, decode_times=False) as file:
+        moving = file.load()
+    resting = moving.copy(deep=True)
+    resting["velocity"][:2] = 0.0
+    resting["position"][:2] = resting["position"][0].values
+    last_frames = []
+    for name, scenario in (("moving", moving), ("resting", resting)):
+        path = tmp_path / f"{name}.gif"
+        animate(scenario, path, kind=Panel.SPEED)
+        with GifImageFile(path) as film:
+            film.seek(film.n_frames - 1)
+            last_frames.append(np.asarray(film.convert("RGB")))
+    assert_array_equal(*last_frames)

@@ -38,7 +38,14 @@ from lagbench.figures.colours import (
     WALL,
     parse_rgb,
 )
-from lagbench.figures.panels import VIEWS, Panel, draw_walls, limit_of
+from lagbench.figures.panels import (
+    VIEWS,
+    Panel,
+    draw_walls,
+    limit_of,
+    median_limit,
+    strongest_limit,
+)
 from lagbench.figures.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.figures.recording import open_recording
 from lagbench.store.dataset import open_split
@@ -506,3 +513,13 @@ def test_every_colour_is_in_the_palette() -> None:
         levels = np.rint(255.0 * shares).astype(int)
         for level in levels.tolist():
             assert tuple(level) in colours
+
+
+def test_frames_at_rest_have_no_say_in_a_common_colour_scale() -> None:
+    """Only where nothing moves anywhere the scale ends at 1."""
+    limits = [0.0, 0.0, 0.0, 0.25, 0.75]
+    assert strongest_limit(limits) == 0.75
+    assert median_limit(limits) == 0.5
+    for nothing in ([], [0.0, 0.0]):
+        assert strongest_limit(nothing) == 1.0
+        assert median_limit(nothing) == 1.0

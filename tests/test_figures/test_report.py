@@ -567,6 +567,19 @@ def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
         assert_allclose(values, share, atol=0.0101, equal_nan=True)
 
 
+def test_scenarios_that_are_not_drawn_are_counted(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two rows of panels have room for one of the two scenarios."""
+    monkeypatch.setattr("lagbench.figures.report.particles.MOST_ROWS", 2)
+    bench = make_report_bench(home, "fluid")
+    page = reported(bench, tmp_path, {"damped": damped})
+    figures = [name for name in expected_figures("fluid") if f'id="{name}"' in page]
+    assert "particles-3" in figures
+    assert "particles-4" not in figures
+    assert "Not drawn for want of room: 1 scenario." in page
+
+
 def test_style_sheet_is_packaged() -> None:
     """Files in the folder that are no modules are named in pyproject.toml."""
     project_text = (ROOT / "pyproject.toml").read_text()

@@ -98,6 +98,15 @@ def test_ties_by_rounding_count() -> None:
         assert sign_flip_p(differences) == pytest.approx(expected, rel=1e-12)
 
 
+def test_p_has_no_scale() -> None:
+    """Sums of the largest and of the smallest numbers are no infinity, and no 0."""
+    differences = np.array([0.25, 1.0, -0.5, 1.0, 0.75, 1.0])
+    expected = sign_flip_p(differences)
+    for factor in (2.0**1023, 2.0**-1060):
+        assert sign_flip_p(factor * differences) == expected
+    assert sign_flip_p([1e308] * 6) == 2.0**-5
+
+
 def test_losses_that_no_p_value_fits() -> None:
     """Nothing to compare, more than can be enumerated, and no numbers are refused, and
     so is infinity.
@@ -442,6 +451,17 @@ def test_one_training_used_in_two_ways_is_paired() -> None:
     assert low < found.difference < high < 0.0
     unpaired = compare(used_one_way, used_another_way)
     assert unpaired.p > 0.5
+
+
+def test_pairs_need_a_scenario_that_a_seed_has_on_both_sides() -> None:
+    """The first scenario is defined in one seed here, and in another one there."""
+    values = np.arange(1.0, 8.0)
+    gap = np.array([math.nan, *values[1:]])
+    first = [score_of(*gap), score_of(*(values + 0.5))]
+    second = [score_of(*(values + 0.25)), score_of(*gap)]
+    comparison = compare(first, second, paired=True)
+    assert comparison.scenarios == (1, 2, 3, 4, 5, 6)
+    assert comparison.difference == pytest.approx(0.125)
 
 
 def test_seeds_of_a_method_are_compared_together() -> None:

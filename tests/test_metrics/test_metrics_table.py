@@ -502,6 +502,7 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
         {"direction": Direction.TARGET, "perfect": None},
         {"direction": "sideways"},
         {"of": "vorticity_mse"},
+        {"of": 5},
         {"name": "My metric", "of": ()},
         {"name": "", "of": ()},
         {"name": "skill", "of": ()},

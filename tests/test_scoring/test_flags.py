@@ -181,9 +181,19 @@ def test_errors_above_the_perturbed_run_do_not_raise_the_flag() -> None:
     assert flag.raised is False
 
 
-def test_without_a_perturbed_run_the_flag_is_undecided() -> None:
-    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, ())
+@pytest.mark.parametrize("limit", [(), PERTURBED_ERROR[:3]])
+def test_without_a_perturbed_run_the_flag_is_undecided(limit: Sequence[float]) -> None:
+    """So it is with one of other frames."""
+    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, limit)
     assert flag.raised is None
+    assert flag.reasons
+
+
+def test_a_perturbed_run_that_has_lost_the_truth_decides_nothing() -> None:
+    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, PERSISTENCE_ERROR)
+    assert flag.raised is None
+    assert flag.reasons
+    assert flag.evidence == {"frames_below": 0.0, "frames_compared": 0.0}
 
 
 def test_a_trace_can_be_pickled() -> None:

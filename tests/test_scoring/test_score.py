@@ -615,3 +615,33 @@ def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
     assert scores_folder(predictions) == tmp_path / "own"
     (tmp_path / "own" / "split.yaml").write_text("format: 1\n")
     assert scores_folder(predictions) == tmp_path / "own-scores"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("method", "another"),
+        ("dataset_version", "1.9.0"),
+        ("dataset_sha256", "ab" * 32),
+        ("subset", "shift"),
+    ],
+)
+def test_scores_of_another_submission_are_not_overwritten(
+    bench: ScoreBench,
+    persistence_card: ScoreCard,
+    predictions: Path,
+    tmp_path: Path,
+    key: str,
+    value: str,
+) -> None:
+    """Another method, version, data set or subset; the message tells them apart."""
+    content = load_json(persistence_card) | {key: value}
+    path = tmp_path / "scores.json"
+    path.write_text(json.dumps(content))
+    before = path.read_bytes()
+    with pytest.raises(UsageError) as caught:
+        bench.score(predictions, output_dir=tmp_path)
+    assert caught.value.where == str(path)
+    assert value in str(caught.value.got)
+    assert value not in str(caught.value.expected)
+    assert path.read_bytes() == before

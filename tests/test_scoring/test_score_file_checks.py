@@ -44,6 +44,25 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
         if kind == "infinite":
             file["value"][0, 0, 0] = np.inf
             return
+        if kind.startswith("beyond float32: "):
+            # of the two steps the second one is infinite
+            variable = preview[kind.removeprefix("beyond float32: ")]
+            variable[...] = np.arange(variable.size).reshape(variable.shape) % 2
+            variable.attrs["scale_factor"] = 1e300
+            variable.attrs["add_offset"] = 0.0
+            return
+        if kind.startswith("material "):
+            number = int(kind.removeprefix("material "))
+            count = len(preview["material"])
+            del preview["material"]
+            preview["material"] = np.full(count, number, np.int32)
+            return
+        if kind == "descending scenarios":
+            file["scenario"][...] = file["scenario"][...][::-1]
+            return
+        if kind == "repeated scenarios":
+            file["scenario"][...] = file["scenario"][0]
+            return
         if kind == "extra group":
             file.create_group("more")
             return
@@ -105,6 +124,11 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
             "strings",
         ),
         *("infinite", "another type", "another shape", "packed twice"),
+        # the page could not draw them
+        *("beyond float32: vorticity", "beyond float32: histogram"),
+        *("material 77", "material -1", "material 256"),
+        # the scores of the reference would be those of other scenarios
+        *("descending scenarios", "repeated scenarios"),
         # it would stand in for the submission itself, another's file, or count though
         # it must not
         *("best floor submission", "best floor theirs.nc", "best floor coarse-solver"),
@@ -124,6 +148,17 @@ def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
     own.rehash("noisy")
     result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
     assert [finding.check for finding in result.findings] == ["score_file"]
+
+
+def test_the_child_refuses_infinite_maps_and_histograms(own: BoardBench) -> None:
+    """There, NumPy's warning of an overflow is no error."""
+    secret = own.folder.parent / "secret"
+    paths = []
+    for name, variable in (("noisy", "vorticity"), ("flipping", "histogram")):
+        path = own.folder / SCORES / f"{name}.nc"
+        hostile(path, f"beyond float32: {variable}", secret)
+        paths.append(path)
+    assert set(find_unreadable(paths)) == set(paths)
 
 
 def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:

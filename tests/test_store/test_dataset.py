@@ -20,6 +20,7 @@ import lagbench
 from lagbench.data import registry
 from lagbench.data.manifest import build_manifest, write_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.store.dataset import list_splits, load_manifest, open_split
 
@@ -138,6 +139,36 @@ def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
         expected = frames_of(TEST_IDS[1], 100, 8192)
         value = float(position[1, 99, 0, 0])
         assert value == expected[99, 0, 0]
+
+
+def write_forced(root: Path, scenario: int, layers: int) -> None:
+    """Write a cavity scenario with a force in some layers."""
+    key = make_key(scenario)
+    with ScenarioWriter(
+        scenario_path(root, scenario),
+        key,
+        particles=8,
+        frames=2,
+        frame_interval=0.1,
+        material=np.zeros(8),
+        particle_mass=1.0,
+        body_force=np.ones((2, layers, 2)),
+        parameters={},
+        seed="s",
+        device="cpu",
+        generator="g",
+    ) as writer:
+        for position in frames_of(scenario, 2, 8):
+            writer.append(position, position)
+
+
+def test_forces_in_other_layers_are_refused(tmp_path: Path) -> None:
+    for place, scenario in enumerate(TEST_IDS):
+        write_forced(tmp_path, scenario, layers=4 + 4 * (place == 1))
+    with pytest.raises(DataError) as caught:
+        open_tiny(tmp_path)
+    name = scenario_path(tmp_path, TEST_IDS[1]).name
+    assert str(caught.value.where).endswith(f"{name}, variable 'body_force'")
 
 
 def test_missing_files_are_counted_and_named(ragged: Path) -> None:

@@ -228,7 +228,7 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
     [
         *(
             ({FIRST: fault}, objects.NotDataError)
-            for fault in ("page", "hidden page", "nowhere")
+            for fault in ("page", "hidden page", "nowhere", "other kind")
         ),
         *(
             ({FIRST: fault}, objects.WrongLengthError)

@@ -4,11 +4,16 @@ is left half done.
 
 from __future__ import annotations
 
+import json
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 from conftest import SIZE, SPLIT
@@ -103,6 +108,75 @@ def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
     assert caught.value.where == "s3://elsewhere/data"
     with pytest.raises(UsageError):
         use("nonsense://data/x")
+
+
+class _NameNode(BaseHTTPRequestHandler):
+    """A host of WebHDFS that has every file, in one length, and stores none."""
+
+    length = 0
+    refusal: tuple[int, str] = (404, "FileNotFoundException")
+
+    def do_GET(self) -> None:
+        status = {"type": "FILE", "length": self.length, "pathSuffix": ""}
+        self._send(200, {"FileStatus": status})
+
+    def do_PUT(self) -> None:
+        code, name = self.refusal
+        self._send(code, {"RemoteException": {"exception": name, "message": name}})
+
+    def _send(self, code: int, content: object) -> None:
+        body = json.dumps(content).encode()
+        self.send_response(code)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def name_node(**answers: Any) -> Iterator[str]:
+    """Yield the address of a host of WebHDFS that answers so."""
+    handler = type("NameNode", (_NameNode,), answers)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"webhdfs://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_each_host_answers_for_itself() -> None:
+    """Stores of one kind on two hosts are two stores, also with equal paths."""
+    with name_node(length=3) as first, name_node(length=5) as second:
+        lengths = []
+        for url in (first, second, first):
+            answer = objects.open_object(f"{url}/data/manifest.json", 0, hint="none")
+            lengths.append(answer.total)
+            answer.close()
+    assert lengths == [3, 5, 3]
+
+
+@pytest.mark.parametrize(
+    ("refusal", "error"),
+    [
+        ((404, "FileNotFoundException"), DataError),
+        ((403, "AccessControlException"), WorkFailedError),
+    ],
+)
+def test_a_store_other_than_s3_has_no_buckets_and_no_keys(
+    refusal: tuple[int, str], error: type[LagbenchError]
+) -> None:
+    with name_node(refusal=refusal) as url, pytest.raises(error) as caught:
+        objects.Objects(url, "data").write("manifest.json", b"{}")
+    assert caught.value.where == f"{url}/data"
+    assert caught.value.fix
+    for word in ("bucket", "AWS"):
+        assert word not in str(caught.value)
 
 
 @pytest.mark.parametrize("root", ["http://host/data", "nonsense://data/x"])

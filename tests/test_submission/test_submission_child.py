@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from submission_data import Bench, small
 
@@ -189,6 +190,7 @@ def test_text_of_strangers_is_shown_escaped_and_short() -> None:
     assert quote("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
     assert len(quote("x" * 10**6)) == 80
     assert len(quote([16**5000])) < 80
+    assert len(quote(np.arange(40.0).reshape(8, 5)).splitlines()) == 1
 
 
 def test_the_document_names_every_check() -> None:

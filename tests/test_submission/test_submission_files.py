@@ -377,6 +377,37 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         assert header.device == "one core"
 
 
+def test_ids_may_be_those_of_xarray(bench: Bench) -> None:
+    path = bench.folder / "ids.nc"
+    ids = xr.DataArray(list(TESTS), dims="scenario")
+    with PredictionsWriter(path, **options(bench)) as writer:
+        for scenario in ids:
+            writer.add(scenario, truth(int(scenario)))
+    assert bench.validate(path).valid
+
+
+@pytest.mark.parametrize("scenario", [[3], np.array([3]), "3", 3.5, None, RAGGED, True])
+def test_ids_that_are_no_whole_numbers_are_refused(bench: Bench, scenario: Any) -> None:
+    with (
+        pytest.raises(UsageError) as caught,
+        PredictionsWriter(bench.folder / "refused.nc", **options(bench)) as writer,
+    ):
+        writer.add(scenario, FIRST)
+    assert str(caught.value.where).startswith("scenario ")
+    assert caught.value.fix
+
+
+def test_an_error_of_the_caller_goes_on_as_it_is(bench: Bench) -> None:
+    """A pipe that broke is no disk that is full."""
+    path = bench.folder / "broken.nc"
+    with (
+        pytest.raises(BrokenPipeError),
+        PredictionsWriter(path, **options(bench)),
+    ):
+        raise BrokenPipeError
+    assert not path.exists()
+
+
 def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
     """Values of an earlier try do not count as written; without an open file no value
     is accepted.

@@ -127,6 +127,16 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
     assert list((tmp_path / "test").iterdir()) == [kept]
 
 
+def test_a_folder_with_a_temporary_name_stays(tmp_path: Path) -> None:
+    """No writer made it, and it stops nobody."""
+    folder = tmp_path / ".own.partial"
+    folder.mkdir()
+    left = folder / ".0004.nc.77.partial"
+    left.touch()
+    assert remove_leftovers(tmp_path) == [left]
+    assert folder.is_dir()
+
+
 def test_a_file_of_another_kind_is_never_replaced(tmp_path: Path) -> None:
     """One of the kind is, on request; what is empty or not there is free to take."""
     signs = (b"first", b"second")

@@ -214,6 +214,19 @@ def test_errors_of_the_system_that_nobody_explains_bring_their_traceback(
     assert error.what == "a package failed in a worker"
 
 
+def test_a_result_that_cannot_be_sent_is_an_error_of_the_task() -> None:
+    """It is not taken for the death of a worker, and the worker goes on."""
+    with Pool(1) as pool:
+        pool.submit(WorkItem(name="a", function=pool_tasks.lock))
+        with pytest.raises(WorkFailedError) as caught:
+            list(pool.events())
+        assert caught.value.what == "a worker crashed"
+        assert "lock" in str(caught.value.got)
+        item = WorkItem(name="b", function=pool_tasks.square, arguments=(3,))
+        pool.submit(item)
+        assert [event.value for event in pool.events()] == [1, 9]
+
+
 def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     """No worker outlives the with block, however busy."""
     marker = tmp_path / "pid"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
+from lagbench.errors import format_count
 from lagbench.figures.colours import MATERIAL_RGB
 from lagbench.figures.html import (
     Markup,
@@ -46,7 +47,8 @@ def particle_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigur
     for scenario in shown:
         caption = CAPTION
         if omitted_count and scenario == shown[-1]:
-            caption += f" For want of room {omitted_count} scenarios are not drawn."
+            count = format_count(omitted_count, "scenario")
+            caption += f" Not drawn for want of room: {count}."
         yield _scenario_figure(subject, gallery, scenario, caption=caption)
 
 
