@@ -358,6 +358,7 @@ def _check_material(
             where=where,
             expected=(particles,),
             got=numbers.shape,
+            fix="give one number for each particle",
         )
     # before the cast, which wraps
     is_known = np.isin(numbers, range(len(MATERIALS)))
@@ -367,6 +368,7 @@ def _check_material(
             where=where,
             expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
             got=numbers[~is_known][0],
+            fix="give the numbers of lagbench.data.MATERIALS",
         )
     return numbers.astype(np.int8)
 

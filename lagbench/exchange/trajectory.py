@@ -86,14 +86,23 @@ MOST_CELLS_OF_PERIODS = 64
 NEIGHBOUR_RADII = 3.0
 """Radii within which a particle must have neighbours, to estimate the spacing."""
 
-KERNEL_REACHES = (2.5, 6.0)
-"""Least and most radius of the kernel that measures the density [spacing].
-
-A small one fits into small bodies, a large one averages over random positions.
+REACHES_ACROSS = 4.0
+"""Radii of the kernel that measures the density, across a square or cube of all
+particles, between the limits.
 """
 
-REACHES_ACROSS = 4.0
-"""Radii of the kernel across a square or cube of all particles, between the limits."""
+MOST_REACH = 6.0
+LEAST_REACH = 3.0
+LEAST_REACH_IN_LATTICE = 1.8
+"""Limits of the radius of the kernel [spacing].
+
+A large one averages over random positions, a small one fits into small bodies.
+"""
+
+LATTICE_SPREAD = 0.1
+"""Spread of the distances to the nearest neighbour up to which particles are taken for
+a lattice: quartile range over median [1].
+"""
 
 KERNEL_ROUNDS = 10
 """Rounds in which spacing and reach of the kernel come to agree."""
@@ -485,8 +494,8 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
 
     It is ``(volume / particles)^(1/d)`` inside the material, by the density that a
     cubic spline kernel measures (Monaghan 1992, Annu. Rev. Astron. Astrophys. 30) with
-    a reach of 2.5 to 6 spacings. A box with periodic axes has the lengths of the
-    positions.
+    a reach of 1.8 to 6 spacings, small only in small lattices. A box with periodic axes
+    has the lengths of the positions.
 
     Args:
         position: particles [length], shape [particle, axis].
@@ -505,14 +514,17 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
     if count > MOST_SAMPLES:
         samples = points[np.linspace(0, count - 1, MOST_SAMPLES).astype(int)]
     particles_across = count ** (1.0 / dimension)
-    relative_reach = float(np.clip(particles_across / REACHES_ACROSS, *KERNEL_REACHES))
+    wanted_reach = min(particles_across / REACHES_ACROSS, MOST_REACH)
+    relative_reach = max(wanted_reach, LEAST_REACH)
     # twice the neighbours within the reach, so that the reach may grow
     reached = _volume_of_unit_ball(dimension) * relative_reach**dimension
     neighbours = min(count, math.ceil(2.0 * reached))
     query = box.tree(points).query(samples, k=neighbours)
     distances = np.asarray(query[0])  # [sample, neighbour]; the first one is itself
-    nearest = float(np.quantile(distances[:, 1], 1.0 - INTERIOR_QUANTILE))
-    if not 0.0 < nearest <= NEIGHBOUR_RADII * radius:
+    low, nearest, high = np.quantile(distances[:, 1], (0.25, 0.5, 0.75))
+    if high - low <= LATTICE_SPREAD * nearest:
+        relative_reach = max(wanted_reach, LEAST_REACH_IN_LATTICE)
+    if not 0.0 < low <= NEIGHBOUR_RADII * radius:
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",
             where="--radius",
@@ -522,7 +534,7 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
             "--describe, key spacing",
         )
 
-    spacing = nearest
+    spacing = float(nearest)
     for _ in range(KERNEL_ROUNDS):
         reach = relative_reach * spacing
         weights = _cubic_spline(distances / reach, dimension) / reach**dimension

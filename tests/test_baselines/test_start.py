@@ -290,6 +290,7 @@ def test_steps_before_the_start_count_for_convergence(
     """Steps that bring nothing converge only where they are half of all."""
     flat = Budget(
         steps=4,
+        epochs=1.0,
         cpu_hours=9.0,
         best=0.5,
         validations=((2, 0.5), (4, 0.5)),

@@ -291,7 +291,7 @@ HINTS = {
     "validate void.nc": "lagbench template",
     "validate good.nc nan.nc": "expected: lagbench validate [OPTIONS] ",
     "submit good.nc --author A --command x --board near/bord": "near/board",
-    f"{ADOPT} runs.npy --periodic w --bounds 0,1,0,1": "axes of the box: x, y",
+    f"{ADOPT} runs.npy --periodic w --bounds 0,1,0,1": "each at most once: x, y",
     f"{ADOPT} runs.npy solid.npy": "apart",
     f"{ADOPT} solid.npy --bounds 0,1,0,1": "a pair for each component",
 }

@@ -350,6 +350,6 @@ def test_a_draw_out_of_range_names_its_scenario(
     )
     with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
-    assert caught.value.where == "curl-noise tiny, scenario 2"
-    assert caught.value.where == f"{SPLIT} {SIZE}, scenario 2"
+    place = f"{own}, splits.{SPLIT}, size {SIZE}, scenario 2"
+    assert caught.value.where == place
     assert files(tmp_path / "data") == []

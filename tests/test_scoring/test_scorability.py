@@ -94,7 +94,7 @@ def undefined_warnings(card: ScoreCard) -> list[Any]:
     ("side", "cells", "word"),
     [
         (12, 5, "finer"),
-        (3, 40, "coarser"),
+        (4, 40, "coarser"),
     ],
 )
 def test_the_proposed_grid_makes_the_score_defined(
