@@ -16,7 +16,7 @@ from torch.onnx import symbolic_helper
 from lagbench.arguments import check_arguments
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError, check_installed
+from lagbench.errors import UsageError, check_installed, require
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
@@ -165,8 +165,7 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
 
 def _state_data_set(path: Path, size: Size) -> None:
     """Write the names of split and size into the metadata of an ONNX file."""
-    import onnx
-
+    onnx = require("onnx", extra="onnx")
     model = onnx.load(path, load_external_data=False)
     names = {SPLIT_KEY: size.split, SIZE_KEY: size.name}
     onnx.helper.set_model_props(model, names)
