@@ -534,8 +534,8 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
         win_count = learned_verdicts.count(LearningVerdict.PAYS)
         open_count = learned_verdicts.count(LearningVerdict.OPEN)
         sentences.append(
-            f"Purely learned models beat the solvers of their cost on {win_count} of "
-            f"{len(learned_verdicts)}; on {open_count} the question is open."
+            f"Purely learned models beat the solvers that cost no more on {win_count} "
+            f"of {len(learned_verdicts)}; on {open_count} the question is open."
         )
     return sentences
 
