@@ -27,6 +27,7 @@ from lagbench.scoring.score_file_checks import (
     read_score_file,
 )
 from lagbench.submission.issues import ValidationIssue
+from lagbench.submission.task_checks import VERSION
 
 from .entry import (
     RELATIVE_TOLERANCE,
@@ -319,9 +320,9 @@ class FolderChecks:
 
         version = identity["dataset_version"]
         major = major_of(entry.dataset.version)
-        if not version.startswith(f"{major}."):
+        if VERSION.fullmatch(version) is None or major_of(version) != major:
             got = ascii(version)[:80]
-            self._add("score_file", path, f"dataset_version {got}, not {major}")
+            self._add("score_file", path, f"dataset_version {got}, not {major}.x.y")
 
     def _check_score_block(
         self, path: Path, entry: Entry, scores: Sequence[SubmissionStatistics]

@@ -161,6 +161,14 @@ def _require_onnx(
     So an entry can share it only with an inactive entry of the same data set and seed.
     """
     declared = check_onnx(path)
+    if declared.split not in (None, header.split):
+        raise UsageError(
+            "the model states another split",
+            where=str(path),
+            expected=header.split,
+            got=declared.split,
+            fix="give the file of the model that made these predictions",
+        )
     sha256 = file_sha256(path)
     for use in uses:
         if use.weights.sha256 == sha256:

@@ -131,7 +131,9 @@ def export(
         next(iter(frames_by_subset["train"])), tier
     )
     if from_walls is None:
-        is_measured_from_walls = tier.is_full_box
+        is_measured_from_walls = (
+            tier.is_full_box or has_moving_walls or tier.box.is_periodic
+        )
     else:
         is_measured_from_walls = from_walls
     walls = None

@@ -44,7 +44,7 @@ from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import format_yaml
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DISK_FULL_ERRORS, DataError, UsageError, WorkFailedError
 from lagbench.metrics.coverage import Cloud, fitting_cells
 from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
@@ -323,7 +323,8 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
         raise _write_error(folder, error.got) from error
     except OSError as error:
         # others come from the source, or from who watches the progress
-        if not _is_below(root, error.filename):
+        is_full = error.errno in DISK_FULL_ERRORS
+        if not is_full and not _is_below(root, error.filename):
             raise
         raise _write_error(folder, error.strerror or error) from error
     finally:
@@ -343,10 +344,10 @@ def _remove_abandoned(folder: Path) -> None:
     """
     for leftover in folder.parent.glob(f".{folder.name}.*{SUFFIX}"):
         lock_path = leftover / LOCK_NAME
-        if not lock_path.is_file():
-            continue
         lock = filelock.FileLock(lock_path)
         try:
+            if not lock_path.is_file():
+                continue
             lock.acquire(timeout=0)
         except (OSError, NotImplementedError):  # its process works, or is not known
             continue

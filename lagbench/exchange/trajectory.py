@@ -91,12 +91,15 @@ REACHES_ACROSS = 4.0
 particles, between the limits.
 """
 
-MOST_REACH = 6.0
 LEAST_REACH = 3.0
-LEAST_REACH_IN_LATTICE = 1.8
-"""Limits of the radius of the kernel [spacing].
+MOST_REACH = 6.0
+"""Limits of the radius of the kernel [spacing]; a large one averages over random
+positions.
+"""
 
-A large one averages over random positions, a small one fits into small bodies.
+REACH_IN_LATTICE = 1.8
+"""Radius of the kernel where particles stand on a lattice: it fits into thin bodies
+[spacing].
 """
 
 LATTICE_SPREAD = 0.1
@@ -142,9 +145,9 @@ class BoxTransform:
         """Return the transform that brings a box into the unit box.
 
         The scale is a power of two, which loses no bit: the least that is not below the
-        longest side, but 1 for sides from 1/16 to 1. It is the longest period instead
-        where else no score grid would fit the periods, as in a box of side 2 pi. The
-        corner is 0 where that is enough.
+        longest side, but 1 for sides from 1/16 to 1. Where no score grid would fit the
+        periods then, as in a box of side 2 pi, it is a multiple of the longest period,
+        if that helps. The corner is 0 where that is enough.
 
         Args:
             bounds: the box [length].
@@ -155,9 +158,7 @@ class BoxTransform:
         scale = _fitting_power_of_two(float(sides.max()))
         is_periodic = parse_periodic(periodic, len(bounds))
         if any(is_periodic):
-            scaled_bounds = [(0.0, float(side / scale)) for side in sides]
-            if not _has_grid(Box.from_bounds(scaled_bounds, is_periodic)):
-                scale = float(sides.max())
+            scale = _scale_with_grid(sides, is_periodic, scale)
         corner = low
         if (low >= 0.0).all() and (high <= scale).all():
             corner = np.zeros(len(bounds))
@@ -188,6 +189,22 @@ def _fitting_power_of_two(side: float) -> float:
     if mantissa == 0.5:
         exponent -= 1
     return math.ldexp(1.0, exponent)
+
+
+def _scale_with_grid(
+    sides: NDArray[np.float64], is_periodic: Sequence[bool], scale: float
+) -> float:
+    """Return a scale by which some score grid fits the periods.
+
+    It is the given one if that fits, or if no multiple of the longest period fits.
+    """
+    period = float(sides[np.asarray(is_periodic)].max())
+    multiple = period * math.ceil(float(sides.max()) / period)
+    for candidate in (scale, multiple):
+        bounds = [(0.0, float(side / candidate)) for side in sides]
+        if _has_grid(Box.from_bounds(bounds, is_periodic)):
+            return candidate
+    return scale
 
 
 def _has_grid(box: Box) -> bool:
@@ -494,8 +511,8 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
 
     It is ``(volume / particles)^(1/d)`` inside the material, by the density that a
     cubic spline kernel measures (Monaghan 1992, Annu. Rev. Astron. Astrophys. 30) with
-    a reach of 1.8 to 6 spacings, small only in small lattices. A box with periodic axes
-    has the lengths of the positions.
+    a reach of 3 to 6 spacings, in lattices of 1.8 spacings. A box with periodic axes
+    has the lengths of the positions. A single particle has the radius as its spacing.
 
     Args:
         position: particles [length], shape [particle, axis].
@@ -503,38 +520,52 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
         box: the box of the particles; the unit box when None.
 
     Raises:
-        UsageError: most particles have no neighbour within three radii.
+        UsageError: three quarters of the particles have no neighbour within three
+            radii, or a quarter of them lie on another one.
     """
     count, dimension = position.shape
     if count == 1:
         return radius
     box = box or unit_box(dimension)
-    points = box.tree_points(position.astype(np.float64))
+    exact = position.astype(np.float64)
+    points = box.tree_points(exact)
     samples = points
     if count > MOST_SAMPLES:
         samples = points[np.linspace(0, count - 1, MOST_SAMPLES).astype(int)]
     particles_across = count ** (1.0 / dimension)
-    wanted_reach = min(particles_across / REACHES_ACROSS, MOST_REACH)
-    relative_reach = max(wanted_reach, LEAST_REACH)
+    relative_reach = float(
+        np.clip(particles_across / REACHES_ACROSS, LEAST_REACH, MOST_REACH)
+    )
     # twice the neighbours within the reach, so that the reach may grow
-    reached = _volume_of_unit_ball(dimension) * relative_reach**dimension
-    neighbours = min(count, math.ceil(2.0 * reached))
-    query = box.tree(points).query(samples, k=neighbours)
+    ball_volume = _volume_of_unit_ball(dimension) * relative_reach**dimension
+    neighbours = min(count, math.ceil(2.0 * ball_volume))
+    query = box.tree(exact).query(samples, k=neighbours)
     distances = np.asarray(query[0])  # [sample, neighbour]; the first one is itself
-    low, nearest, high = np.quantile(distances[:, 1], (0.25, 0.5, 0.75))
-    if high - low <= LATTICE_SPREAD * nearest:
-        relative_reach = max(wanted_reach, LEAST_REACH_IN_LATTICE)
-    if not 0.0 < low <= NEIGHBOUR_RADII * radius:
+    lower_quartile, median, upper_quartile = np.quantile(
+        distances[:, 1], (0.25, 0.5, 0.75)
+    )
+    if lower_quartile == 0.0:
+        raise UsageError(
+            "particles lie on one another: their spacing cannot be estimated",
+            where="the first frame of train",
+            expected="most particles at places of their own",
+            got="a quarter of the particles at the place of another one, or more",
+            fix="leave out copies, or say in a file how far particles are apart: "
+            "--describe, key spacing",
+        )
+    if lower_quartile > NEIGHBOUR_RADII * radius:
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",
             where="--radius",
-            expected=f"neighbours within {NEIGHBOUR_RADII:g} radii, at other places",
+            expected=f"neighbours within {NEIGHBOUR_RADII:g} radii",
             got=radius,
             fix="a larger --radius, or say in a file how far particles are apart: "
             "--describe, key spacing",
         )
 
-    spacing = float(nearest)
+    if upper_quartile - lower_quartile <= LATTICE_SPREAD * median:
+        relative_reach = REACH_IN_LATTICE
+    spacing = float(median)
     for _ in range(KERNEL_ROUNDS):
         reach = relative_reach * spacing
         weights = _cubic_spline(distances / reach, dimension) / reach**dimension

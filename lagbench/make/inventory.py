@@ -370,12 +370,14 @@ def _check_header(
     for name, value in file_parameters(size, scenario, state).items():
         expected[name] = to_plain(value)
     if size.periodic:  # stated by the writer, from the box
-        expected["periodic"] = " ".join(size.periodic)
+        expected["periodic"] = " ".join(sorted(size.periodic))
     # What only the simulation tells is covered by the content hash.
     stated = {}
     for name, value in header.parameters.items():
         if name not in OUTCOMES:
             stated[name] = value
+    if "periodic" in stated:  # in any order
+        stated["periodic"] = " ".join(sorted(str(stated["periodic"]).split()))
 
     if expected != stated:
         names = expected.keys() | stated.keys()

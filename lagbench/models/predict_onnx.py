@@ -77,8 +77,20 @@ def predict_onnx(
     """
     check_predictions_output(Path(output), overwrite=overwrite)
     declared = check_onnx(Path(model))
+    stated_split = split
     split, size = _choose_data_set(split, size, declared, Path(model))
-    any_tier, folder, known = locate(split, size, root=root, registry=registry)
+    try:
+        any_tier, folder, known = locate(split, size, root=root, registry=registry)
+    except UsageError as error:
+        if stated_split is not None:
+            raise
+        raise UsageError(
+            error.what,
+            where=f"{model}, the data set that it states",
+            expected=error.expected,
+            got=error.got,
+            fix="name the split, or the folder of a local one: --split",
+        ) from error
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(Path(model), size=tier, root=folder, declared=declared)

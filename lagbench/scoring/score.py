@@ -391,12 +391,14 @@ def _check_overwriting(path: Path, header: Header) -> None:
 
 
 def _describe_scored(identity: Mapping[str, str], subset: str) -> str:
-    """Return method, data set and subset of scores in words."""
+    """Return method, data set and subset of scores in words.
+
+    A minor version leaves the data as they are, so the hash decides.
+    """
     split = identity["split"]
     size = identity["size"]
-    version = identity["dataset_version"]
     sha256 = identity["dataset_sha256"]
-    return f"{identity['method']} {split} {size} {version} {subset}, data {sha256}"
+    return f"{identity['method']} {split} {size} {subset}, data {sha256}"
 
 
 def _warn_of_few_nodes(

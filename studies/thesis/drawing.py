@@ -23,6 +23,7 @@ from lagbench.figures.panels import (
     draw,
     draw_walls,
     limit_of,
+    strongest_limit,
 )
 from lagbench.figures.recording import Recording, Scene, open_recording
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
@@ -228,7 +229,7 @@ def _common_limit(
     for rollouts in scenarios.values():
         for frame in frames:
             limits.append(limit_of(scale, rollouts.scene(None, frame)))
-    return max(limits)
+    return strongest_limit(limits)
 
 
 def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:

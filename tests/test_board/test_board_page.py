@@ -444,7 +444,8 @@ def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
     assert "The model is hybrid: a classical solver" in shown
     assert "The model is slower than the simulator" in shown
     assert (
-        "beat the solvers that cost no more on 0 of 1; on 1 the question is open" in shown
+        "beat the solvers that cost no more on 0 of 1; on 1 the question is open"
+        in shown
     )
     winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×, slower"
     assert f"cavityyes{winner_cells}Net0.90× (0.80 to 1.1)" in shown

@@ -914,7 +914,9 @@ def test_seeds_may_come_after_a_minor_version_of_the_data(own: BoardBench) -> No
     first, later = [trained(own, seed) for seed in (0, 3)]
     with netCDF4.Dataset(first / "predictions.nc", "a") as file:
         version = file.getncattr("dataset_version")
-        file.setncattr("dataset_version", version.partition(".")[0] + ".0.0")
+        minor_version = version.partition(".")[0] + ".0.9"
+        assert minor_version != version
+        file.setncattr("dataset_version", minor_version)
     submitted(own, first)
     submitted(own, later, add=True)
     assert_sound(own)

@@ -860,6 +860,10 @@ def test_periods_that_no_grid_fits_become_one() -> None:
     assert transform.transform_box(cube) == ((0.0, 1.0),) * 3
     assert BoxTransform.fit(cube).scale == 8.0
     assert BoxTransform.fit(((0.0, 1.12),) * 2, ("x", "y")).scale == 2.0
+    channel = ((0.0, 2.0 * math.pi), (0.0, 8.0))  # its walls are further apart
+    assert BoxTransform.fit(channel, ("x",)).scale == 4.0 * math.pi
+    # no scale helps where the ratio of the periods is irrational
+    assert BoxTransform.fit(((0.0, 1.0), (0.0, math.sqrt(2.0))), ("x", "y")).scale == 2
 
 
 @pytest.mark.parametrize("radius", [0.012, 0.026, 0.06])
@@ -874,13 +878,27 @@ def test_the_spacing_of_a_lattice_is_found(
     assert math.isclose(spacing, 0.01, rel_tol=0.01)
 
 
-def test_the_spacing_in_a_periodic_box_is_found() -> None:
-    """In a cube of eight particles a side each has neighbours across the ends."""
-    axis = (np.arange(8) + 0.5) / 8
+@pytest.mark.parametrize("low", [0.0, -1.0, 0.013, 5.0])
+@pytest.mark.parametrize("periodic", [(True, True, True), (True, False, False)])
+def test_the_spacing_in_a_periodic_box_is_found(
+    periodic: tuple[bool, ...], low: float
+) -> None:
+    """In a cube of eight particles a side each has neighbours across the ends, wherever
+    the box begins.
+    """
+    axis = low + (np.arange(8) + 0.5) / 8
     cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    box = Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3)
+    box = Box.from_bounds([(low, low + 1.0)] * 3, periodic)
     for radius in (0.2, 0.45):
         assert math.isclose(estimate_spacing(cube, radius, box), 0.125, rel_tol=0.01)
+
+
+@pytest.mark.parametrize("shape", [(100, 6), (40, 40, 6)])
+def test_the_spacing_of_a_thin_layer_is_found(shape: tuple[int, ...]) -> None:
+    """Most of its particles are near a surface."""
+    axes = [0.005 * np.arange(count) for count in shape]
+    points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(shape))
+    assert math.isclose(estimate_spacing(points, 0.01), 0.005, rel_tol=0.01)
 
 
 def test_the_spacing_of_random_positions_is_near() -> None:

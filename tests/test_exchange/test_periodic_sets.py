@@ -21,7 +21,7 @@ from lagbench.baselines.train import train
 from lagbench.data.local import locate
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.exchange import adopt, import_split
+from lagbench.exchange import adopt, export, import_split
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.scoring.card import ScoreCard
 
@@ -208,6 +208,29 @@ def test_cells_that_no_period_fits_are_refused(tmp_path: Path) -> None:
                 rescale=rescale,
             )
         assert caught.value.where == "--periodic"
+
+
+def test_a_periodic_export_begins_at_the_origin(tmp_path: Path) -> None:
+    """LagrangeBench looks for neighbours from 0 to a period, whatever fills the box."""
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    for number in range(4):
+        np.save(runs / f"{number}.npy", (0.25 + 0.5 * carried(18)).astype(np.float32))
+    for full_box in (False, True):
+        own_split = adopt(
+            runs,
+            output=tmp_path / f"shifted-{int(full_box)}",
+            radius=0.05,
+            frame_interval=0.1,
+            bounds=((0.25, 0.75), (0.25, 0.75)),
+            periodic=("x", "y"),
+            full_box=full_box,
+        )
+        folder = tmp_path / f"out-{full_box}"
+        export(own_split.folder, format="lagrangebench-h5", output=folder)
+        with h5py.File(folder / "train.h5") as file:
+            position = file["00000/position"][()]
+        assert 0.0 <= position.min() <= position.max() < 0.5
 
 
 def test_a_force_beside_the_data_is_not_read(tmp_path: Path) -> None:

@@ -353,3 +353,19 @@ def test_a_draw_out_of_range_names_its_scenario(
     place = f"{own}, splits.{SPLIT}, size {SIZE}, scenario 2"
     assert caught.value.where == place
     assert files(tmp_path / "data") == []
+
+
+@pytest.mark.slow
+def test_the_order_of_periodic_axes_makes_no_other_scenario(
+    tmp_path: Path, unmeasured_path: Path
+) -> None:
+    """A description may name them in any order; what is there is kept."""
+    before, name, after = unmeasured_path.read_text().partition("  decaying-vortices:")
+    own = tmp_path / "own.yaml"
+    own.write_text(before + name + after.replace("[x, y]", "[y, x]"))
+    registry = load(own)
+    options: dict[str, Any] = {"scenarios": "0", "root": tmp_path / "data"}
+    generate("decaying-vortices", "tiny", registry=registry, **options)
+    again = generate("decaying-vortices", "tiny", registry=registry, **options)
+    assert again.kept == (0,)
+    assert again.simulated == ()

@@ -326,6 +326,18 @@ def test_a_stated_data_set_is_a_name(name: str, tmp_path: Path) -> None:
     assert len(str(caught.value)) < 1000
 
 
+def test_a_stated_split_that_is_not_there_needs_the_option(tmp_path: Path) -> None:
+    """As that of a local split, whose folder only the user knows."""
+    path = straight_on(tmp_path / "lines.onnx")
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"lagbench_split": "own"})
+    onnx.save(model, path)
+    with pytest.raises(UsageError) as caught:
+        predict_onnx(path, tmp_path / "predictions.nc", root=tmp_path)
+    assert str(path) in str(caught.value.where)
+    assert "--split" in str(caught.value.fix)
+
+
 def test_an_onnx_model_without_a_stated_split_needs_the_option(tmp_path: Path) -> None:
     path = straight_on(tmp_path / "lines.onnx")
     with pytest.raises(UsageError) as caught:
@@ -546,6 +558,11 @@ def test_an_entry_carries_an_onnx_model(
     straight_on(other)
     with pytest.raises(UsageError):  # one of the two did not make the predictions
         submit([predictions], meta, weights=[path, other], **options)
+    stated = onnx.load(other)
+    onnx.helper.set_model_props(stated, {"lagbench_split": "cavity"})
+    onnx.save(stated, other)
+    with pytest.raises(UsageError):  # the predictions are of curl-noise
+        submit([predictions], meta, weights=[other], **options)
     hostile = pickle_as_onnx(other)
     with pytest.raises(UnreadableFileError):
         submit([predictions], meta, weights=[hostile], **options)

@@ -621,7 +621,6 @@ def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
     ("key", "value"),
     [
         ("method", "another"),
-        ("dataset_version", "1.9.0"),
         ("dataset_sha256", "ab" * 32),
         ("subset", "shift"),
     ],
@@ -634,7 +633,7 @@ def test_scores_of_another_submission_are_not_overwritten(
     key: str,
     value: str,
 ) -> None:
-    """Another method, version, data set or subset; the message tells them apart."""
+    """Another method, data set or subset; the message tells them apart."""
     content = load_json(persistence_card) | {key: value}
     path = tmp_path / "scores.json"
     path.write_text(json.dumps(content))
