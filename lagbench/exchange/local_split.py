@@ -10,7 +10,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -204,6 +204,7 @@ def make_local_split(
             folder.
     """
     folder = check_output(output)
+    _check_cells(description)
     meter = Meter(progress)
     with _staging_folder(folder) as root:
         builder = SplitBuilder(description, root)
@@ -227,6 +228,21 @@ def make_local_split(
         size = load(built / DESCRIPTION).size(description.name, SIZE)
         _move_to_place(built, folder)
     return _summarise(folder, size, manifest, spacing=builder.spacing)
+
+
+def _check_cells(description: Description) -> None:
+    """Refuse a stated score grid that does not fit the periods of the box."""
+    cells = description.cells
+    box = description.box
+    if cells is None or box is None or box.has_whole_cells(cells):
+        return
+    raise UsageError(
+        "the score grid has no whole cells along the periodic axes",
+        where="--cells",
+        expected="cells that divide each period into three or more of them",
+        got=f"{cells} across a length of 1, in the box {format_bounds(box.bounds)}",
+        fix="leave --cells out, and add --rescale if the periods need it",
+    )
 
 
 def _summarise(
@@ -301,20 +317,17 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
     try:
         root.mkdir(parents=True)
     except FileExistsError as error:
-        raise WorkFailedError(
-            "another call makes this folder",
-            where=str(folder),
-            expected="one call at a time for a folder",
-            got=f"{root.name} beside it, in which another call writes",
-            fix="wait until that one ends, or name another folder: --output",
-        ) from error
+        raise _error_of_other_call(folder, root) from error
     except OSError as error:
         raise _write_error(folder, error.strerror or error) from error
 
     lock = filelock.FileLock(root / LOCK_NAME)
-    # without a lock, as on disks that have none, no call removes the folder
-    with suppress(OSError, NotImplementedError):
+    try:
         lock.acquire(timeout=0)
+    except filelock.Timeout as error:
+        raise _error_of_other_call(folder, root) from error
+    except (OSError, NotImplementedError):
+        pass  # on disks without locks no call removes the folder
     try:
         yield root
     except WorkFailedError as error:
@@ -332,6 +345,16 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(root, ignore_errors=True)
 
 
+def _error_of_other_call(folder: Path, root: Path) -> WorkFailedError:
+    return WorkFailedError(
+        "another call makes this folder",
+        where=str(folder),
+        expected="one call at a time for a folder",
+        got=f"{root.name} beside it, in which another call writes",
+        fix="wait until that one ends, or name another folder: --output",
+    )
+
+
 def _is_below(root: Path, place: object) -> bool:
     """Return whether an error is about a place in a folder."""
     return str(place).startswith(f"{root}{os.sep}")
@@ -340,7 +363,8 @@ def _is_below(root: Path, place: object) -> bool:
 def _remove_abandoned(folder: Path) -> None:
     """Remove the folders that killed calls for the same target left beside it.
 
-    The system has dropped the lock of a killed process, on whatever machine it was.
+    The system has dropped the lock of a killed process. On network disks whose locks
+    hold for one machine only, two machines may not build the same target.
     """
     for leftover in folder.parent.glob(f".{folder.name}.*{SUFFIX}"):
         lock_path = leftover / LOCK_NAME
@@ -898,9 +922,7 @@ class SplitBuilder:
         if description.full_box:
             placement = Placement.CELL_CENTRES
         cells = description.cells
-        if cells:
-            self._check_cells(cells)
-        else:
+        if not cells:
             ends = (description.input_frames, last)
             cells = self._suitable_cells(placement, ends)
         return {
@@ -910,19 +932,6 @@ class SplitBuilder:
             "score_grid": {"cells": cells, "placement": placement.value},
             "radius": description.radius / description.transform.scale,
         }
-
-    def _check_cells(self, cells: int) -> None:
-        """Refuse a stated score grid that does not fit the periods."""
-        if self._box.has_whole_cells(cells):
-            return
-        raise UsageError(
-            "the score grid has no whole cells along the periodic axes",
-            where="--cells",
-            expected="cells that divide each period into three or more of them",
-            got=f"{cells} across a length of 1, in the box "
-            f"{format_bounds(self._box.bounds)}",
-            fix="leave --cells out, and add --rescale if the periods need it",
-        )
 
     def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
         """Return cells across a score grid that suits the spacing.

@@ -77,12 +77,12 @@ def predict_onnx(
     """
     check_predictions_output(Path(output), overwrite=overwrite)
     declared = check_onnx(Path(model))
-    stated_split = split
+    named_split = split
     split, size = _choose_data_set(split, size, declared, Path(model))
     try:
         any_tier, folder, known = locate(split, size, root=root, registry=registry)
     except UsageError as error:
-        if stated_split is not None:
+        if named_split is not None:
             raise
         raise UsageError(
             error.what,

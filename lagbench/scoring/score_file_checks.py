@@ -299,6 +299,8 @@ def _check_obstacle(obstacle: NDArray[np.float32] | None) -> None:
 
 def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:
     """Refuse a file that is not of the task of a split and size."""
+    if scores.subset != size.scored_subset:
+        raise ValueError(f"scores of the subset {scores.subset[:40]!a}")
     frames = tuple(frames_to_predict(size))
     ids = tuple(sorted(size.scored_scenarios))
     scored_ids = tuple(sorted(scores.tallies))

@@ -181,6 +181,7 @@ def test_a_square_of_side_2_pi_is_rescaled(tmp_path: Path) -> None:
 def test_cells_that_no_period_fits_are_refused(tmp_path: Path) -> None:
     """Before anything is written; nor are there periods without bounds."""
     source = write_set(tmp_path / "theirs", 0.7853981633974483)
+    steps: list[object] = []
     with pytest.raises(UsageError) as caught:
         import_split(
             source,
@@ -189,8 +190,10 @@ def test_cells_that_no_period_fits_are_refused(tmp_path: Path) -> None:
             input_frames=GIVEN,
             full_box=True,
             cells=7,
+            progress=steps.append,
         )
     assert caught.value.where == "--cells"
+    assert not steps
     assert not (tmp_path / "seven").exists()
 
     runs = tmp_path / "runs"
