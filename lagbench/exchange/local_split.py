@@ -953,8 +953,8 @@ class SplitBuilder:
             where="--periodic and --bounds",
             expected="periods that are whole numbers of one cell",
             got=format_bounds(box.bounds),
-            fix="--rescale makes the longest period 1; if that does not help, the "
-            "ratios of the periods need other --bounds",
+            fix="add --rescale; if that does not help, give --bounds whose periods "
+            "have a ratio of small whole numbers",
         )
 
     def _read_clouds(self, frames: tuple[int, int]) -> Iterator[Cloud]:
