@@ -21,7 +21,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
@@ -50,21 +50,37 @@ class Symmetry(enum.StrEnum):
     """All eight images of the square, or 48 of the cube: splits without gravity."""
 
 
-def check_symmetry(symmetry: object, size: Size) -> None:
+def check_symmetry(
+    symmetry: object, size: Size, *, forcing: Collection[str] = ()
+) -> None:
     """Refuse all images of the square where some of them are no motion of the split.
 
     Mirror images alone are possible everywhere. A split whose description names no
     gravity, as an imported one may, passes.
 
+    Args:
+        symmetry: the images that are asked for.
+        size: the data set.
+        forcing: what drives the flow, by the names in batches.
+
     Raises:
-        UsageError: all images of the square are asked for where gravity acts, or where
-            only some axes are periodic.
+        UsageError: all images of the square are asked for where gravity or a force on
+            layers acts, or where only some axes are periodic.
     """
     if symmetry != Symmetry.SQUARE:
         return
     if len(set(size.box.periodic)) > 1:
         raise UsageError(
             f"only some axes of {size.split} are periodic: axes cannot change places",
+            where="model.symmetry",
+            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR}",
+            got=str(symmetry),
+            fix="set model.symmetry=mirror",
+        )
+    if "body_force" in forcing:
+        raise UsageError(
+            f"a force acts on layers along y in {size.split}: y cannot change places "
+            "with another axis",
             where="model.symmetry",
             expected=f"{Symmetry.NONE} or {Symmetry.MIRROR}",
             got=str(symmetry),
@@ -416,14 +432,14 @@ def add_walk_noise(
 def velocity_towards_path(
     gap: Tensor, frames: float | None, *, acceleration_std: float
 ) -> Tensor:
-    """Return the velocity that leads back to the true path, shape [particle, 2].
+    """Return the velocity that leads back to the true path, shape [particle, axis].
 
     It is ``gap / frames``. The gap is measured anew in each frame, so each frame closes
     1/frames of what is left of it. However far off a particle is, the velocity is no
     longer than three standard deviations of an acceleration, acting for one frame.
 
     Args:
-        gap: true less reached positions [length], shape [particle, 2].
+        gap: true less reached positions [length], shape [particle, axis].
         frames: frames to come back in; None for no way back.
         acceleration_std: deviation of accelerations [length/frame^2].
     """

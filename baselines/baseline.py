@@ -42,7 +42,10 @@ __all__ = [
 
 
 LARGEST_OPTION = 1e12
-"""Greatest whole number that an option may have: counts and steps are far below."""
+"""Greatest whole number that an option may have: counts and steps are far below.
+
+It is the greatest number of epochs, too.
+"""
 
 
 class Settings(BaseModel):
@@ -254,7 +257,7 @@ class Baseline(nn.Module):
 
     @abstractmethod
     def advance(self, state: Any) -> tuple[Any, Tensor]:  # noqa: ANN401
-        """Return the next state and positions [length], shape [particle, 2]."""
+        """Return the next state and positions [length], shape [particle, axis]."""
 
 
 def count_parameters(model: Baseline) -> int:

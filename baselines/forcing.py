@@ -143,9 +143,12 @@ class ForcingFeatures(nn.Module):
 
 
 def root_mean_square(deviations: Sequence[float]) -> float:
-    """Return the deviation of one component, from those along each axis."""
+    """Return the deviation of one component, from those along each axis.
+
+    It is 1 where nothing varies: models divide by it.
+    """
     variance = np.mean(np.square(deviations))
-    return float(np.sqrt(variance))
+    return float(np.sqrt(variance)) or 1.0
 
 
 def coming_force(given: Batch, info: DatasetInfo) -> Tensor:

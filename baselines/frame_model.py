@@ -6,7 +6,8 @@ standardised:
 
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
-with the public statistics of the training scenarios, one number per feature. The first
+with the public statistics of the training scenarios, one number per feature; a feature
+that never varies has the deviation of :func:`.deviations.replace_zeros`. The first
 frame of a window has no frame before it: it takes the velocity of the second. In three
 dimensions q has six components. Along periodic axes positions are wrapped, velocities
 and errors follow the shortest way.
@@ -29,6 +30,7 @@ from lagbench.tensors import TensorBox
 
 from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
+from .deviations import replace_zeros
 from .forcing import ForcingFeatures, require_force, root_mean_square, skip_frames
 from .graph import MATERIALS
 
@@ -47,7 +49,9 @@ class FrameState(nn.Module):
         self.dimension = info.box.dimension
         statistics = info.statistics
         mean = (*statistics["position_mean"], *statistics["velocity_mean"])
-        std = (*statistics["position_std"], *statistics["velocity_std"])
+        position_std = replace_zeros(statistics["position_std"])
+        velocity_std = replace_zeros(statistics["velocity_std"])
+        std = (*position_std, *velocity_std)
         mean_tensor = torch.tensor(mean, dtype=torch.float64)
         std_tensor = torch.tensor(std, dtype=torch.float64)
         self.register_buffer("mean", mean_tensor, persistent=False)
@@ -342,7 +346,7 @@ class FrameNetwork(FrameModel):
         }
         ratios = []
         for state_name, change_name in change_of_state.items():
-            state_stds = statistics[state_name]
+            state_stds = replace_zeros(statistics[state_name])
             change_stds = statistics[change_name]
             for state_std, change_std in zip(state_stds, change_stds, strict=True):
                 ratios.append(change_std / state_std)

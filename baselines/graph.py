@@ -32,6 +32,8 @@ from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
+from .deviations import replace_zeros
+
 Bounds = Sequence[tuple[float, float]]
 """Low and high end of the box along each axis."""
 
@@ -376,7 +378,10 @@ EMBEDDING = 16  # numbers that a material is embedded in
 
 
 class Standardisation(nn.Module):
-    """Standardisation by train statistics: ``(x - mean) / sqrt(std^2 + noise^2)``."""
+    """Standardisation by train statistics: ``(x - mean) / sqrt(std^2 + noise^2)``.
+
+    A component without a deviation has that of :func:`.deviations.replace_zeros`.
+    """
 
     mean: Tensor  # mean over train, shape [axis]
     std: Tensor  # standard deviation over train, shape [axis]
@@ -391,7 +396,8 @@ class Standardisation(nn.Module):
         super().__init__()
         exact_std = torch.tensor(std, dtype=torch.float64)
         variance = exact_std**2 + noise**2
-        std_with_noise = variance.sqrt()
+        deviations = replace_zeros(variance.sqrt().tolist())
+        std_with_noise = torch.tensor(deviations, dtype=torch.float64)
         mean_tensor = torch.tensor(mean, dtype=torch.float32)
         std_tensor = std_with_noise.to(torch.float32)
         # Not in the files of weights, where half precision would round them: dataset

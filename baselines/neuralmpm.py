@@ -78,9 +78,9 @@ class NeuralMPM(Baseline):
             multiple=NODES_PER_COARSE_NODE,
             periodic=periodic,
         )
-        cells_per_radius = self.grid.spacing / info.radius
+        radii_per_cell = self.grid.spacing / info.radius
         # sum of weights at a node among particles that lie a radius apart [1]
-        weight_unit = cells_per_radius**info.box.dimension
+        weight_unit = radii_per_cell**info.box.dimension
         # The network reads velocities in units of their deviation [length/frame], and
         # predicts accelerations in units of theirs [length/frame^2].
         self.velocity_std = _isotropic_std(info, "velocity_std")
@@ -473,10 +473,11 @@ class NeuralMPM(Baseline):
 def _isotropic_std(info: DatasetInfo, name: str) -> float:
     """Return one deviation for all axes, the root of their mean square.
 
-    A model that is trained on mirror images must not distinguish the axes.
+    A model that is trained on mirror images must not distinguish the axes. It is 1
+    where nothing varies: the model divides by it.
     """
     dimension = info.box.dimension
     mean_square = 0.0
     for std in info.statistics[name]:
         mean_square += std**2 / dimension
-    return float(mean_square**0.5)
+    return float(mean_square**0.5) or 1.0

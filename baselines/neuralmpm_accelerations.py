@@ -69,15 +69,15 @@ class Accelerations(ABC):
         """Return the grid's velocity and the accelerations at the particles.
 
         The velocity, and the acceleration in each coming frame, have shape [particle,
-        2].
+        axis].
 
         Args:
             state: input of the call.
             stencil: nodes around the particles in their layers.
             output: output of the U-Net [length/frame^2], shape [window, channel, x
-                node, y node].
-            grid_velocity: last velocity on the grid [length/frame], shape [layer, 2, x
-                node, y node].
+                node, y node], in three dimensions with z nodes.
+            grid_velocity: last velocity on the grid [length/frame], shape [layer, axis,
+                x node, y node], in three dimensions with z nodes.
         """
 
 

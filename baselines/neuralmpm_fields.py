@@ -31,14 +31,14 @@ REACH = 4  # cells over which the U-Net sees how far a wall is
 class GridState:
     """Input of a call."""
 
-    position: Tensor  # last positions [length], shape [particle, 2]
-    # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
+    position: Tensor  # last positions [length], shape [particle, axis]
+    # last velocities, oldest first [length/frame], shape [particle, velocities, axis]
     velocity: Tensor
     sample: Tensor  # window of each particle, int64, shape [particle]
     # layer of the grid: one for each window and material, int64, shape [particle]
     layer: Tensor
     # velocities of the walls from the last frame on [length/frame], shape [window,
-    # frame, wall, 2]
+    # frame, wall, axis]
     walls: Tensor
     # output of the context network for the given frames, shape [window, context]
     context: Tensor

@@ -30,6 +30,7 @@ from .augmentation import check_symmetry
 from .baseline import Baseline, DatasetInfo, count_parameters, rescale
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
+from .dataset_info import find_forcing
 from .graph import radius_graph
 from .machine import (
     bound_memory,
@@ -41,7 +42,13 @@ from .machine import (
 )
 from .provenance import training_provenance
 from .recipe import change_options
-from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
+from .rollout import (
+    Rollout,
+    count_predicted,
+    roll_out,
+    scenario_batch,
+    scenario_paths,
+)
 from .run_folder import RunFolder
 from .start import warn_of_last_state
 
@@ -142,10 +149,12 @@ def predict(
             the training.
         UsageError: the baseline is not installed, there is no such device, the model
             was trained on another split than ``split``, the weights cannot be run at
-            that size or with those settings, or the output would replace predictions
-            without ``overwrite``, or a file of another kind, such as the weights.
+            that size or with those settings, ``batch`` is below 1, or the output would
+            replace predictions without ``overwrite``, or a file of another kind, such
+            as the weights.
         WorkFailedError: out of memory, or the disk is full.
     """
+    _check_batch(batch)
     checkpoint_path = Path(checkpoint)
     trained = load(checkpoint)
     output_path = Path(output)
@@ -163,7 +172,9 @@ def predict(
     bound_memory()
 
     with use_threads(threads), explain_memory_errors("lower --batch"):
-        model = restore_for_size(trained, info, settings, known_splits, where=where)
+        model = restore_for_size(
+            trained, info, settings, known_splits, root=root_folder, where=where
+        )
         if model.computes_on_cpu:
             machine = "cpu"
         model = model.to(machine)
@@ -327,9 +338,25 @@ def _warn_of_unfinished(checkpoint: Checkpoint, path: Path) -> None:
     warnings.warn(message, UnfinishedWarning, stacklevel=3)
 
 
+def _check_batch(batch: int | None) -> None:
+    """Refuse groups of no scenario.
+
+    Raises:
+        UsageError: fewer than one scenario is to be rolled out side by side.
+    """
+    if batch is not None and batch < 1:
+        raise UsageError(
+            "so few scenarios cannot be predicted together",
+            where="--batch",
+            expected="1 or more",
+            got=batch,
+            fix="leave it out, or give 1 or more",
+        )
+
+
 def _choose_batch(batch: int | None, machine: str, *, scenarios: int) -> int:
     """Return how many scenarios to roll out side by side."""
-    if not batch:
+    if batch is None:
         batch = scenarios
         if machine == "cpu":
             batch = 1
@@ -439,12 +466,11 @@ class _TimedRollouts:
             yield from rollouts
 
     def _count_frames(self, rollout: Rollout) -> None:
-        if rollout.diverged_at is None:
-            self.frames += self.info.horizon
-            return
-        # The model predicted the first frame that is not finite, too.
-        self.frames += rollout.diverged_at - self.info.input_frames + 1
-        self.diverged[rollout.scenario] = rollout.diverged_at
+        self.frames += count_predicted(
+            rollout, self.info.horizon, input_frames=self.info.input_frames
+        )
+        if rollout.diverged_at is not None:
+            self.diverged[rollout.scenario] = rollout.diverged_at
 
     def _time_searches(self, given: Batch, rollouts: list[Rollout]) -> None:
         """Search neighbours once more in some frames, and take the time."""
@@ -498,9 +524,23 @@ def restore_for_size(
     settings: Sequence[str],
     registry: Registry,
     *,
+    root: Path,
     where: str,
 ) -> Baseline:
-    """Return the model of a checkpoint for a size, with settings."""
+    """Return the model of a checkpoint for a size, with settings.
+
+    Args:
+        checkpoint: weights of the model.
+        info: public figures of the size to predict.
+        settings: changes of options that have no weights.
+        registry: where splits are described.
+        root: folder of all data sets.
+        where: place of the checkpoint, for messages.
+
+    Raises:
+        UnreadableFileError: the checkpoint is damaged.
+        UsageError: the model is not installed, or does not take the settings.
+    """
     scaled = replace(checkpoint, info=rescale(checkpoint.info, info))
     # Without settings first, so that a damaged file is refused as such.
     model = restore(scaled, where=where)
@@ -508,7 +548,8 @@ def restore_for_size(
         return model
     entry = find(checkpoint.baseline)
     options = change_options(entry, checkpoint.options, settings)
-    check_symmetry(options.get("symmetry"), registry.size(info.split, info.size))
+    size = registry.size(info.split, info.size)
+    check_symmetry(options.get("symmetry"), size, forcing=find_forcing(size, root))
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:

@@ -38,7 +38,7 @@ from lagbench.data.field_errors import describe_expectation
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
-from .baseline import Settings
+from .baseline import LARGEST_OPTION, Settings
 from .catalogue import CatalogueEntry, list_names
 
 
@@ -105,7 +105,9 @@ class TrainingOptions(Settings):
 
     steps: int | None = Field(default=None, gt=0)  # optimiser steps; or give 'epochs'
     # passes over all windows
-    epochs: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    epochs: float | None = Field(
+        default=None, gt=0, le=LARGEST_OPTION, allow_inf_nan=False
+    )
     batch: int = Field(default=2, gt=0)  # windows of a step, in every process
     # of Adam, times the number of processes (thesis section 5.7.3)
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
@@ -163,7 +165,12 @@ class TrainingOptions(Settings):
         return windows
 
     def total_steps(self, windows: int, *, processes: int = 1) -> int:
-        """Return the optimiser steps of the training."""
+        """Return the optimiser steps of the training; one epoch if it states neither.
+
+        Args:
+            windows: windows of the data that it trains on.
+            processes: processes that share each step.
+        """
         if self.steps is not None:
             return self.steps
         windows_per_step = self.batch * processes

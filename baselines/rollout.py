@@ -45,10 +45,24 @@ class Rollout:
     """Predicted positions of one window."""
 
     scenario: int  # scenario id
-    # positions [length], float32, on the CPU, shape [frame, particle, 2]
+    # positions [length], float32, on the CPU, shape [frame, particle, axis]
     position: Tensor
     # absolute frame from which the positions are frozen; None where none is
     diverged_at: int | None
+
+
+def count_predicted(rollout: Rollout, frames: int, *, input_frames: int) -> int:
+    """Return how many frames of a rollout the model predicted; others are frozen.
+
+    Args:
+        rollout: a rollout from the first frames of its scenario.
+        frames: frames of the rollout.
+        input_frames: given frames.
+    """
+    if rollout.diverged_at is None:
+        return frames
+    # The model predicted the first frame that is not finite, too.
+    return rollout.diverged_at - input_frames + 1
 
 
 @torch.no_grad()
@@ -126,7 +140,7 @@ def _rows(values: Tensor | None, rows: slice | Tensor) -> Tensor | None:
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
     """Return positions, and how many of the frames are finite and near the box.
 
-    Positions have shape [frame, particle, 2].
+    Positions have shape [frame, particle, axis].
     """
     particles, _, dimension = given.position.shape
     shape = (frames, particles, dimension)

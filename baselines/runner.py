@@ -19,7 +19,7 @@ from .baseline import Baseline, DatasetInfo
 from .checkpoint import check_data, load
 from .machine import bound_memory, explain_memory_errors, use_threads
 from .predict import restore_for_size
-from .rollout import roll_out, scenario_batch
+from .rollout import Rollout, count_predicted, roll_out, scenario_batch
 
 
 class WeightsRunner:
@@ -58,7 +58,7 @@ class WeightsRunner:
         self._viscosity = registry.size(self._info.split, self._info.size).viscosity()
         bound_memory()
         self._model: Baseline = restore_for_size(
-            trained, self._info, settings, registry, where=str(path)
+            trained, self._info, settings, registry, root=root, where=str(path)
         )
 
     def predict(
@@ -75,23 +75,33 @@ class WeightsRunner:
         Returns:
             Positions, shape [frame, particle, axis].
         """
-        info = self._info
+        rollout = self._roll_out(scenario_file, frames or self._info.horizon)
+        return rollout.position.numpy()
+
+    def _roll_out(self, scenario_file: Path, frames: int) -> Rollout:
+        """Return the rollout of a scenario."""
         given_frames = scenario_batch(
-            scenario_file, slice(0, info.input_frames), viscosity=self._viscosity
+            scenario_file,
+            slice(0, self._info.input_frames),
+            viscosity=self._viscosity,
         )
         with use_threads(self._threads), explain_memory_errors("use more memory"):
-            rollout = roll_out(self._model, given_frames, frames or info.horizon)[0]
-        return rollout.position.numpy()
+            return roll_out(self._model, given_frames, frames)[0]
 
     def time(self, scenario_file: Path, frames: int) -> float:
         """Return the processor time of a frame, mean over the first ones [s].
 
-        One step before the clock starts warms up.
+        One step before the clock starts warms up. The time to read the given frames
+        counts; frozen frames do not.
         """
-        self.predict(scenario_file, 1)
+        self._roll_out(scenario_file, 1)
         started = time.process_time()
-        self.predict(scenario_file, frames)
-        return (time.process_time() - started) / frames
+        rollout = self._roll_out(scenario_file, frames)
+        seconds = time.process_time() - started
+        predicted = count_predicted(
+            rollout, frames, input_frames=self._info.input_frames
+        )
+        return seconds / predicted
 
     def close(self) -> None:
         """Nothing is left open."""

@@ -54,10 +54,10 @@ from .torch_grid import TensorFields, tensor_fields, transfer
 class Motion(NamedTuple):
     """One frame of particles."""
 
-    position: Tensor  # x(f) [length], shape [particle, 2]
-    velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, 2]
-    # velocity less that of the frame before [length/frame^2], shape [particle, 2]; in
-    # target and prediction that is the same frame, the model's input
+    position: Tensor  # x(f) [length], shape [particle, axis]
+    velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, axis]
+    # velocity less that of the frame before [length/frame^2], shape [particle, axis];
+    # in target and prediction that is the same frame, the model's input
     acceleration: Tensor
 
 
@@ -65,14 +65,14 @@ class Motion(NamedTuple):
 class ParticleState:
     """Input of a step."""
 
-    position: Tensor  # last positions [length], shape [particle, 2]
-    # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
+    position: Tensor  # last positions [length], shape [particle, axis]
+    # last velocities, oldest first [length/frame], shape [particle, velocities, axis]
     velocity: Tensor
     material: Tensor  # material of each particle, int64, shape [particle]
     sample: Tensor  # window of each particle, ascending, int64, shape [particle]
     # velocity of the walls in the coming frames, the next one first [length/frame],
-    # shape [window, frame, 4, 2]; beyond them the last one stays. None where walls rest
-    # or the model does not see them.
+    # shape [window, frame, wall, axis]; beyond them the last one stays. None where
+    # walls rest or the model does not see them.
     wall_velocity: Tensor | None
     # force on layers along y in the coming frames, the next one first
     # [length/frame^2], shape [window, frame, layer, axis]; beyond them the last one
@@ -152,7 +152,8 @@ def loss_terms(
         target: true motion.
         sample: window of each particle, shape [particle].
         grid: grid of density, divergence and vorticity.
-        scales: deviations (x, y) of errors, by the names in :class:`Motion`.
+        scales: deviations of errors, one along each axis, by the names in
+            :class:`Motion`.
         norm: norm of the errors.
         weights: weights by term; a missing one is 1.
     """
@@ -691,7 +692,7 @@ class GraphNetwork(Baseline):
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
-        """Return the next state and positions [length], shape [particle, 2]."""
+        """Return the next state and positions [length], shape [particle, axis]."""
         following, _ = self.step(state)
         return following, following.position
 
@@ -735,7 +736,7 @@ class GraphNetwork(Baseline):
         edge_index: Tensor,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the standardised target [1], shape [particle, 2], and losses.
+        """Return the standardised target [1], shape [particle, axis], and losses.
 
         The losses are those of the operator.
         """

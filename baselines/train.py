@@ -156,8 +156,8 @@ def train(
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
-            forbids; or the folder holds another training, or weights without their
-            checkpoint; weights to start from that do not fit.
+            or a force forbids; or the folder holds another training, or weights
+            without their checkpoint; weights to start from that do not fit.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
@@ -181,7 +181,9 @@ def train(
         seed=seed,
         learned=learned_options,
     )
-    check_symmetry(plan.model.get("symmetry"), tier)
+    check_symmetry(
+        plan.model.get("symmetry"), tier, forcing=find_forcing(tier, root_folder)
+    )
     if initial is not None:
         info = initial.info
         plan = replace(plan, start=initial.record)

@@ -213,8 +213,8 @@ names of splits. They use standard deviations that we measured from the score fi
 size mini in leaderboard/scores.
 
 The measurement needs two methods whose means differ by less than a factor of two. At
-least one of these methods must have several seeds. Where a split has no more than that,
-its row is inaccurate.
+least one of these methods must have several seeds. A row is inaccurate if
+its split has only two such methods, and only one of them has several seeds.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
@@ -234,8 +234,9 @@ In this table both sides are seeds of the same method. So the test should find a
 difference in at most 5 % of the draws. A share of 5 % has a statistical error of 1.4
 percentage points (95 % interval).
 
-With one seed on each side the test is the sign-flip test over scenarios. The two seeds
-are two sets of weights. One of them may really be better than the other, and then the
+With one seed on each side the test is the
+[sign-flip test](scoring.md#comparing-two-methods) over scenarios. The two seeds are two
+sets of weights. One of them may really be better than the other, and then the
 test is right to find a difference between them. But this difference is no difference
 between methods. The column "1 seed each" shows how often the test finds it. Therefore
 the leaderboard speaks of "these weights", not of methods, if one side has only one

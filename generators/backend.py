@@ -8,12 +8,19 @@ here.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
+from lagbench.errors import (
+    LIMIT_FIXES,
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    require,
+)
 from lagbench.work.machine import available_cores
 
 from .split import Device
@@ -38,6 +45,9 @@ HARMLESS = frozenset(
 """Variables of Taichi that a user may set: they choose memory, places and cards,
 never arithmetic.
 """
+
+PROCESS_WORDS = os.strerror(errno.EAGAIN)
+"""What the system says that starts no more threads."""
 
 MEMORY_WORDS = "memory allocation"
 """What Taichi says that finds no memory as it starts."""
@@ -120,6 +130,14 @@ def _device_error(on_gpu: bool, error: RuntimeError) -> LagbenchError:
             expected="room for a gigabyte of addresses",
             got=error,
             fix="raise the limit (`ulimit -v unlimited`, or that of the batch system)",
+        )
+    if PROCESS_WORDS in str(error):
+        return WorkFailedError(
+            "a limit of the operating system is reached",
+            where="Taichi",
+            expected="room for the threads of Taichi",
+            got=error,
+            fix=LIMIT_FIXES[errno.EAGAIN],
         )
     if on_gpu:
         return UsageError(

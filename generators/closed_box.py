@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
-from .driver import Driver
+from .driver import Driver, check_program
 from .nodal_stress import NodalStress, broken_jacobian_bounds
 from .solver import Health, Singles
 from .split import ClosedBoxParameters, InitialState
@@ -143,6 +143,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
+        where = f"scenario {index}, wall_velocity"
+        check_program(state.wall_velocity, (4, 2), where=where, has_one_row=True)
         speed_bound = self._kernels.speed_bound / 2.0
         speeds = np.abs(state.wall_velocity)
         normal = state.wall_velocity[..., _WALL_NUMBERS, _NORMAL_AXES]
@@ -157,7 +159,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
-                where=f"scenario {index}, wall_velocity in the order {order}",
+                where=f"{where} in the order {order}",
                 expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}",
                 got=f"speeds up to {largest_speeds}",
                 fix="correct what initial_state returns: docs/extending.md",

@@ -157,7 +157,8 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
         is_possible = limit.holds(value)
         expected = str(limit)
     if field.name == "wall" and is_possible:
-        # The box between the walls is four cells wide at least.
+        # Between the walls lie four cells at least; three in a closed box, whose walls
+        # lie half-way between nodes.
         high = (int(str(values["grid"])) - 4) // 2
         limit = Limit(low=0, high=high, whole=True)
         is_possible = limit.holds(value)

@@ -295,8 +295,9 @@ class Driver(ABC, Generic[Parameters]):
         self._check_arrays(index, state)
         material_values = [material.value for material in Material]
         area = np.float64(state.area)
-        is_below = state.position < 0.0
-        is_above = state.position > 1.0
+        position = np.asarray(state.position)
+        is_below = position < 0.0
+        is_above = position > 1.0
         outside_count = np.count_nonzero(is_below | is_above)
         is_known = np.isin(state.material, material_values)
         has_area = 0.0 < area <= 1.0
@@ -315,7 +316,7 @@ class Driver(ABC, Generic[Parameters]):
         speed = np.abs(state.velocity).max()
         largest_slope = np.abs(state.affine).max()
         stretch = largest_slope * self.parameters.dt
-        is_finite = np.isfinite(state.position)
+        is_finite = np.isfinite(position)
         is_within_bounds = speed <= speed_bound and stretch <= 2.0
         if not is_finite.all() or not is_within_bounds:
             raise WorkFailedError(
@@ -352,6 +353,40 @@ class Driver(ABC, Generic[Parameters]):
                     got=f"{array.shape}, {array.dtype}",
                     fix="return such arrays from initial_state: docs/extending.md",
                 )
+
+
+def check_program(
+    program: object, row: tuple[int, ...], *, where: str, has_one_row: bool = False
+) -> None:
+    """Refuse motions of walls, or forces, that a solver cannot take row by row.
+
+    Args:
+        program: velocities or accelerations, shape [frame, *row].
+        row: shape of a row.
+        where: place of the program, for messages.
+        has_one_row: whether a single row, without an axis of frames, is one too.
+
+    Raises:
+        UsageError: it is no array of finite numbers, of another shape, or without rows.
+    """
+    got = type(program).__name__
+    if isinstance(program, np.ndarray):
+        got = f"shape {program.shape}, {program.dtype}"
+        is_row = has_one_row and program.shape == row
+        is_program = program.shape[1:] == row and len(program) > 0
+        is_numeric = program.dtype.kind in "fiu"
+        if is_numeric and (is_row or is_program):
+            if np.isfinite(program).all():
+                return
+            got = "NaN or an infinite number"
+    shape = ", ".join(str(length) for length in row)
+    raise UsageError(
+        "wrong shape of a program in an initial state, or no such numbers",
+        where=where,
+        expected=f"an array of finite numbers, shape [frame, {shape}]",
+        got=got,
+        fix="correct what initial_state returns: docs/extending.md",
+    )
 
 
 @ti.kernel

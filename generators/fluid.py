@@ -34,6 +34,7 @@ from .shapes import (
     Region,
     Shape,
     body_at,
+    check_room,
     place,
     sample_points,
 )
@@ -131,6 +132,7 @@ def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
     aspect = draw_between(rng, size, "column_aspect")
     shape = Rectangle.of_area(area, 1.0 / aspect)
     low, high = free_surface_walls(size)
+    check_room(shape, [(low, high), (low, high)])
     half_width, half_height = shape.reach
     x = low + half_width
     if number // 2 % 2 == 1:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from .constants import constants, draw_between, free_surface_walls
 from .draws import RandomSource, add_in_order, choice, quantise, uniform
-from .shapes import Body, sample_points
+from .shapes import Body, check_room, sample_points
 from .solids import Ball, Block, Solid
 from .split import (
     FreeSurface3DParameters,
@@ -67,13 +67,19 @@ def _draw_vector(rng: RandomSource, size: Size, name: str) -> Point:
 
 
 def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> Point:
-    """Draw where a solid hangs: within the walls' margin, its centre above a height."""
+    """Draw where a solid hangs: within the walls' margin, its centre above a height.
+
+    Raises:
+        WorkFailedError: there is no room for it.
+    """
     low, high = free_surface_walls(size)
     margin = size.value("margin")
     least = low + margin
     most = high - margin
     reach_x, reach_y, reach_z = solid.reach
     lowest = max(lowest, least + reach_y)
+    across = (least, most)
+    check_room(solid, [across, (lowest - reach_y, most), across])
     x = uniform(rng, least + reach_x, most - reach_x)
     y = uniform(rng, lowest, most - reach_y)
     z = uniform(rng, least + reach_z, most - reach_z)
@@ -121,6 +127,7 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     else:
         column = Block((side, height, width))
         centre = (middle, y, start)
+    check_room(column, [(low, high)] * 3)
     body = _LiquidBody(column, centre, AT_REST)
     return _state(rng, size, "dam-break", [body])
 
@@ -130,6 +137,7 @@ def _splash(rng: RandomSource, size: Size) -> InitialState:
     depth = draw_between(rng, size, "pool_depth")
     side = high - low
     pool = Block((side, depth, side))
+    check_room(pool, [(low, high)] * 3)
     middle = 0.5 * (low + high)
     pool_y = low + 0.5 * depth
     pool_centre = (middle, pool_y, middle)

@@ -11,7 +11,7 @@ import numpy as np
 from lagbench.errors import UsageError
 
 from .box_tables import LANES, Singles
-from .driver import Driver
+from .driver import Driver, check_program
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import broken_jacobian_bounds
 from .nodal_stress_nd import NodalStressND
@@ -176,41 +176,35 @@ class FullBox(Driver[FullBoxParameters]):
         speed_bound = self._kernels.speed_bound / 2.0
         wall_count = 2 * self.dimension
         shape = (wall_count, self.dimension)
-        speeds = np.abs(np.asarray(state.wall_velocity))
-        has_walls = speeds.shape[-2:] == shape
-        if has_walls:
-            wall = np.arange(wall_count)
-            normal = wall // 2
-            is_periodic = np.repeat(p.box.periodic, 2)
-            may_move = np.full(shape, p.no_slip)
-            may_move[wall, normal] = False  # a wall does not move along its normal
-            may_move[is_periodic] = False
-            moves_well = may_move & (speeds <= speed_bound)
-            is_allowed = (speeds == 0.0) | moves_well
-        if not has_walls or not is_allowed.all():
+        where = f"scenario {index}, wall_velocity"
+        check_program(state.wall_velocity, shape, where=where, has_one_row=True)
+        speeds = np.abs(state.wall_velocity)
+        wall = np.arange(wall_count)
+        normal = wall // 2
+        is_periodic = np.repeat(p.box.periodic, 2)
+        may_move = np.full(shape, p.no_slip)
+        may_move[wall, normal] = False  # a wall does not move along its normal
+        may_move[is_periodic] = False
+        moves_well = may_move & (speeds <= speed_bound)
+        is_allowed = (speeds == 0.0) | moves_well
+        if not is_allowed.all():
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
-                where=f"scenario {index}, wall_velocity",
-                expected=f"shape [..., {shape[0]}, {shape[1]}], speeds up to dx/(2 dt)"
-                f" = {speed_bound:.6g}, zeros along periodic axes",
-                got=f"shape {speeds.shape}, speeds up to {speeds.max():.6g}",
+                where=where,
+                expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}, zeros along "
+                "periodic axes",
+                got=f"speeds up to {speeds.max():.6g}",
                 fix="correct what initial_state returns: docs/extending.md",
             )
 
     def _check_force(self, index: int, state: InitialState) -> None:
         """Refuse a body force of other layers than the solver has."""
         layer_count = self.parameters.force_layers
-        force = state.force_towards(0)
-        has_layers = force.shape == (layer_count, self.dimension)
-        if not has_layers or not np.isfinite(force).all():
-            raise UsageError(
-                "the body force does not fit the box",
-                where=f"scenario {index}, body_force",
-                expected=f"finite, shape [frame, {layer_count}, {self.dimension}]",
-                got=f"shape [frame, {force.shape[0]}, {force.shape[1]}]",
-                fix="correct what initial_state returns: docs/extending.md",
-            )
+        if state.body_force is None and layer_count == 0:
+            return
+        where = f"scenario {index}, body_force"
+        check_program(state.body_force, (layer_count, self.dimension), where=where)
 
     def _check_obstacle(self, index: int, state: InitialState) -> None:
         """Refuse an obstacle whose number of particles is not the solver's."""
@@ -276,16 +270,14 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _check_stream(self, index: int, state: InitialState) -> None:
         """Refuse a stream where no fringe is, a fringe without one, or a fast one."""
-        stream = state.stream
-        if stream is None and not self.parameters.fringe_rate:
+        if state.stream is None and not self.parameters.fringe_rate:
             return
         speed_bound = self._kernels.speed_bound
         has_fringe = self.parameters.fringe_rate > 0.0
+        stream = np.asarray(state.stream)
+        is_velocity = stream.shape == (self.dimension,) and stream.dtype.kind in "fiu"
         is_valid = (
-            stream is not None
-            and has_fringe
-            and stream.shape == (self.dimension,)
-            and float(np.abs(stream).max()) <= speed_bound
+            is_velocity and has_fringe and float(np.abs(stream).max()) <= speed_bound
         )
         if not is_valid:
             raise UsageError(
@@ -293,7 +285,8 @@ class FullBox(Driver[FullBoxParameters]):
                 where=f"scenario {index}, stream",
                 expected=f"fringe_rate above 0, and a velocity of {self.dimension} "
                 f"components up to dx/dt = {speed_bound:.6g}",
-                got=f"fringe_rate {self.parameters.fringe_rate:g}, stream {stream}",
+                got=f"fringe_rate {self.parameters.fringe_rate:g}, "
+                f"stream {state.stream}",
                 fix="correct what initial_state returns: docs/extending.md",
             )
 

@@ -2,7 +2,8 @@
 
 Perlin's noise on a lattice that is wrapped around the unit box: a polynomial within
 each cell of the lattice, with continuous second derivatives. Every operation is + - *
-or floor, so that bits are the same on every x86-64 Linux CPU.
+/, sqrt or rounding to a whole number, so that bits are the same on every x86-64 Linux
+CPU.
 
 A :class:`Smooth` carries a function with its gradient and Hessian by the product rule,
 

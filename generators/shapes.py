@@ -28,6 +28,7 @@ __all__ = [
     "Region",
     "Shape",
     "body_at",
+    "check_room",
     "place",
     "sample_points",
 ]
@@ -218,13 +219,12 @@ def body_at(shape: Shape, *centre: float) -> Body:
     return Body(shape, quantise(centre))
 
 
-def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
-    """Put a shape uniformly at random where its bounding box lies within a region.
+def check_room(shape: Shape, region: Region) -> None:
+    """Refuse a region that is too small for the bounding box of a shape.
 
     Raises:
-        WorkFailedError: the region is too small for it.
+        WorkFailedError: it is, along some axis.
     """
-    centre = []
     for reach, (low, high) in zip(shape.reach, region, strict=True):
         room = high - low
         extent = 2.0 * reach
@@ -236,6 +236,17 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
                 got=f"{extent:.4f}",
                 fix="lower the areas or lengths in the file of the split",
             )
+
+
+def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
+    """Put a shape uniformly at random where its bounding box lies within a region.
+
+    Raises:
+        WorkFailedError: the region is too small for it.
+    """
+    check_room(shape, region)
+    centre = []
+    for reach, (low, high) in zip(shape.reach, region, strict=True):
         coordinate = uniform(rng, low + reach, high - reach)
         centre.append(coordinate)
     return body_at(shape, *centre)

@@ -72,7 +72,7 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
 
 
 def wave_modulus(young: float, poisson: float) -> float:
-    """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)) [mass/s^2]."""
+    """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)), in the unit of E."""
     lateral = 1.0 + poisson
     incompressibility = 1.0 - 2.0 * poisson
     divisor = lateral * incompressibility
@@ -104,7 +104,7 @@ class SoundnessRecorder:
         """Add a recorded frame.
 
         Args:
-            velocity: particle velocities [length/s], shape [particle, 2].
+            velocity: particle velocities [length/s], shape [particle, axis].
             ratio: J of liquid [1], shape [particle]; of others it is not read.
         """
         squares = np.square(velocity, dtype=np.float64)

@@ -13,6 +13,7 @@ INTERRUPTED = 130
 
 def app() -> None:
     """Run the program with the words of the command line; ends with its exit code."""
+    _fill_standard_descriptors()
     try:
         is_heard = _is_interruptible()
         if is_heard:
@@ -28,6 +29,20 @@ def app() -> None:
         # All is written; Python's own end shall print no traceback.
         if _is_interruptible():
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _fill_standard_descriptors() -> None:
+    """Open the null device where standard input, output or error is closed.
+
+    Otherwise the next file or socket that is opened would get that number, and a
+    process that we start would put its own input or output in its place.
+    """
+    for standard in range(3):
+        try:
+            os.fstat(standard)
+        except OSError:
+            # the system gives the lowest free number, which is this one
+            os.open(os.devnull, os.O_RDWR)
 
 
 def _is_interruptible() -> bool:

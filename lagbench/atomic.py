@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import hashlib
 import os
 import secrets
 import shlex
@@ -11,10 +12,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import DISK_FULL_ERRORS, LagbenchError, UsageError, WorkFailedError
+from .errors import (
+    DISK_FULL_ERRORS,
+    LIMIT_FIXES,
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+)
 
 SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
+
+LONGEST_KEPT_NAME = 200
+"""Longest name that a temporary name repeats [bytes]; a name has at most 255."""
 
 SIGNED_BYTES = 4 << 20
 """How much of a file is read to learn its kind [bytes]."""
@@ -200,7 +210,11 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 def temporary_name(target: Path) -> Path:
     """Return a temporary name beside a target that no other process uses."""
-    return target.with_name(f".{target.name}.{os.getpid()}-{_process_token()}{SUFFIX}")
+    name = target.name
+    encoded_name = os.fsencode(name)
+    if len(encoded_name) > LONGEST_KEPT_NAME:
+        name = hashlib.sha256(encoded_name).hexdigest()
+    return target.with_name(f".{name}.{os.getpid()}-{_process_token()}{SUFFIX}")
 
 
 @functools.cache
@@ -213,6 +227,8 @@ def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
     hint = "see that the disk is there and can be written to"
     if error.errno in DISK_FULL_ERRORS:
         hint = "free disk space"
+    if error.errno in LIMIT_FIXES:
+        hint = LIMIT_FIXES[error.errno]
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "a file is where a folder has to be: move it"
     if isinstance(error, IsADirectoryError):

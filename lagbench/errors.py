@@ -35,8 +35,17 @@ if TYPE_CHECKING:
 PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
 """Entry points by which other packages add models, splits and metrics."""
 
-DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""What the operating system says of a disk, a quota or a file that is full."""
+DISK_FULL_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""What the operating system says of a disk or a quota that is full."""
+
+LIMIT_FIXES = {
+    errno.EFBIG: "raise the limit of the length of a file: `ulimit -f unlimited`",
+    errno.EMFILE: "allow more open files, as by `ulimit -n 4096`",
+    errno.ENFILE: "close other programs: the whole system opens no more files",
+    errno.EAGAIN: "raise the limit of processes, as by `ulimit -u 4096`; where the "
+    "command has the option --workers, take fewer of them",
+}
+"""What a user can do who has reached a limit of the operating system."""
 
 VANISHED_ERRORS = frozenset(
     {
@@ -315,7 +324,7 @@ def explain_system_error(error: OSError) -> LagbenchError | None:
     """Return the message for an error of the operating system that a user can mend.
 
     These are a missing permission, a disk or folder that has vanished, a name that is
-    too long, and a full disk. None for all others.
+    too long, a full disk, and a limit of files or processes. None for all others.
     """
     if isinstance(error, PermissionError) and error.filename is not None:
         return WorkFailedError(
@@ -350,6 +359,16 @@ def explain_system_error(error: OSError) -> LagbenchError | None:
             expected="space on the disk",
             got=error.strerror,
             fix="free disk space",
+        )
+    # HDF5 names EAGAIN, in a longer text, for a file that another process has locked.
+    is_locked = error.errno == errno.EAGAIN and "lock" in str(error)
+    if error.errno in LIMIT_FIXES and not is_locked:
+        return WorkFailedError(
+            "a limit of the operating system is reached",
+            where=os.fsdecode(error.filename or "this process"),
+            expected="room for the files and processes of lagbench",
+            got=error.strerror,
+            fix=LIMIT_FIXES[error.errno],
         )
     return None
 

@@ -82,8 +82,8 @@ score is better.
 HOW_TO_READ = """\
 ## How to read this page
 
-- **Reference predictors** are not trained. A naive baseline learns nothing and knows no
-  equation. A classical solver integrates the equations
+- **Reference predictors** are not trained. A naive baseline learns nothing and
+  integrates no equations. A classical solver integrates the equations
   ([references](references.md)).
 - **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
   perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
@@ -95,9 +95,10 @@ HOW_TO_READ = """\
   `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
   seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
-  sign-flip test over scenarios. Otherwise it is the two-way bootstrap over scenarios
-  and seeds. Two models may use the same weights, for example with and without mirror
-  averaging. Then they are compared seed by seed. The p-values are corrected for
+  sign-flip test over scenarios. Otherwise it is a t-test, and the two-way bootstrap
+  over scenarios and seeds gives its standard error. Two models may use the same
+  weights, for example with and without mirror averaging. Then they are compared seed by
+  seed. The p-values are corrected for
   the number of models in the comparison (Holm). With fewer than six scenarios there is
   no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on

@@ -21,6 +21,7 @@ from lagbench.board.build import Scope, collect
 from lagbench.board.folder import Folder
 from lagbench.board.model import OnShift, ReferenceRow, Tab
 from lagbench.data.registry import load
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.chart import AxisScale, Plot, Spot, Tick, close_logarithmic
 from lagbench.figures.html import Markup, words
 from lagbench.figures.tables import markdown
@@ -47,7 +48,11 @@ class ShiftedRow:
 
 
 def collect_shifted(board: Path, size: str) -> list[tuple[Tab, list[ShiftedRow]]]:
-    """Return the data sets of a size with methods that were scored on shift."""
+    """Return the data sets of a size with methods that were scored on shift.
+
+    Raises:
+        UsageError: there is no such data set, or no board.
+    """
     registry = load()
     places = set()
     for path in Folder(board).entries():
@@ -60,6 +65,14 @@ def collect_shifted(board: Path, size: str) -> list[tuple[Tab, list[ShiftedRow]]
         rows = rows_of(tab)
         if rows:
             chosen.append((tab, rows))
+    if not chosen:
+        raise UsageError(
+            "no method was scored on shift",
+            where="--board, --size",
+            expected="a size with scores on shift, such as mini",
+            got=ascii(size),
+            fix="name another size, or another board",
+        )
     return chosen
 
 
@@ -206,10 +219,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output", "-o", type=Path, default=Path("docs/figures/shift.svg")
     )
     options = parser.parse_args(arguments)
-    chosen = collect_shifted(options.board, options.size)
-    charts = [draw(tab, rows) for tab, rows in chosen]
-    svg = join_charts(charts, height=HEIGHT)
-    write_atomically(options.output, svg.encode(), option="--output")
+    try:
+        chosen = collect_shifted(options.board, options.size)
+        charts = [draw(tab, rows) for tab, rows in chosen]
+        svg = join_charts(charts, height=HEIGHT)
+        write_atomically(options.output, svg.encode(), option="--output")
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
     sys.stdout.write(f"{table(chosen)}\n")
     return 0
 

@@ -24,6 +24,7 @@ from lagbench.atomic import write_atomically
 from lagbench.board.entry import Entry, Prediction, Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder, weights_path
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.chart import Plot, Spot, close_logarithmic
 from lagbench.figures.html import Markup, words
 from lagbench.figures.tables import markdown
@@ -234,12 +235,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output", "-o", type=Path, default=Path("docs/figures/validation_curves.svg")
     )
     options = parser.parse_args(arguments)
-    curves = curves_of(Folder(options.board))
-    charts = []
-    for data_set, of_set in curves.items():
-        charts.append(draw(data_set, of_set))
-    svg = join_charts(charts, height=HEIGHT)
-    write_atomically(options.output, svg.encode(), option="--output")
+    try:
+        curves = curves_of(Folder(options.board))
+        if not curves:
+            raise UsageError(
+                "no training on this board has a curve of validations",
+                where="--board",
+                expected="a folder with weights and the records of their trainings",
+                got=str(options.board),
+                fix="run it from the root of the clone, or name it: --board FOLDER",
+            )
+        charts = []
+        for data_set, of_set in curves.items():
+            charts.append(draw(data_set, of_set))
+        svg = join_charts(charts, height=HEIGHT)
+        write_atomically(options.output, svg.encode(), option="--output")
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
     sys.stdout.write(f"{table(curves)}\n")
     return 0
 

@@ -8,6 +8,7 @@ particles per cell and the constants per substep stay.
 from __future__ import annotations
 
 import dataclasses
+import decimal
 import enum
 import itertools
 import math
@@ -164,6 +165,14 @@ def _require(
         raise UsageError(what, where=where, expected=expected, got=got)
 
 
+def _round_bound(bound: float, *, is_least: bool) -> str:
+    """Return a bound in three digits, rounded to the side that it allows."""
+    rounding = decimal.ROUND_CEILING if is_least else decimal.ROUND_FLOOR
+    context = decimal.Context(prec=3, rounding=rounding)
+    rounded = context.create_decimal_from_float(bound)
+    return f"{float(rounded):.3g}"
+
+
 def _check_cavity_options(reynolds: float | None, frequency: int | None) -> None:
     _require(
         reynolds is not None,
@@ -212,7 +221,7 @@ def _check_ranges(experiment: Experiment) -> None:
         0.0 < experiment.dt <= dt_max,
         "sound outruns the grid",
         where="--dt",
-        expected=f"above 0, at most {dt_max:.3g}",
+        expected=f"above 0, at most {_round_bound(dt_max, is_least=False)}",
         got=experiment.dt,
     )
     if experiment.case is Case.CAVITY:
@@ -229,7 +238,7 @@ def _check_lid(experiment: Experiment, sound_speed: float) -> None:
         0.0 < experiment.lid_speed <= speed_max,
         "not a subsonic lid",
         where="--lid-speed",
-        expected=f"above 0, at most {speed_max:.3g}",
+        expected=f"above 0, at most {_round_bound(speed_max, is_least=False)}",
         got=experiment.lid_speed,
     )
     stop = experiment.lid_off_after
@@ -274,7 +283,8 @@ def _check_reynolds(
         reynolds >= reynolds_min,
         "too viscous for the substep",
         where="--re",
-        expected=f"at least {reynolds_min:.3g} at dt = {experiment.dt:.3g}",
+        expected=f"at least {_round_bound(reynolds_min, is_least=True)} "
+        f"at dt = {experiment.dt:.3g}",
         got=reynolds,
     )
 

@@ -311,8 +311,9 @@ ENTRY_COLUMNS = (
         key="kind",
         label="kind",
         form="text",
-        meaning="Naive: learns nothing and knows no equation. Classical: integrates the"
-        " equations. Learned: fitted to train. Hybrid: a solver with a learned part.",
+        meaning="Naive: learns nothing and integrates no equations. Classical:"
+        " integrates the equations. Learned: fitted to train. Hybrid: a solver with a"
+        " learned part.",
         read=_read_kind,
     ),
     Column(

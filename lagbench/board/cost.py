@@ -137,7 +137,10 @@ def _seconds_here(cost: EntryCost, solver_seconds_here: float | None) -> float:
 
 
 def find_front(points: Iterable[CostPoint]) -> list[CostPoint]:
-    """Return the points that no other beats in both cost and error, by cost."""
+    """Return the points that are more accurate than all others that cost no more.
+
+    They are in the order of their cost; of equal points the first one is returned.
+    """
     least_error = math.inf
     front = []
     for point in sorted(points, key=lambda point: (point.seconds, point.error)):

@@ -23,6 +23,7 @@ from lagbench.errors import (
     ChecksFailedError,
     UnreadableFileError,
     UsageError,
+    format_count,
     suggest_file,
     suggest_name,
 )
@@ -60,12 +61,18 @@ class SchemaIssue:
         return line
 
 
-def load_plain(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: ANN401
-    """Return the content of a submitter's YAML file as plain values.
+def load_plain(
+    path: Path,
+    *,
+    longest: int = MAX_ENTRY_BYTES,
+    fix: str = "describe the method in a few lines; predictions go elsewhere",
+) -> Any:  # noqa: ANN401
+    """Return the content of a YAML file of a leaderboard as plain values.
 
     Args:
-        path: the file.
+        path: the file, which a stranger may have written.
         longest: the most that it may have [bytes].
+        fix: what to do about a file that is too long, or no file.
 
     Raises:
         UnreadableFileError: no regular file, too long, or no plain YAML.
@@ -89,18 +96,21 @@ def load_plain(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: A
     else:
         got = "something that is no regular file"
     raise UnreadableFileError(
-        "not a YAML file of an entry",
+        "not a YAML file of a leaderboard",
         where=str(path),
         expected=f"a regular file of at most {longest} bytes",
         got=got,
-        fix="describe the method in a few lines; predictions go elsewhere",
+        fix=fix,
     )
 
 
 def examine(
     kind: type[Model], value: object
 ) -> tuple[Model | None, tuple[SchemaIssue, ...]]:
-    """Return the model that a value describes, or None and what is wrong with it."""
+    """Return the model that a value describes, or None and what is wrong with it.
+
+    Of what is wrong, the first :data:`MOST_ISSUES` places are returned.
+    """
     try:
         return kind.model_validate(value), ()
     except ValidationError as error:
@@ -135,8 +145,11 @@ def read_entry(path: Path) -> Entry:
     """
     entry, issues = examine(Entry, load_plain(path))
     if entry is None:
+        count = format_count(len(issues), "mistake")
+        if len(issues) == MOST_ISSUES:
+            count = f"at least {count}"
         raise ChecksFailedError(
-            f"{len(issues)} mistake(s) in an entry",
+            f"{count} in an entry",
             where=str(path),
             expected="known keys, with values of their kinds",
             got=format_issues(issues),

@@ -151,4 +151,6 @@ Version = Annotated[str, StringConstraints(pattern=RELEASE)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+# value of a metric that ranks: an error, whose fourth power is a number too
+RankingValue = Annotated[float, Field(ge=0.0, le=1e75, allow_inf_nan=False)]
 Date = Annotated[datetime.date, BeforeValidator(_parse_date)]

@@ -243,7 +243,10 @@ class Folder:
         if top not in ENDINGS:
             return "no file of a leaderboard has this name"
         if not all(PART.fullmatch(part) for part in path.parts):
-            return "a name with other characters than letters, digits, '-', '_' and '.'"
+            return (
+                "a name that does not consist of 1 to 100 letters, digits, '-', '_' "
+                "and '.', a letter or digit first"
+            )
         endings = ENDINGS[top]
         if path.suffix not in endings or len(path.parts) != DEPTH:
             return f"not {top}/<split>/<size>/<name>{' or '.join(endings)}"

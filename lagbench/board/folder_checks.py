@@ -73,6 +73,7 @@ class FolderChecks:
     isolated: bool = True  # whether a child process reads the recipes of shared weights
     issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
+    # score files of entries and reference predictors
     readable_score_files: set[Path] = field(default_factory=set)
     # lines of verified.yaml that hold, of active entries
     verifications: list[Verification] = field(default_factory=list)
@@ -385,6 +386,7 @@ class FolderChecks:
                 self._add("reference", path, got, expected=", ".join(REFERENCES))
                 return
             identity = read_score_file(file, size).scores.identity
+            self.readable_score_files.add(path)
         except LagbenchError as error:
             self.issues.append(issue_from_error("reference", error, path))
             return

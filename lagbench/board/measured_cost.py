@@ -108,7 +108,7 @@ def measure_costs(
             meter.count(1)
         for one in timed:
             frames = min(TIMED_FRAMES, task.config.horizon)
-            seconds[one.entry.method] = one.runner.time(path, frames)
+            seconds[f"model {one.entry.method}"] = one.runner.time(path, frames)
             meter.count(1)
         rounds.append(seconds)
 
@@ -126,7 +126,7 @@ def measure_costs(
             machine=describe_processor(),
             date=today(),
             repeats=repeats,
-            seconds_per_frame=least[one.entry.method],
+            seconds_per_frame=least[f"model {one.entry.method}"],
             solver=least.get("solver"),
             classical=kinds[Kind.CLASSICAL],
             naive=kinds[Kind.NAIVE],

@@ -435,7 +435,10 @@ class _Reproduction:
             self.result.measured.append("/".join(entry.place))
 
     def _open_first_model(self, entry: Entry) -> Runner | None:
-        """Return the model of the first seed that has one; None where it fails."""
+        """Return the first model of an entry that can be opened, None without one.
+
+        The first error is kept in the result.
+        """
         for prediction in entry.predictions:
             if prediction.weights is None:
                 continue

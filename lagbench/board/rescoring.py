@@ -70,7 +70,7 @@ class Rescoring:
 
     folder: Folder
     entries: Sequence[Entry]
-    readable_score_files: Collection[Path]
+    readable_score_files: Collection[Path]  # of entries and reference predictors
     score: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmations: list[Confirmation] = field(default_factory=list)
 
@@ -176,6 +176,9 @@ class Rescoring:
         header = card.header
         for path in self.folder.reference_files(header.split, header.size):
             if path.stem not in card.tallies or path.stem == SUBMISSION:
+                continue
+            # the checks of the folder report files that cannot be read
+            if path not in self.readable_score_files:
                 continue
             stored = read_score_file(self.folder.path / path).scores
             if stored.identity["dataset_sha256"] != header.dataset_sha256:

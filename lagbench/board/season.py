@@ -245,14 +245,16 @@ def read_season(folder: Folder, name: str) -> Season:
             if known
             else "begin one: lagbench season close NAME --size mini",
         )
-    season, issues = examine(Season, load_plain(file, longest=MOST_SEASON_BYTES))
+    fix = "restore the file that `lagbench season close` wrote"
+    content = load_plain(file, longest=MOST_SEASON_BYTES, fix=fix)
+    season, issues = examine(Season, content)
     if season is None:
         raise ChecksFailedError(
             "the file of a season does not fit",
             where=str(file),
             expected="the layout of season.yaml",
             got=format_issues(issues),
-            fix="restore the file that `lagbench season close` wrote",
+            fix=fix,
         )
     for data_set in season.data_sets:
         _check_measures(data_set, file)
@@ -439,15 +441,16 @@ def _check_options(
             where="--scenarios",
             expected=f"{FEWEST_BLIND_SCENARIOS} to {MOST_SCENARIOS}",
             got=scenarios,
-            fix=f"give a number from {FEWEST_BLIND_SCENARIOS} on",
+            fix=f"give a number from {FEWEST_BLIND_SCENARIOS} to {MOST_SCENARIOS}",
         )
     name_rule = "small letters, digits and single hyphens, as in spring-2027"
     _check_option(Name, name, where="NAME", expected=name_rule)
     source_rule = "one line of printable text, of at most 200 characters"
     _check_option(Line, source, where="--source", expected=source_rule)
     if budget is not None:
-        budget_rule = "a number of seconds"
-        _check_option(Number, budget, where="--budget", expected=budget_rule)
+        budget_rule = "a number of seconds above 0"
+        kind = Annotated[Number, Field(gt=0.0)]
+        _check_option(kind, budget, where="--budget", expected=budget_rule)
 
 
 def _check_option(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
@@ -38,6 +39,7 @@ from lagbench.work.progress import Meter, Progress
 
 from .entry import Entry
 from .entry_file import read_entry, yaml_bytes
+from .fields import RankingValue
 from .folder import SEASON_SCORES, Folder, entry_path
 from .lock import board_lock
 from .reproduce import open_model, score_positions
@@ -65,6 +67,9 @@ from .season_scores import (
 
 SAVED = "scores.json"
 """Name of the file beside the blind data with what is scored already."""
+
+SAVED_VALUES = TypeAdapter(dict[str, dict[str, RankingValue]])
+"""Its content: the ranking metric by what was scored, then by scenario and hash."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,25 +181,35 @@ def run_season(
 def compare_scores(
     stored: SeasonScores, scores: SeasonScores, *, has_same_bytes: bool
 ) -> SeasonComparison:
-    """Return the greatest relative difference of two runs of the same season."""
-    before = list(_values_of(stored))
-    after = list(_values_of(scores))
-    scale = np.maximum(np.abs(before), np.finfo(np.float32).tiny)
-    relative = np.abs(np.subtract(after, before)) / scale
+    """Return the greatest relative difference of two runs of the same season.
+
+    A value that only one of the runs has counts as a difference of 1.
+    """
+    before = list(_rows_of(stored))
+    after = list(_rows_of(scores))
+    greatest = 0.0
+    count = 0
+    for old_row, new_row in zip(before, after, strict=True):
+        count += len(old_row)
+        if old_row.keys() != new_row.keys():
+            greatest = max(greatest, 1.0)
+            continue
+        for scenario, value in old_row.items():
+            scale = max(value, float(np.finfo(np.float32).tiny))
+            greatest = max(greatest, abs(new_row[scenario] - value) / scale)
     return SeasonComparison(
-        has_same_bytes=has_same_bytes,
-        greatest=float(np.max(relative)),
-        values=len(before),
+        has_same_bytes=has_same_bytes, greatest=greatest, values=count
     )
 
 
-def _values_of(scores: SeasonScores) -> Iterable[float]:
+def _rows_of(scores: SeasonScores) -> Iterable[Mapping[int, float]]:
+    """Yield the values of each predictor and model by scenario."""
     for data_set in scores.data_sets:
-        yield from data_set.public_reference.values()
-        yield from data_set.blind_reference.values()
+        yield data_set.public_reference
+        yield data_set.blind_reference
         for model in data_set.models:
-            yield from model.public.values()
-            yield from model.blind.values()
+            yield model.public
+            yield model.blind
 
 
 @dataclass(kw_only=True)
@@ -217,8 +232,8 @@ class _SeasonRun:
         """Read what an earlier run has scored; a damaged file counts as none."""
         try:
             content = json.loads((self.blind_root / SAVED).read_bytes())
-            self._saved = {str(key): dict(row) for key, row in content.items()}
-        except (OSError, ValueError, TypeError, AttributeError):
+            self._saved = SAVED_VALUES.validate_python(content)
+        except (OSError, ValueError):
             self._saved = {}
 
     def score(self, data_set: SeasonDataSet) -> DataSetScores:

@@ -14,11 +14,10 @@ from lagbench.metrics.aggregate import Score
 
 from .entry import Entry, Strict
 from .entry_file import examine, format_issues, load_plain
-from .fields import Hash, Name, Number, Seed
+from .fields import Hash, Name, RankingValue, Seed
 from .folder import SEASON_SCORES, Folder
 from .scores_compared import DIGITS
 from .season import (
-    MOST_SEASON_BYTES,
     FrozenEntry,
     FrozenModel,
     Recorded,
@@ -27,8 +26,10 @@ from .season import (
     season_path,
 )
 
-# every metric that ranks is an error: not less than 0
-Values = Annotated[dict[int, Annotated[Number, Field(ge=0.0)]], Field(max_length=1000)]
+MOST_SCORE_BYTES = 4_000_000
+"""Longest file of scores [bytes]; a model takes up to 5,000."""
+
+Values = Annotated[dict[int, RankingValue], Field(max_length=1000)]
 
 
 class ModelScores(Strict):
@@ -84,14 +85,16 @@ def read_scores(folder: Folder, season: Season) -> SeasonScores | None:
     file = folder.path / path
     if folder.link_in(path) is not None or not file.is_file():
         return None
-    scores, issues = examine(SeasonScores, load_plain(file, longest=MOST_SEASON_BYTES))
+    fix = f"restore it, or remove it and run: lagbench season run {season.season}"
+    content = load_plain(file, longest=MOST_SCORE_BYTES, fix=fix)
+    scores, issues = examine(SeasonScores, content)
     if scores is None:
         raise ChecksFailedError(
             "the scores of a season do not fit",
             where=str(file),
             expected="the layout of scores.yaml",
             got=format_issues(issues),
-            fix=f"lagbench season run {season.season} --again",
+            fix=fix,
         )
     problem = _find_mismatch(season, scores)
     if problem is not None:
@@ -100,7 +103,7 @@ def read_scores(folder: Folder, season: Season) -> SeasonScores | None:
             where=str(file),
             expected=str(season_path(season.season)),
             got=problem,
-            fix=f"lagbench season run {season.season} --again",
+            fix=fix,
         )
     return scores
 

@@ -22,7 +22,7 @@ from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, Strict
 from .entry_file import examine, format_issues, load_plain, yaml_bytes
-from .fields import Hash, Label, Number, Seed
+from .fields import Hash, Label, RankingValue, Seed
 from .folder import SHIFT, Folder, Place, entry_path
 from .issues import issue_from_error, make_issue
 from .lock import board_lock
@@ -33,16 +33,12 @@ MOST_SHIFT_BYTES = 4_000_000
 """Longest file [bytes]; a model takes about 500."""
 
 
-MetricValue = Annotated[Number, Field(ge=0.0, le=1e100)]
-"""Value of a metric that ranks, an error; its square is a number too."""
-
-
 class ShiftModel(Strict):
     """The ranking metric of one model in each scenario of ``shift``."""
 
     seed: Seed | None = None
     model: Hash
-    values: Annotated[dict[int, MetricValue], Field(min_length=1, max_length=1000)]
+    values: Annotated[dict[int, RankingValue], Field(min_length=1, max_length=1000)]
 
 
 class ShiftScores(Strict):

@@ -176,12 +176,14 @@ class _ShiftRun:
                 continue
             if not self.again and self._is_recorded(entry, prediction):
                 continue
+            task = self._task(entry)
+            # before the predictions, which may take hours
+            subset_sha256 = self._subset_sha256(size)
             scores = ShiftModel(
                 seed=prediction.seed,
                 model=prediction.weights.sha256,
-                values=self._predict(entry, prediction),
+                values=self._predict(entry, prediction, task),
             )
-            subset_sha256 = self._subset_sha256(size)
             record_shift(self.folder, entry, size, scores, subset_sha256=subset_sha256)
             self.result.predicted.append(name_seed(entry, prediction))
 
@@ -218,9 +220,10 @@ class _ShiftRun:
             self._tasks[key] = load_scored_task(size, self.root)
         return self._tasks[key]
 
-    def _predict(self, entry: Entry, prediction: Prediction) -> dict[int, float]:
+    def _predict(
+        self, entry: Entry, prediction: Prediction, task: ScoredTask
+    ) -> dict[int, float]:
         """Return the ranking metric of a model in each scenario."""
-        task = self._task(entry)
         metric = entry.score.ranking_metric
         name = name_seed(entry, prediction)
         model = open_model(

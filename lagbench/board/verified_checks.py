@@ -152,9 +152,11 @@ def _faults_of_records(
     proofs = [_proves_score(reproduction, entry) for reproduction in line.reproduced]
     if not all(proofs):
         yield f"{sum(proofs)} of {len(proofs)} records agree"
-    path_of_seed = dict(zip(entry.seeds, entry.score_paths, strict=True))
+    path_of_seed = {}
+    for seed, score_path in zip(entry.seeds, entry.score_paths, strict=True):
+        path_of_seed[seed or 0] = score_path
     for reproduction in line.reproduced:
-        path = path_of_seed.get(reproduction.seed)
+        path = path_of_seed.get(reproduction.seed or 0)
         # a seed without a score file that is sound is reported as such
         if path is not None and path in ranking_values:
             yield from _compare_submitted(reproduction, ranking_values[path], path)

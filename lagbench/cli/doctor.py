@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import platform
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from lagbench.addresses import REPOSITORY, describe
+from lagbench.atomic import check_writable
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError, LagbenchError
@@ -115,10 +115,10 @@ def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     if broken_parts:
         raise ChecksFailedError(
             "this machine cannot run lagbench",
-            where="the table above",
+            where="lagbench doctor",
             expected="every part: ok",
             got=f"broken: {', '.join(broken_parts)}",
-            fix="install what the table names as broken once more",
+            fix="do for each of them what its detail says",
         )
 
 
@@ -141,7 +141,11 @@ def install_command(extras: str) -> str:
 
 
 def diagnose(root: str | Path | None = None) -> Diagnosis:
-    """Check what lagbench needs, with data sets under ``root``; nothing is changed."""
+    """Check what lagbench needs, with data sets under ``root``.
+
+    Nothing is changed, but for the working copy of a root in a store: it is made where
+    it is missing.
+    """
     folder = resolve_root(root)
     checks = [
         InstallationCheck(name="lagbench", state="ok", detail=version("lagbench")),
@@ -205,11 +209,7 @@ def _describe_folder(folder: Path) -> str:
     """Return the folder of all data sets and its free space, if it can be written.
 
     Raises:
-        OSError: nothing can be written there.
+        WorkFailedError: nothing can be written there.
     """
-    nearest_existing = folder
-    while not nearest_existing.exists():
-        nearest_existing = nearest_existing.parent
-    # raises the error of a folder that cannot be written
-    with tempfile.TemporaryFile(dir=nearest_existing):
-        return f"{folder}, {free_bytes(folder)} bytes free"
+    check_writable(folder)
+    return f"{folder}, {free_bytes(folder)} bytes free"

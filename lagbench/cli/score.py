@@ -151,14 +151,16 @@ def _print_cards(
     for card in cards:
         if every or all_references:
             print_tables(card_tables(card, every=every, all_references=all_references))
-            lines = flag_lines(card)
+            lines = flag_lines(card, every=every)
         else:
             print_tables([brief_table(card)])
             lines = brief_lines(card)
         for line in lines:
             print_line(line)
         print_line(f"written: {', '.join(map(str, card.files))}")
-    if not every:
+    if all_references and not every:
+        print_line("more: --all shows every metric")
+    elif not every:
         print_line("more: --all shows every metric, frame of interest and scenario")
 
 

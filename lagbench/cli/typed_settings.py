@@ -24,6 +24,9 @@ LIST_OPTIONS = ("--subset", *LIST_FORMS)
 BENCH_OPTIONS = ("--size", "--frames")
 """Options of the command bench whose value is the next word, beside the split."""
 
+TRAIN_OPTIONS = ("--output", "-o", "--recipe", "--start", "--root", "--split")
+"""Options of the command train whose value may be called as a model is."""
+
 MOST_LETTERS = 60
 """Letters of a word of the command line in a message."""
 
@@ -93,6 +96,8 @@ def advise_on_lists(words: Sequence[str]) -> str | None:
 
     >>> advise_on_lists(["generate", "cavity", "--subset", "train", "valid"])
     'write several values with commas: --subset train,valid'
+    >>> advise_on_lists(["generate", "cavity", "--scenarios", "1", ",", "2"])
+    'write several values with commas: --scenarios 1,2'
     >>> advise_on_lists(["generate", "--subset", "train", "cavity", "tiny"])
     """
     for number, word in enumerate(words):
@@ -102,9 +107,11 @@ def advise_on_lists(words: Sequence[str]) -> str | None:
         for value in words[number + 1 :]:
             if value.startswith("-") and not NEGATIVE_NUMBER.fullmatch(value):
                 break
-            values.append(value.strip(","))
+            # a comma alone is a separator
+            if value.strip(","):
+                values.append(value.strip(","))
         if len(values) > 1 and all(_fits_option(value, word) for value in values):
-            listing = shorten_word(",".join(filter(None, values)))
+            listing = shorten_word(",".join(values))
             return f"write several values with commas: {word} {listing}"
     return None
 
@@ -124,6 +131,7 @@ def advise_on_baselines(words: Sequence[str]) -> str | None:
 
     >>> advise_on_baselines(["lagbench", "train", "cavity", "gns"])
     'name the model by an option: --baseline gns'
+    >>> advise_on_baselines(["lagbench", "train", "cavity", "tiny", "-o", "gns"])
     """
     # importlib.metadata takes half as long to import as the rest of lagbench.
     from importlib.metadata import entry_points
@@ -132,8 +140,9 @@ def advise_on_baselines(words: Sequence[str]) -> str | None:
     if "train" not in words[1:2] or is_named:
         return None
     names = {point.name for point in entry_points(group="lagbench.baselines")}
-    for word in words[2:]:
-        if word in names:
+    for number, word in enumerate(words[2:], start=2):
+        is_value = words[number - 1] in TRAIN_OPTIONS
+        if word in names and not is_value:
             return f"name the model by an option: --baseline {word}"
     return None
 

@@ -361,7 +361,8 @@ def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | Non
     """Return a function from a file to its noted content hash and SHA-256.
 
     The function returns None for a file that was not hashed here or has changed since.
-    It reads the bytes once in a process; values are not unpacked.
+    It reads the bytes once in a process; values are not unpacked. It takes paths below
+    the folder, and raises an OSError for a file that was hashed and cannot be read now.
     """
     notes = _read_hash_notes(folder)
 

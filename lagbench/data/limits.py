@@ -126,13 +126,27 @@ def check_parameters(
             raise ValueError(f"{key}: expected {limit}; got {describe_value(value)}")
 
 
-def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
-    """Refuse unknown subsets and ids that stand in two of them."""
+def check_subsets(
+    size: str, subsets: Mapping[str, Sequence[int]], *, needed: Sequence[str]
+) -> None:
+    """Refuse unknown and missing subsets, and ids that stand in two of them.
+
+    Args:
+        size: name of the size.
+        subsets: scenario ids of each subset.
+        needed: names of the subsets that every size has.
+
+    Raises:
+        ValueError: a subset is unknown or missing, or an id stands in two of them.
+    """
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
         name = min(unknown)
         hint = suggest_name(name, SUBSETS)
         raise ValueError(f"size {size}: no subset {name!r}: {hint}")
+    for name in needed:
+        if name not in subsets:
+            raise ValueError(f"size {size}: no subset {name!r}, which every size needs")
     ids = _all_ids(subsets)
     if len(ids) != len(set(ids)):
         raise ValueError(f"size {size}: a scenario stands in two subsets")

@@ -371,8 +371,8 @@ def locate(
 
     Args:
         split: name or path, see :func:`locate_split`.
-        size: name of the size; when None the only one with data, of several mini, which
-            :func:`locate_new` would make.
+        size: name of the size. When None it is the only one of the split, or the only
+            one with data; where several have data it is mini.
         root: folder of all data sets.
         registry: the other splits; ours when None.
         is_chosen_of_several: whether mini is taken where several sizes have data. What
@@ -381,7 +381,7 @@ def locate(
     Raises:
         UsageError: see :func:`locate_split`; the split has no such size, or none is
             named where several sizes have data, but not mini.
-        DataError: no size is named, and none has data.
+        DataError: no size is named, and none of several has data.
         UnreadableFileError: the description of the local split is not right.
     """
     location = locate_split(split, root=root, registry=registry)

@@ -42,6 +42,7 @@ from lagbench.errors import (
 )
 
 from .box import Box, parse_periodic
+from .checksums import HASHED_SUBSETS
 from .field_errors import describe_expectation, describe_input, is_own_sentence
 from .grid import Grid, Placement
 from .layout import (
@@ -496,7 +497,9 @@ class Split(_RegistryModel):
     source: str
     parameters: dict[str, Parameter]
     # a size's name is that of a folder
-    sizes: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")], _SizeEntry]
+    sizes: dict[
+        Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")], _SizeEntry
+    ] = Field(min_length=1)
     mirrors: tuple[Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")], ...] = Field(
         (), strict=False
     )
@@ -506,7 +509,7 @@ class Split(_RegistryModel):
         declared = {name: entry.value for name, entry in self.parameters.items()}
         for name, size in self.sizes.items():
             check_parameters(name, size.parameters, declared)
-            check_subsets(name, size.subsets)
+            check_subsets(name, size.subsets, needed=HASHED_SUBSETS)
             task_frames = size.task.input_frames + size.task.horizon
             check_frames(name, size.frames, size.subsets, task_frames=task_frames)
             particles = size.parameters.get("particles", declared.get("particles"))
@@ -530,7 +533,11 @@ class Registry:
         self.package_splits = frozenset(package_splits)
 
     def split(self, name: str) -> Split:
-        """Return a split by name."""
+        """Return a split by name.
+
+        Raises:
+            UsageError: there is no such split.
+        """
         if name not in self.splits:
             raise UsageError(
                 f"no split {name!r}",
@@ -545,7 +552,7 @@ class Registry:
         """Return one size of a split with its merged parameters and measured values.
 
         Raises:
-            UsageError: the split has no such size.
+            UsageError: there is no such split, or it has no such size.
         """
         parent = self.split(split)
         if name not in parent.sizes:
@@ -604,21 +611,23 @@ def load(path: Path | None = None) -> Registry:
             read, or has a name that is taken.
 
     Raises:
-        UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
+        UnreadableFileError: no such file, not YAML, an unknown key, or a value that
+            does not fit.
     """
     named_path = path or os.environ.get(REGISTRY_VARIABLE)
     if named_path:
         named_path = Path(named_path)
     file = named_path or default_path()
-    modified = 0
+    stamp: tuple[int, ...] = ()
     if file.exists():
-        modified = file.stat().st_mtime_ns
-    return _load(named_path or None, modified)
+        status = file.stat()
+        stamp = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+    return _load(named_path or None, stamp)
 
 
 @functools.cache
-def _load(path: Path | None, modified: int) -> Registry:
-    """Load a file once per modification time."""
+def _load(path: Path | None, _stamp: tuple[int, ...]) -> Registry:
+    """Load a file once, and again once it has changed or the path means another one."""
     file = path or default_path()
     our_file = _read_registry_file(file)
     registry = Registry(

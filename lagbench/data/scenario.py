@@ -50,6 +50,9 @@ CHUNK_CACHE = 1 << 20
 MAX_FACTS_LENGTH = 4096
 """Characters of ``facts``, which no hash covers and the manifest repeats."""
 
+MOST_LETTERS = 80
+"""Letters of a wrong attribute in a message."""
+
 STATED_NAMES = frozenset(
     (
         "active_frames",
@@ -88,13 +91,19 @@ class ScenarioHeader:
     def viscosity(self) -> float | None:
         """Kinematic viscosity that the file states [length^2/s]; None without one."""
         stated = self.parameters.get("viscosity")
-        return parse_viscosity(stated, where=f"{self.key}")
+        return parse_viscosity(stated, where=self._place)
 
     @property
     def friction(self) -> float | None:
         """Coulomb friction of the walls that the file states [1]; None without one."""
         stated = self.parameters.get("friction")
-        return _parse_number(stated, "friction", unit="1", where=f"{self.key}")
+        return _parse_number(stated, "friction", unit="1", where=self._place)
+
+    @property
+    def _place(self) -> str:
+        """The scenario in words, for messages."""
+        key = self.key
+        return f"{key.split} {key.size}, scenario {key.scenario}"
 
 
 def select_parameters(
@@ -151,7 +160,7 @@ def _parse_number(stated: object, name: str, *, unit: str, where: str) -> float 
             f"the {name} has an impossible value",
             where=f"{where}, attribute {name}",
             expected=f"a finite number from 0 [{unit}]",
-            got=stated,
+            got=str(stated)[:MOST_LETTERS],
             fix="mend the attribute, or make the file again",
         )
     return number

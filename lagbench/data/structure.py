@@ -343,10 +343,11 @@ def check_structure(
 
     They have no names of dimensions.
 
-    Refused are links, foreign storage and filters, filters that are applied twice,
-    groups and types that the format does not have, and arrays that unpack to far more
-    than the file holds. The headers tell most of it. Large chunks are unpacked up to
-    the length that they declare: this check has to hold in a process without limits.
+    Refused are links, members with several names, foreign storage and filters, filters
+    that are applied twice, groups and types that the format does not have, and arrays
+    that unpack to far more than the file holds. The headers tell most of it. Large
+    chunks are unpacked up to the length that they declare: this check has to hold in a
+    process without limits.
 
     Raises:
         UnreadableFileError: the file has another structure, is damaged, or is a trap.
@@ -396,6 +397,13 @@ def _list_arrays(file: h5py.File, path: Path, expected: Structure) -> list[str]:
                 groups.append(f"{member}/")
             else:
                 issue = StorageIssue("a member that is no variable", "a variable", kind)
+                raise _refusal(path, name, issue)
+            # a thousand names of one group of a thousand names: a small file, and a
+            # million arrays
+            name_count = h5py.h5o.get_info(file.id, name.encode()).rc
+            if name_count > 1:
+                names = f"{name_count} names"
+                issue = StorageIssue("a member has several names", "one name", names)
                 raise _refusal(path, name, issue)
     return arrays
 

@@ -413,6 +413,7 @@ def _write_errors(path: Path) -> Iterator[None]:
             where=str(path),
             expected="a place that can be written to",
             got=f"{error}; {free_bytes:,} bytes free",
-            fix="free disk space, or name a folder that you may write to: --root or "
+            fix="free disk space, raise the limit of the length of a file (`ulimit -f "
+            "unlimited`), or name a folder that you may write to: --root or "
             "LAGBENCH_ROOT",
         ) from error

@@ -27,6 +27,10 @@ MAX_DEPTH = 32
 """Deepest nesting of mappings and lists that is read."""
 
 
+UNICODE_BREAKS = frozenset("\x85\u2028\u2029\ufeff")
+"""Characters that YAML takes for line breaks, and the mark of the order of bytes."""
+
+TEXT = "tag:yaml.org,2002:str"
 INTEGER = "tag:yaml.org,2002:int"
 FLOAT = "tag:yaml.org,2002:float"
 NUMBERS = {
@@ -144,12 +148,24 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper for our reader: no aliases, and quotes around texts like numbers."""
+    """Dumper for our reader.
+
+    It writes no aliases. Texts like numbers stand in quotes, and line breaks of Unicode
+    are escaped: readers fold them into blanks.
+    """
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
+def _represent_text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    style = None
+    if UNICODE_BREAKS.intersection(text):
+        style = '"'
+    return dumper.represent_scalar(TEXT, text, style=style)
+
+
+_Dumper.add_representer(str, _represent_text)
 for _tag, _pattern in NUMBERS.items():
     _Dumper.add_implicit_resolver(_tag, _pattern, FIRST_CHARACTERS)
 

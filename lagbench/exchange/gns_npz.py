@@ -279,10 +279,12 @@ class PickledArray:
         if self._array is None:
             shape, dtype, is_fortran, data = self._state
             if dtype.is_object:
+                # NumPy lists objects in the order of C, whatever the array's own order
                 values = _build_objects(data, depth - 1)
+                self._array = values.reshape(shape)
             else:
                 values = np.frombuffer(_raw_bytes(data), dtype.build())
-            self._array = _reshape(values, shape, is_fortran)
+                self._array = _reshape(values, shape, is_fortran)
         return self._array
 
 

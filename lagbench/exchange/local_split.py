@@ -171,9 +171,9 @@ def _not_finite(position: NDArray[np.floating], where: str) -> DataError:
     return DataError(
         "a position is not finite",
         where=f"{where}, particle {particle}",
-        expected="numbers",
+        expected="finite numbers, no larger than those of float32",
         got=position[particle].tolist(),
-        fix="end the trajectory before this frame",
+        fix="leave the particle out, or end the trajectory before this frame",
     )
 
 
@@ -274,7 +274,7 @@ def _summarise(
 
 
 def format_bounds(bounds: Bounds) -> str:
-    """Return the bounds of a split for a message.
+    """Return the bounds of a split for a message; there is one axis at least.
 
     >>> format_bounds(((0.0, 1.0), (0.25, 2.0)))
     '[0, 1] x [0.25, 2]'
@@ -688,7 +688,7 @@ class SplitBuilder:
             where=f"{where}; --bounds, or bounds of the metadata",
             expected=f"bounds that hold {format_box(source_low, source_high)}, the "
             "extent of the trajectory",
-            got=description.bounds,
+            got=format_bounds(description.bounds),
             fix="state the box of the data, in their own length",
         )
 

@@ -73,6 +73,9 @@ LEAST = 1e-30
 MOST = 1e30
 """What a length, a time or a density may be: squares of them are floats."""
 
+LEAST_INTERVAL = 1.0 / NEEDED["frame_rate"].high
+"""Shortest time between two frames: a description of a split states the frame rate."""
+
 MOST_MISTAKES = 10
 """Mistakes of a description that one message tells."""
 
@@ -406,21 +409,22 @@ class Description:
             object.__setattr__(self, "transform", transform)
 
     def _check_quantities(self, mistakes: UsageErrorCollector) -> None:
-        for option, value in (
-            ("--radius", self.radius),
-            ("--frame-interval", self.frame_interval),
-            ("density", self.density),
-            ("spacing", self.spacing),
+        for option, value, least in (
+            ("--radius", self.radius, LEAST),
+            ("--frame-interval", self.frame_interval, LEAST_INTERVAL),
+            ("density", self.density, LEAST),
+            ("spacing", self.spacing, LEAST),
         ):
-            if value is None or LEAST <= value <= MOST:
+            if value is None or least <= value <= MOST:
                 continue
             with mistakes:
                 raise UsageError(
-                    "not a number above 0",
+                    "a quantity is out of range",
                     where=option,
-                    expected=f"{LEAST:g} to {MOST:g}",
+                    expected=f"a number from {least:g} to {MOST:g}",
                     got=value,
-                    fix="give it in the length and time of the data",
+                    fix="give it in the units of the data; where it is as large or as "
+                    "small in them, give all quantities in other units",
                 )
 
     def _check_counts(self, mistakes: UsageErrorCollector) -> None:

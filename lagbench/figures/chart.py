@@ -27,6 +27,7 @@ DEEPEST = 1e-6
 """A logarithmic axis reaches no lower than this share of its top."""
 
 HUGE = 1e300  # values beyond are no numbers of a chart
+TINY = 1e-300  # magnitudes below it stand at 0
 MOST_LABELS = 8  # of a logarithmic axis; of more ticks the powers of ten stay
 PLAIN_POWERS = range(-3, 4)  # powers of ten that are written out
 ROUND_FACTORS = (1.0, 2.0, 2.5, 5.0, 10.0)
@@ -178,6 +179,7 @@ def spanning(
     parts = [np.asarray(values, np.float64).ravel() for values in series]
     values = np.concatenate([*parts, np.zeros(0)])
     values = values[np.abs(values) < HUGE]  # NaN is not less
+    values = np.where(np.abs(values) < TINY, 0.0, values)
     if not values.size:
         return linear(0.0, 1.0)
     low = float(values.min())
@@ -186,7 +188,7 @@ def spanning(
     if high > 0.0:
         positive = values[values > DEEPEST * high]
 
-    has_logs = positive.size > 0 and high > 1.0 / HUGE
+    has_logs = positive.size > 0
     if log is None:
         log = False
         if has_logs and low >= 0.0:

@@ -70,7 +70,8 @@ def plot(
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
-    with _blame_named_files(source):
+    named_files = [source] if _is_file(source) else []
+    with _blame_named_files(*named_files):
         if output is None:
             output = _frame_path(file, frame)
         require_place(Path(output), overwrite=overwrite)
@@ -125,7 +126,7 @@ def animate(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     second: Path | None = None
-    named_files = [source]
+    named_files = [source] if _is_file(source) else []
     if isinstance(beside, str | Path):
         second = Path(beside)
         named_files.append(second)
@@ -167,7 +168,7 @@ def find_scenario(
         UsageError: no such split, size or scenario, or an id beside a file.
         DataError: the scenario is not on this machine.
     """
-    if str(source).endswith(SCENARIO_ENDING):
+    if _is_file(source):
         if scenario is not None:
             raise UsageError(
                 "a file holds one scenario, and an id names another",
@@ -196,6 +197,11 @@ def find_scenario(
             fix=suggest_repair(tier, repair, root=folder),
         )
     return path
+
+
+def _is_file(source: str | Path) -> bool:
+    """Return whether a user names a scenario file, not a split."""
+    return str(source).endswith(SCENARIO_ENDING)
 
 
 @contextmanager

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import MATERIALS
 from lagbench.data import grid as gridding
 from lagbench.data.box import parse_obstacle
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
-from lagbench.errors import UsageError
+from lagbench.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -143,7 +144,8 @@ class Recording:
             file: path of the scenario file, for messages; None where it is not known.
 
         Raises:
-            DataError: the obstacle has no place or no size.
+            DataError: the obstacle has no place or no size, or a number stands for no
+                material.
         """
         self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
         self.title = registry.split(self.size.split).title
@@ -155,28 +157,27 @@ class Recording:
         self._read = read
         # rows of NaN fill up scenarios that have fewer particles than others
         self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
-        material = read("material", slice(None))
-        self.material = material[self._is_present].astype(np.int8)
+        where = file or f"{self.size.split} {self.size.name}, scenario {self.scenario}"
+        material = read("material", slice(None))[self._is_present]
+        self.material = _check_material(material, where=where)
         # [length/s], shape [frame, wall, axis]; zeros without walls
         dimension = self.size.dimension
         self.wall_velocity = np.zeros((frames, 2 * dimension, dimension))
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         # centre and radius of a fixed obstacle [length]; None without one
-        self.obstacle = self._obstacle(read, variables, file)
+        self.obstacle = self._obstacle(read, variables, where=where)
         self._has_velocity = "velocity" in variables
         self._particle_mass = float(read("particle_mass", slice(None)))
 
     def _obstacle(
-        self, read: Read, variables: set[str], file: str | None
+        self, read: Read, variables: set[str], *, where: str
     ) -> NDArray[np.float32] | None:
         """Return centre and radius of the obstacle that a file or data set states."""
         if "obstacle" in variables:
             stated = read("obstacle", slice(None))
             return np.asarray(stated, np.float32)
-        size = self.size
-        where = file or f"{size.split} {size.name}, scenario {self.scenario}"
-        return parse_obstacle(self.parameters, size.dimension, where=where)
+        return parse_obstacle(self.parameters, self.size.dimension, where=where)
 
     @property
     def particles(self) -> int:
@@ -276,6 +277,20 @@ class Recording:
 
     def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:
         return self._read(name, frame)[self._is_present].astype(np.float64)
+
+
+def _check_material(material: NDArray[Any], *, where: str) -> NDArray[np.int8]:
+    """Return the materials of particles; refuse numbers that stand for none."""
+    is_known = np.isin(material, range(len(MATERIALS)))
+    if not is_known.all():
+        raise DataError(
+            "a particle has an unknown material",
+            where=f"{where}, variable 'material'",
+            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
+            got=material[~is_known][0],
+            fix="state a material of lagbench for every particle",
+        )
+    return material.astype(np.int8)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Parameter, Registry, Size, Split
+from lagbench.errors import format_count
 from lagbench.figures.tables import escape, escape_prose, markdown
 
 from .croissant import KEYWORDS, croissant_json
@@ -414,7 +415,8 @@ def _scenario_table(manifest: Manifest) -> str:
     rows = [_scenario_row(entry, names) for entry in manifest.files]
     titles = [name.replace("_", " ") for name in names]
     table = markdown(("id", "file", "frames", *titles, "content hash"), rows)
-    return f"<details><summary>{len(rows)} files</summary>\n\n{table}\n\n</details>"
+    count = format_count(len(rows), "file")
+    return f"<details><summary>{count}</summary>\n\n{table}\n\n</details>"
 
 
 def _scenario_row(entry: FileEntry, names: list[str]) -> tuple[object, ...]:

@@ -255,13 +255,16 @@ def free_bytes(folder: Path) -> int:
     Raises:
         WorkFailedError: nothing can be written there.
     """
-    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    places = (folder, *folder.parents)
+    existing = next(place for place in places if os.path.lexists(place))
     if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
         return shutil.disk_usage(existing).free
 
     obstacle = "a file"
     if existing.is_dir():
         obstacle = "write-protected"
+    elif existing.is_symlink():
+        obstacle = "a link that leads to no folder"
     raise WorkFailedError(
         "no data set can be written here",
         where=str(folder),

@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, WorkFailedError
 
 from .frame import Floats, FramePair
 from .metric import Metric, identity, mean, mean_of_rows, root_mean_square
@@ -513,6 +513,8 @@ def _score(metric: Metric, statistics: _SeriesByStatistic) -> Score | None:
     try:
         series = _series(metric, statistics)
         values = _over_frames(metric, series)
+    except WorkFailedError:
+        raise  # it names the metric
     except (Exception, SystemExit) as error:
         metric.raise_named(error, "over all frames")
 
@@ -534,7 +536,7 @@ def _series(metric: Metric, statistics: _SeriesByStatistic) -> Floats:
         return parts[0]
     rows = []
     for row_of_parts in zip(*parts, strict=True):
-        rows.append(np.asarray(metric.series(*row_of_parts), np.float64))
+        rows.append(metric.per_frame_from(*row_of_parts))
     return np.stack(rows)
 
 
@@ -545,13 +547,19 @@ def _over_frames(metric: Metric, series: Floats) -> Floats:
         return mean_of_rows(series)
     if metric.over_frames is root_mean_square:
         return np.asarray(np.sqrt(mean_of_rows(series**2)))
-    return np.array([metric.over_frames(row) for row in series])
+    return np.array([metric.over_horizon(row) for row in series])
 
 
 def aggregate(
     metrics: Iterable[Metric], tallies: Mapping[int, Tally]
 ) -> dict[str, Score]:
-    """Return the scores of all metrics that this split and size have, by name."""
+    """Return the scores of all metrics that this split and size have, by name.
+
+    All tallies have the same statistics and frames, and every statistic of a metric.
+
+    Raises:
+        WorkFailedError: a metric gives no value per frame, or no number.
+    """
     scores: dict[str, Score] = {}
     if not tallies:
         return scores

@@ -292,6 +292,29 @@ class Metric:
             raise self._failure(what, place, expected="a bool", got=is_defined)
         return self._to_number(value, place)
 
+    def per_frame_from(self, *statistics: Floats) -> Floats:
+        """Return the value per frame from the statistics in ``of``, shape [frame].
+
+        Raises:
+            WorkFailedError: it has another shape.
+        """
+        series = np.asarray(self.series(*statistics), np.float64)
+        if series.shape != statistics[0].shape:
+            what = "the series of a metric has another shape"
+            expected = f"one value per frame, shape {statistics[0].shape}"
+            place = "over all frames"
+            raise self._failure(what, place, expected=expected, got=series.shape)
+        return series
+
+    def over_horizon(self, series: Floats) -> float:
+        """Return the number of a scenario from the value per frame.
+
+        Raises:
+            WorkFailedError: it is no number.
+        """
+        value: object = self.over_frames(series)
+        return self._to_number(value, "over all frames")
+
     def _to_number(self, value: object, place: str) -> float:
         """Return a statistic as a float; an array of one element is converted."""
         if not isinstance(value, (str, bytes, complex)):

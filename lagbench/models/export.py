@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
 from lagbench.arguments import check_arguments
-from lagbench.atomic import write_atomically
+from lagbench.atomic import check_writable, write_atomically
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, check_installed, require
 from lagbench.tensors import Batch
@@ -75,6 +76,7 @@ def export_onnx(
             history is beyond the given frames, the model cannot be traced, or its file
             predicts something else.
         UnreadableFileError: the file holds what an entry may not carry.
+        WorkFailedError: the file cannot be written.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -115,16 +117,27 @@ def export_onnx(
         inputs["obstacle"] = window.obstacle[0]
     wrapped = _Exported(step, modules, history=history, input_names=tuple(inputs))
 
-    temporary = target.with_name(f".{target.stem}.exporting.onnx")
-    try:
-        _write(wrapped, inputs, temporary)
-        _state_data_set(temporary, data.size)
-        check_onnx(temporary)
-        _require_same(wrapped, inputs, temporary)
-        write_atomically(target, temporary.read_bytes(), option="path")
-    finally:
-        temporary.unlink(missing_ok=True)
+    check_writable(target.parent, option="path")
+    with _evaluation_mode(wrapped), tempfile.TemporaryDirectory() as folder:
+        unchecked = Path(folder) / target.name
+        _write(wrapped, inputs, unchecked)
+        _state_data_set(unchecked, data.size)
+        check_onnx(unchecked)
+        _require_same(wrapped, inputs, unchecked)
+        write_atomically(target, unchecked.read_bytes(), option="path")
     return target
+
+
+@contextmanager
+def _evaluation_mode(model: nn.Module) -> Iterator[None]:
+    """Evaluate a model, as without dropout; each part gets its own mode back."""
+    modes = [(part, part.training) for part in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for part, is_training in modes:
+            part.training = is_training
 
 
 def _one_frame_more(forcing: Tensor, frames: int) -> Tensor:
@@ -142,7 +155,7 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
         warnings.simplefilter("ignore")
         try:
             torch.onnx.export(
-                wrapped.eval(),
+                wrapped,
                 tuple(inputs.values()),
                 str(path),
                 input_names=list(inputs),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lagbench.arguments import check_arguments
+from lagbench.atomic import check_writable, write_atomically
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
@@ -72,6 +74,7 @@ def export_safetensors(
         UsageError: the file has another suffix.
         UnreadableFileError: weights are not finite, the model is of another
             architecture, or the file is longer than an entry may carry.
+        WorkFailedError: the file cannot be written.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -93,11 +96,10 @@ def export_safetensors(
         },
     )
     restore(checkpoint, where=str(target))
-    temporary = target.with_name(f".{target.stem}.exporting{SUFFIX}")
-    try:
-        save(temporary, checkpoint)
-        load(temporary)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    check_writable(target.parent, option="path")
+    with tempfile.TemporaryDirectory() as folder:
+        unchecked = Path(folder) / target.name
+        save(unchecked, checkpoint)
+        load(unchecked)
+        write_atomically(target, unchecked.read_bytes(), option="path")
     return target

@@ -164,8 +164,9 @@ PREDICTOR = ReferencePredictor(
     title="Ballistic, then mean cloud of analogs",
     kind=Kind.NAIVE,
     definition="Every particle falls freely until a tenth of them touch a wall or two"
-    " bodies meet. Then the five states of train, or their mirror images, that are most"
-    " like that are matched, and their clouds are averaged; nearer states count more.",
+    " bodies meet. Then the two to five states of train, or their mirror images, that"
+    " are most like that are matched, and their clouds are averaged; nearer states"
+    " count more.",
     applies=applies,
     predict=predict,
     reads_train=True,

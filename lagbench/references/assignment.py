@@ -30,7 +30,8 @@ def assign_particles(
     are halved along the longest side of their cloud, both clouds at the same rank,
     until there are no more than that. Where the other cloud has fewer or more particles
     of a material, some are taken more than once, or not at all, evenly over their
-    numbers. A material that it lacks is matched to all of its particles.
+    numbers. Particles of a material that the other cloud lacks get partners among all
+    of its particles, of which there is at least one.
 
     Args:
         position: our positions [length], shape [particle, axis].

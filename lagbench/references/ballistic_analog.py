@@ -100,7 +100,8 @@ def label_bodies(
 ) -> NDArray[np.intp]:
     """Return the number of the body of each particle.
 
-    A body is all that hangs together by steps shorter than the radius.
+    A body is all that hangs together by steps of at most the radius. Bodies are
+    numbered from 0.
 
     Args:
         position: positions [length], shape [particle, axis].

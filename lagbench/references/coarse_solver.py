@@ -281,7 +281,7 @@ def _leaders(
     given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     """Return for each other particle the index of the nearest of its material that
-    carries mass.
+    carries mass; of any material where none of its own does.
     """
     carrier_position = given.last[carriers]
     carrier_material = given.material[carriers]
@@ -290,6 +290,8 @@ def _leaders(
     leader = np.zeros(len(others), np.intp)
     for kind in np.unique(other_material):
         pool = np.flatnonzero(carrier_material == kind)
+        if not pool.size:
+            pool = np.arange(len(carriers))
         led = np.flatnonzero(other_material == kind)
         tree = given.box.tree(carrier_position[pool])
         points = given.box.tree_points(other_position[led])

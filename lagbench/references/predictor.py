@@ -1,8 +1,9 @@
 """Reference predictors: what predicts without training, and what it may know.
 
-A *naive* predictor learns nothing and knows no equation; it may look things up in
-train. A *classical* one integrates the equations. Both get what a model gets of a test
-scenario: its first frames, its materials, the motion of its walls and its viscosity.
+A *naive* predictor learns nothing and integrates no equations; it may look things up
+in train. A *classical* one integrates the equations. Both get what a model gets of a
+test scenario: its first frames, its materials, the motion of its walls and its
+viscosity.
 
 Some predictors carry the particles of a full box by a velocity field that is known at
 scattered points. In two dimensions the field is linear on the Delaunay triangles of the
@@ -46,7 +47,8 @@ NEAREST = 10
 class Kind(enum.StrEnum):
     """How a prediction comes about."""
 
-    NAIVE = "naive"  # learns nothing, knows no equation; may look things up in train
+    # learns nothing and integrates no equations; may look things up in train
+    NAIVE = "naive"
     CLASSICAL = "classical"  # integrates the equations
     LEARNED = "learned"  # its parameters are fitted to train
     HYBRID = "hybrid"  # a solver with a learned part

@@ -654,7 +654,8 @@ def fill_gaps(sums: Floats, weight: Floats) -> Floats:
     """Return ``sums / weight`` at the faces of a grid, with gaps filled.
 
     A face without weight gets the mean of its neighbours that have a value.
-    Gaps close from their edges, layer by layer. Without any weight all values are 0.
+    Gaps close from their edges, layer by layer, but not across the ends of a periodic
+    axis. Without any weight all values are 0.
     """
     has_value = weight > LEAST_WEIGHT
     divisor = np.where(has_value, weight, 1.0)

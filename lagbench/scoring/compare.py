@@ -697,7 +697,7 @@ def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant
         scores = _load_scores(path, scoring)
         _check_split(path, scores.identity, scoring.split)
         if SUBMISSION not in scores.scores:
-            rows = ", ".join(map(repr, list(scores.scores)[:10]))
+            rows = ", ".join(map(repr, list(scores.scores)[:10])) or "no row"
             raise _incomplete(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
         seeds.append(scores)
 
@@ -737,12 +737,26 @@ def _check_split(
 
 
 def _check_seeds(source: str | Path, seeds: Sequence[PublishedScores]) -> None:
-    """Refuse seeds of different methods or tasks, and copies of one seed."""
+    """Refuse seeds of different methods, tasks or scenarios, and copies of one seed."""
     first = seeds[0].identity
     first_name = f"{source} ({first['method']})"
     for seed in seeds[1:]:
         where = f"{first_name} and {source} ({seed.identity['method']})"
         _check_same(where, first, seed.identity, more=("method",))
+
+    first_scenarios = _scenarios_of(seeds[0])
+    for seed in seeds[1:]:
+        scenarios = _scenarios_of(seed)
+        # a row without a metric is refused later
+        if scenarios and first_scenarios and scenarios != first_scenarios:
+            raise UsageError(
+                "the seeds of a method have other scenarios",
+                where=str(source),
+                expected=f"scenarios {format_ids(first_scenarios)}",
+                got=f"scenarios {format_ids(scenarios)}",
+                fix="keep the seeds of one subset, each with all of its scenarios, in "
+                "a folder of their own",
+            )
 
     hashes = {seed.predictions_sha256 for seed in seeds}
     if len(hashes) < len(seeds):
@@ -753,6 +767,13 @@ def _check_seeds(source: str | Path, seeds: Sequence[PublishedScores]) -> None:
             got=f"{len(seeds) - len(hashes)} of {len(seeds)} once more",
             fix="one file stands for one training: leave copies out",
         )
+
+
+def _scenarios_of(seed: PublishedScores) -> tuple[int, ...]:
+    """Return the ids of the scenarios of a seed, the same for all of its metrics."""
+    for score_of_metric in seed.scores[SUBMISSION].values():
+        return score_of_metric.scenarios
+    return ()
 
 
 def _seed_files(path: Path) -> list[Path]:
@@ -938,9 +959,9 @@ def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
 
     expected = f"values of a ranking metric that judges, {one.ranking!r}"
     if one.ranking not in judging:
-        raise _incomplete(one.name, expected, None)
+        raise _incomplete(one.name, expected, _list_names(judging))
     if one.ranking not in two.scores:
-        raise _incomplete(two.name, expected, None)
+        raise _incomplete(two.name, expected, _list_names(two.scores))
     common = []
     for name in judging:
         if name in two.scores:
@@ -948,7 +969,12 @@ def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
     return common
 
 
-def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:
+def _list_names(names: Iterable[str]) -> str:
+    """Return the first names in one line, for a message."""
+    return ", ".join(list(names)[:10]) or "no such metric"
+
+
+def _incomplete(where: str, expected: str, got: str) -> UnreadableFileError:
     return UnreadableFileError(
         "scores without the row or the ranking metric",
         where=where,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -34,9 +35,11 @@ def _require_known_format(number: int) -> int:
     return number
 
 
-def _require_unique(ids: list[int]) -> list[int]:
-    if len(set(ids)) < len(ids):
-        raise ValueError("scenario ids that occur twice")
+def _require_ascending(ids: list[int]) -> list[int]:
+    if not ids:
+        raise ValueError("no scenario ids")
+    if not all(first < second for first, second in itertools.pairwise(ids)):
+        raise ValueError("scenario ids that do not ascend")
     return ids
 
 
@@ -52,7 +55,7 @@ class _Content(BaseModel):
 
 
 class _TaskContent(_Content):
-    scenarios: Annotated[list[Count], AfterValidator(_require_unique)]
+    scenarios: Annotated[list[Count], AfterValidator(_require_ascending)]
 
 
 class _ScoreContent(_Content):

@@ -116,7 +116,10 @@ def sizes_with_test_files(
 def remeasure(
     size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
 ) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the shipped references of a data set again.
+    """Measure the references of a data set again, and compare with the shipped scores.
+
+    References that read train are left out where train is not there. A reference whose
+    scores are not shipped differs in all metrics.
 
     Returns:
         The names of the measured references, and by name the metrics that differ.

@@ -325,9 +325,9 @@ def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> N
 def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
     """Return the files that a child cannot read, and why.
 
-    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at
-    most and within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files,
-    whatever the files contain.
+    Where a file stops a child, another one reads the rest. After :data:`MOST_STOPS`
+    stops, and after :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files, the
+    rest is left unread, whatever the files contain.
     """
     reasons: dict[Path, str] = {}
     pending = list(paths)

@@ -193,10 +193,17 @@ def _break_name(name: str) -> str:
     return "-\n".join(name.split("-"))
 
 
-def flag_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield the legend, undefined frames, comparisons, flags and warnings, by line."""
+def flag_lines(card: ScoreCard, *, every: bool = False) -> Iterator[str]:
+    """Yield the legend, undefined frames, comparisons, flags and warnings, by line.
+
+    With ``every`` the undefined frames of all metrics are counted, not only those of
+    the chosen ones: as the tables show them.
+    """
+    names: Collection[str] = card.chosen_metrics
+    if every:
+        names = card.submission
     yield LEGEND
-    yield from _undefined_lines(card, CHOSEN)
+    yield from _undefined_lines(card, names)
     for row in card.scores:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"

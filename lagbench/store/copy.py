@@ -35,7 +35,13 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
-from lagbench.errors import DataError, UsageError, hide_user, suggest_name
+from lagbench.errors import (
+    DataError,
+    UsageError,
+    format_count,
+    hide_user,
+    suggest_name,
+)
 from lagbench.work.machine import may_differ
 from lagbench.work.progress import watched
 
@@ -604,7 +610,8 @@ class _TransferDisplay:
         self._last_print = time.monotonic()
         if not self._is_visible:
             return
-        files = f"{self.finished_objects} of {self._object_count} files"
+        count = format_count(self._object_count, "file")
+        files = f"{self.finished_objects} of {count}"
         arrived = f"{self._arrived_bytes / 1e6:.1f}"
         megabytes = f"{arrived} of {self._total_bytes / 1e6:.1f} MB"
         text = f"lagbench: fetching from {self._url}: {files}, {megabytes}"

@@ -121,7 +121,11 @@ WRITE_IN_CHUNKS = (
 SURROGATES = re.compile("[\ud800-\udfff]")
 """Characters that no UTF-8 has."""
 
-KINDS = {str: "text", int: "an integer", float: "a positive number"}
+KINDS = {
+    str: f"text of at most {MAX_ATTRIBUTE} characters, without NUL and surrogates",
+    int: "an integer of 64 bits",
+    float: "a positive number",
+}
 """Types of optional attributes in words."""
 
 
@@ -179,7 +183,7 @@ def describe_kind(name: str) -> str:
     """Return in words what an attribute must be.
 
     >>> describe_kind("seed"), describe_kind("parameters")
-    ('an integer', 'an integer >= 0')
+    ('an integer of 64 bits', 'an integer of 64 bits >= 0')
     """
     if name in REQUIRED:
         return f"printable text of 1 to {MAX_NAME} characters"
@@ -263,8 +267,8 @@ def require_valid_attribute(name: str, value: object) -> None:
             where=f"label {name!r}",
             expected=describe_kind(name),
             got=quote(value),
-            fix="docs/predictions.md describes the labels; leave one out that is not "
-            "known",
+            fix="docs/predictions.md describes the labels; leave out a label that you "
+            "do not know",
         )
 
 
@@ -427,7 +431,8 @@ def _check_variables(info: FileInfo, issues: IssueCollector) -> None:
         if kind or not stored_names:
             fix = USE_TEMPLATE
         else:
-            fix = suggest_name(quote(name), stored_names)
+            known_names = [quote(stored)[1:-1] for stored in info.links]
+            fix = suggest_name(name, known_names)
         issues.error(
             "format",
             f"no variable {name!r}",

@@ -20,7 +20,7 @@ import os
 import queue
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -361,8 +361,8 @@ class Cluster:
 def _connect(address: str) -> Iterator[Any]:
     """Connect, with Dask's logs kept off the terminal: their news become our errors.
 
-    After an error they stay off: a client that lost its scheduler logs until the
-    process ends.
+    After an error of a connected client they stay off: a client that lost its scheduler
+    logs until the process ends.
     """
     # Its import sets the levels of its loggers.
     distributed = require("distributed", extra="cluster")
@@ -371,13 +371,22 @@ def _connect(address: str) -> Iterator[Any]:
         logger = logging.getLogger(name)
         levels[name] = logger.level
         logger.setLevel(logging.CRITICAL + 1)
-    client = _open_client(distributed, address)
+    try:
+        client = _open_client(distributed, address)
+    except LagbenchError:
+        _restore_levels(levels)
+        raise
     try:
         yield client
     except (CancelledError, distributed.comm.CommClosedError) as error:
         raise _lost_error(error) from error
     finally:
         client.close()
+    _restore_levels(levels)
+
+
+def _restore_levels(levels: Mapping[str, int]) -> None:
+    """Let loggers print again what they printed before."""
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
 

@@ -60,6 +60,8 @@ ENVIRONMENT = {
     # glibc keeps freed memory: each MiB taken from the system anew is 256 page faults.
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
     "MALLOC_TRIM_THRESHOLD_": str(64 << 20),
+    # The parent writes and reads the lines of JSON in this encoding.
+    "PYTHONIOENCODING": "utf-8",
 }
 
 UNLIMITED_START = 60.0
@@ -136,11 +138,11 @@ def available_cores() -> int:
 
 
 def worker_count(workers: int | None, *, default: int | None = None) -> int:
-    """Return how many workers to start: by default one per core.
+    """Return how many workers to start.
 
     Args:
         workers: the number that the user gave.
-        default: the number where the user gave none.
+        default: the number where the user gave none; when None one per core.
 
     Raises:
         UsageError: it is no whole number from 1.
@@ -159,7 +161,7 @@ def worker_count(workers: int | None, *, default: int | None = None) -> int:
         where="--workers",
         expected="a whole number from 1",
         got=repr(workers)[:80],
-        fix="leave it out: one per core is taken",
+        fix="leave it out: a number that suits the work is taken",
     )
 
 
@@ -198,6 +200,14 @@ def address_space_limit() -> int | None:
         return None
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     return None if soft == resource.RLIM_INFINITY else soft
+
+
+def has_time_limit() -> bool:
+    """Return whether processes end after some processor time, as by ``ulimit -t``."""
+    if not LIMITS:
+        return False
+    soft, _ = resource.getrlimit(resource.RLIMIT_CPU)
+    return soft != resource.RLIM_INFINITY
 
 
 class ChildStopped(Exception):

@@ -34,7 +34,7 @@ from lagbench.errors import (
     find_place_in_extension,
 )
 
-from .machine import worker_count
+from .machine import has_time_limit, worker_count
 
 AVAILABLE = os.name == "posix"
 """Whether workers can be started here.
@@ -44,6 +44,9 @@ They inherit a socket, which Windows cannot hand on.
 
 ATTEMPTS = 3
 """How often an item is tried when its workers die."""
+
+LONGEST_END = 1.0
+"""How long a worker may take to end once its channel is closed [s]."""
 
 Report = Callable[[int], None]
 """Function that an item calls with the units of work done since its last call."""
@@ -246,8 +249,7 @@ class Pool:
     def _bury(self, worker: _Worker, attempt: _Attempt) -> Event:
         """Forget a dead worker; queue its item again unless it was tried often."""
         self._workers.remove(worker)
-        worker.process.kill()
-        code = worker.process.wait()
+        code = _end(worker.process)
         worker.channel.close()
         next_attempt = _Attempt(attempt.item, attempt.deaths + 1)
         if next_attempt.deaths >= ATTEMPTS:
@@ -259,21 +261,56 @@ class Pool:
                 where=attempt.item.name,
                 expected="a worker that lives as long as the work",
                 got=cause,
-                fix="free memory; where the command has the option --workers, take "
-                "fewer of them",
+                fix=_advise_on_death(),
             )
         self._enqueue(next_attempt)
         return Event(item=attempt.item, kind="lost", value=worker.progress)
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """Return the exit code of a worker whose channel is closed.
+
+    A worker that does not end by itself is killed.
+    """
+    try:
+        return process.wait(timeout=LONGEST_END)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _advise_on_death() -> str:
+    """Return what a user can do whose workers die."""
+    memory = (
+        "free memory; where the command has the option --workers, take fewer of them"
+    )
+    if has_time_limit():
+        return (
+            "raise the limit of processor time: `ulimit -t unlimited`; if that was not "
+            f"the cause, {memory}"
+        )
+    return memory
 
 
 def error_to_send(error: Exception) -> LagbenchError:
     """Return an exception of an item as an error of ours, which can be sent.
 
     A full disk or a missing permission has the same message in a worker as elsewhere.
-    Errors of other packages and unexpected ones hold their traceback.
+    An error of another package names the line of that package; an unexpected one holds
+    its traceback.
     """
     if isinstance(error, LagbenchError):
         return error
+    if isinstance(error, MemoryError):
+        return WorkFailedError(
+            "there is not enough memory",
+            where="a worker process",
+            expected="room for the libraries and the data",
+            got=f"{type(error).__name__}: {str(error)[:200]}",
+            fix="free memory, or raise the limit (`ulimit -v unlimited`, or that of "
+            "the batch system); where the command has the option --workers, take "
+            "fewer of them",
+        )
     if isinstance(error, OSError) and find_place_in_extension(error) is None:
         explained = explain_system_error(error)
         if explained is not None:

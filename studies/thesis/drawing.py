@@ -233,7 +233,11 @@ def _common_limit(
 
 
 def _draw_arrows(axes: Axes, scene: Scene, limit: float) -> None:
-    """Draw the velocity at the nodes; the fastest arrow spans 2.5 node spacings."""
+    """Draw the velocity at the nodes; an arrow of the limit's speed spans 2.5 node
+    spacings.
+
+    Faster nodes have longer arrows.
+    """
     draw_walls(axes, scene.recording, scene.frame)
     fields = scene.fields
     scale = colour_scale(Panel.STREAMLINES, limit)

@@ -165,7 +165,10 @@ class Method:
 
 
 def _average_seeds(scores: Sequence[Score]) -> Score:
-    """Return the mean of the scores of several seeds, per scenario and per frame."""
+    """Return the mean of the scores of several seeds, per scenario and per frame.
+
+    A value is the mean over the seeds that have one; undefined frames are added up.
+    """
     if len(scores) == 1:
         return scores[0]
     undefined_counts = np.sum([score.undefined for score in scores], axis=0)

@@ -170,8 +170,9 @@ def forecast_errors(
         truth: the states to compare with, shape [frame, feature].
 
     Returns:
-        Errors, shape [frame], and the factor by which a state grows per frame at the
-        end of the forecast.
+        Errors, shape [frame], infinite once the forecast overflows; and the factor by
+        which a state grows per frame at the end of the forecast, NaN for a forecast of
+        one frame.
     """
     history = list(last[::-1].astype(np.float64))
     errors = np.full(len(truth), np.inf)
@@ -182,7 +183,8 @@ def forecast_errors(
     for frame, true_state in enumerate(truth):
         state = transposed @ np.concatenate([[1.0], *history])
         history = [state, *history[:-1]]
-        norms[frame] = np.linalg.norm(state)
+        with np.errstate(over="ignore", invalid="ignore"):
+            norms[frame] = np.linalg.norm(state)
         if not np.isfinite(norms[frame]) or norms[frame] > OVERFLOW:
             break
         errors[frame] = np.square(state - true_state).mean()
@@ -260,13 +262,18 @@ def beside_thesis(result: Mapping[str, Any]) -> Sheet:
             our_cell = f"{our_value:,}"
         cells.append((quantity, number(thesis_value), our_cell))
 
-    verdict = "diverges" if result["growth"] > 1.0 else "does not diverge"
+    growth = result["growth"]
+    is_divergent = growth > 1.0 or math.isinf(result["forecast_mse"])
+    verdict = "diverges" if is_divergent else "does not diverge"
+    # A forecast that overflows in its first frame has no growth.
+    if not math.isnan(growth):
+        factor = number(growth, 5)
+        verdict += f": at its end it grows by a factor of {factor} per frame"
     note = (
         f"VAR of {result['features']} dimensions on {result['split']} "
         f"{result['size']} by the thesis's protocol: all frames are concatenated, the "
         f"first 70 % are fitted, the next 15 %, {result['forecast_frames']} frames, "
-        f"are forecast. The forecast {verdict}: at its end it grows by a factor of "
-        f"{number(result['growth'], 5)} per frame."
+        f"are forecast. The forecast {verdict}."
     )
     table = Table("", ("", "thesis", "ours"), tuple(cells))
     return Sheet(notes=(note,), tables=(table,))

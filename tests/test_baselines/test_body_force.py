@@ -14,8 +14,10 @@ from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import mirror_batch, shift_batch
+from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.dataset_info import find_forcing, read_dataset_info
 from lagbench.baselines.neuralmpm import NeuralMPM
+from lagbench.baselines.predict import predict as predict_file
 from lagbench.baselines.train import UnseenForcingWarning, train
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
@@ -215,3 +217,33 @@ def test_the_obstacle_of_a_data_set_is_found(
     cylinder = load().size("cylinder", "tiny")
     assert find_forcing(cylinder, tiny_split("cylinder").root) == {"obstacle"}
     assert find_forcing(SIZE, root) == {"body_force"}
+
+
+def test_no_image_turns_the_layers_of_a_force(root: Path, tmp_path: Path) -> None:
+    """Neither a training nor a prediction begins with all images of the square."""
+    square = "model.symmetry=square"
+    output = tmp_path / "run"
+    with pytest.raises(UsageError) as caught:
+        train("gns", SPLIT, "tiny", settings=[square], root=root, output=output)
+    assert caught.value.where == "model.symmetry"
+    assert not output.exists()
+
+    info = read_dataset_info(SPLIT, "tiny", root=root)
+    options = {"cells": 12, "width": 8, "symmetry": "mirror", "body_force": True}
+    model = NeuralMPM.build(options, info)
+    weights = tmp_path / "weights.pt"
+    checkpoint = Checkpoint(
+        baseline="neuralmpm",
+        options=model.options.model_dump(mode="json"),
+        info=info,
+        weights=model.state_dict(),
+        training={},
+    )
+    save(weights, checkpoint)
+    predictions = tmp_path / "predictions.nc"
+    average = "model.average=true"
+    with pytest.raises(UsageError) as caught:
+        predict_file(weights, predictions, root=root, settings=[square, average])
+    assert caught.value.where == "model.symmetry"
+    assert not predictions.exists()
+    predict_file(weights, predictions, root=root, settings=[average])

@@ -20,6 +20,7 @@ from simple_models import INFO, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
+from lagbench.baselines import runner
 from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find, load_all
 from lagbench.baselines.checkpoint import Checkpoint, load, save
@@ -36,6 +37,7 @@ from lagbench.baselines.predict import (
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out, round_parameters, select_window
 from lagbench.baselines.run_folder import LARGEST_LOG
+from lagbench.baselines.runner import WeightsRunner
 from lagbench.baselines.training_log import OVER
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
@@ -316,6 +318,37 @@ def test_frozen_frames_are_not_timed(
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
+
+
+def test_the_cost_of_a_rollout_that_diverges_is_that_of_the_frames_before(
+    run: Predict,
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With a second per step, a frame costs a second: frozen ones take no time."""
+    run(model={"explode_at": 4})
+    advance = Mock(side_effect=Drift.advance)
+    clock = SimpleNamespace(process_time=lambda: float(advance.call_count))
+    monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
+    monkeypatch.setattr(runner, "time", clock)
+    weights_runner = WeightsRunner(
+        tmp_path / "weights.pt", size="tiny", root=generated.root, registry=unmeasured
+    )
+    scenario_file = next(generated.folder.glob("test/*.nc"))
+    assert weights_runner.time(scenario_file, 2) == 1.0
+    assert weights_runner.time(scenario_file, 10) == 1.0
+
+
+@pytest.mark.parametrize("batch", [-1, 0])
+def test_fewer_scenarios_side_by_side_than_one_are_refused(
+    run: Predict, tmp_path: Path, batch: int
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        run(batch=batch)
+    assert caught.value.where == "--batch"
+    assert not (tmp_path / "predictions.nc").exists()
 
 
 @pytest.mark.parametrize("threads", [1, 2])

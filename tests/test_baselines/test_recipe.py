@@ -337,6 +337,17 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
         TrainingOptions(steps=1, epochs=1)
 
 
+@pytest.mark.parametrize("epochs", ["1e308", "1e30"])
+def test_more_epochs_than_any_machine_could_train_are_refused(
+    entry: CatalogueEntry, epochs: str
+) -> None:
+    """As more steps are: the number of steps would be infinite."""
+    setting = f"training.epochs={epochs}"
+    with pytest.raises(UsageError) as caught:
+        recipe_for(entry, "cavity", "tiny", settings=[setting])
+    assert "training.epochs" in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [

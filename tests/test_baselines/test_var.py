@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -411,6 +413,22 @@ def test_a_forecast_grows_by_its_eigenvalue() -> None:
     long_truth = np.zeros((600, 2), np.float32)
     errors, _ = var_protocol.forecast_errors(coefficients, last, long_truth)
     assert np.isinf(errors[-1])
+
+
+@pytest.mark.parametrize("factor", [1e152, 1e200])
+def test_a_forecast_that_overflows_at_once_diverges(factor: float) -> None:
+    """Then it has no growth from frame to frame."""
+    result: dict[str, Any] = {}
+    for field in dataclasses.fields(var_protocol.ProtocolResult):
+        result[field.name] = 1.0
+    coefficients = np.array([[0.0], [factor]])
+    last = np.ones((1, 1), np.float32)
+    truth = np.zeros((3, 1), np.float32)
+    errors, growth = var_protocol.forecast_errors(coefficients, last, truth)
+    assert np.isnan(growth)
+    result |= {"mse_at": {}, "growth": growth, "forecast_mse": float(errors.mean())}
+    (note,) = var_protocol.beside_thesis(result).notes
+    assert "The forecast diverges" in note
 
 
 def test_the_protocol_of_the_thesis_runs(

@@ -621,6 +621,31 @@ def test_each_record_of_an_entry_is_compared_with_the_score_file_of_its_seed(
     assert str(entry.score_paths[1]) in got
 
 
+def test_a_record_of_an_entry_without_seeds_is_compared_with_its_score_file(
+    own: BoardBench,
+) -> None:
+    """Also where the record states seed 0, as the name of the weights does."""
+    entry = read_entry(own.entry("noisy"))
+    assert entry.seeds == (None,)
+    size = own.registry.size("cavity", "tiny")
+    stored = read_score_file(own.folder / entry.score_paths[0]).scores
+    score = stored.scores()[stored.ranking]
+    by_scenario = zip(score.scenarios, score.values.tolist(), strict=True)
+    values = {entry.score_paths[0]: dict(by_scenario)}
+    for factor, issue_count in ((1.0, 0), (0.9, 1)):
+        line = Verification(
+            scores=tuple(file.sha256 for file in entry.score.files),
+            lagbench="0.1.0",
+            date=entry.date,
+            level=Level.REPRODUCED,
+            reproduced=(
+                reproduced(score, seed=0, sample=score.scenarios, factor=factor),
+            ),
+        )
+        issues = check_line(line, entry, size, ranking_values=values)
+        assert len(list(issues)) == issue_count
+
+
 def test_later_entries_may_supersede_the_same_predictions(own: BoardBench) -> None:
     """The same predictions under a new name, and a name of old, are well where the old
     entry steps back.

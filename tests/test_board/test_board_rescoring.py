@@ -132,6 +132,16 @@ def test_metrics_of_packages_decide_nothing(
     assert len(rescored(own, predictions).confirmed) == 1
 
 
+def test_a_damaged_file_of_a_reference_does_not_end_the_check(
+    own: BoardBench, predictions: Path
+) -> None:
+    """It is reported, and predictions are scored again all the same."""
+    (own.folder / PREDICTOR).write_bytes(b"damaged")
+    result = rescored(own, predictions)
+    assert [finding.check for finding in result.findings] == ["reference"]
+    assert len(result.confirmed) == 1
+
+
 def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
     """One of two seeds confirms its score file, not the entry."""
     path = own.predict(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -16,9 +17,11 @@ from model_board import NAME, PATH, ModelBoard
 from typer.testing import Result
 
 from lagbench.board.entry import Level
+from lagbench.board.entry_file import yaml_bytes
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import reproduce
 from lagbench.board.season import (
+    MOST_SEASON_BYTES,
     FrozenModel,
     Season,
     close,
@@ -29,6 +32,7 @@ from lagbench.board.season import (
     season_root,
 )
 from lagbench.board.season_run import SeasonResult, run_season
+from lagbench.board.season_scores import frozen_models, read_scores
 from lagbench.board.season_table import record_blind, season_rows
 from lagbench.board.verified import read_verified
 from lagbench.data.registry import load
@@ -252,6 +256,22 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
+@pytest.mark.parametrize("value", ["NaN", '"many"', "-1.0", "null"])
+def test_a_damaged_file_of_saved_scores_counts_as_none(
+    master: ModelBoard, tmp_path: Path, value: str
+) -> None:
+    """What it held is predicted again."""
+    root = tmp_path / "data"
+    shutil.copytree(master.root, root)
+    path = season_root(SEASON, root) / "scores.json"
+    text = re.sub(r'("1003 \w+": )[\d.e-]+', rf"\g<1>{value}", path.read_text())
+    assert text != path.read_text()
+    path.write_text(text)
+    result = run_again(replace(master, root=root))
+    assert result.predicted == [f"{NAME}, seed 0"]
+    assert result.exit_code == 0
+
+
 def change_options(bench: ModelBoard) -> None:
     """Let the entry state an option of its prediction."""
 
@@ -422,6 +442,89 @@ def test_a_missing_public_value_is_found(own: ModelBoard) -> None:
     assert issue.check == "season"
 
 
+def test_values_beyond_the_range_of_scores_are_found(own: ModelBoard) -> None:
+    """Their squares would be infinite in the table of the season."""
+    path = own.folder / "seasons" / SEASON / "scores.yaml"
+    huge = re.sub(r"1003: [\d.]+", "1003: 1.0e+200", path.read_text())
+    path.write_text(huge)
+    (issue,) = own.find().findings
+    assert issue.check == "season"
+
+
+@pytest.mark.parametrize("change", ["another scenario", "one scenario less"])
+def test_a_run_with_values_of_other_scenarios_differs(
+    own: ModelBoard, change: str
+) -> None:
+    path = own.folder / "seasons" / SEASON / "scores.yaml"
+    first_value = r" public: {\d+: ([\d.]+), "
+    new_value = r" public: {999: \1, "
+    if change == "one scenario less":
+        new_value = " public: {"
+    path.write_text(re.sub(first_value, new_value, path.read_text()))
+    result = run_again(own)
+    assert result.predicted == []
+    assert result.exit_code == 1
+    assert result.comparison is not None
+    assert json.dumps(result.comparison.greatest, allow_nan=False)
+
+
+def test_a_file_of_many_scores_is_read(own: ModelBoard) -> None:
+    """A season of many models and scenarios has more than a megabyte of scores."""
+    season = read_season(Folder(own.folder), SEASON)
+    (data_set,) = season.data_sets
+    (entry,) = data_set.entries
+    (model,) = entry.models
+    models = []
+    for seed in range(20):
+        models.append(model.model_copy(update={"seed": seed}))
+    entries = []
+    for number in range(20):
+        entries.append(
+            entry.model_copy(
+                update={
+                    "method": f"method-{number}",
+                    "scenarios": 200,
+                    "models": tuple(models),
+                }
+            )
+        )
+    large_set = data_set.model_copy(
+        update={"scenarios": 200, "entries": tuple(entries)}
+    )
+    large = season.model_copy(update={"data_sets": (large_set,)})
+
+    stored = read_scores(Folder(own.folder), season)
+    assert stored is not None
+    (scored,) = stored.data_sets
+    blind = dict.fromkeys(large_set.ids, 0.123456789)
+    rows = []
+    for one, frozen in frozen_models(large_set):
+        count = one.scenarios
+        rows.append(
+            scored.models[0].model_copy(
+                update={
+                    "method": one.method,
+                    "seed": frozen.seed,
+                    "public": dict.fromkeys(range(100), 0.123456789),
+                    "blind": dict(list(blind.items())[:count]),
+                }
+            )
+        )
+    large_scored = scored.model_copy(
+        update={
+            "scenarios": dict.fromkeys(large_set.ids, "0" * 64),
+            "blind_reference": blind,
+            "models": tuple(rows),
+        }
+    )
+    scores = stored.model_copy(update={"data_sets": (large_scored,)})
+    data = yaml_bytes(scores.model_dump(mode="python", exclude_none=True))
+    assert len(data) > MOST_SEASON_BYTES
+    path = own.folder / "seasons" / SEASON / "scores.yaml"
+    path.write_bytes(data)
+    assert read_scores(Folder(own.folder), large) == scores
+
+
 def test_a_removed_entry_leaves_its_season_alone(own: ModelBoard) -> None:
     """Its score files are gone, and the frozen values stay."""
     for room in ("submissions", "scores", "weights"):
@@ -478,6 +581,20 @@ def test_the_commands_say_what_is_wrong(
     early = run("season", "show", SEASON, "--board", own.folder)
     assert early.exit_code == 1
     assert f"generate --season {SEASON} --board {own.folder}" in early.stderr
+
+
+@pytest.mark.parametrize("budget", [-5.0, 0.0])
+def test_a_budget_without_time_is_refused(own: ModelBoard, budget: float) -> None:
+    with pytest.raises(UsageError) as caught:
+        close(
+            own.folder,
+            "next",
+            scenarios=4,
+            budget=budget,
+            root=own.root,
+            lagbench="0.1.0",
+        )
+    assert caught.value.where == "--budget"
 
 
 def test_a_season_under_another_name_is_refused_by_its_name(own: ModelBoard) -> None:

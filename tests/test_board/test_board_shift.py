@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,7 @@ from lagbench.models.predict_onnx import predict_onnx
 from lagbench.references.shipped import shipped
 from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.predictions import open_predictions
+from lagbench.work.progress import Progress
 
 pytestmark = pytest.mark.slow
 """Their leaderboard takes ten seconds to make."""
@@ -203,7 +205,7 @@ def drop_models(line: Content) -> None:
 
 def set_huge_value(line: Content) -> None:
     values = line["models"][0]["values"]
-    values[min(values)] = 1e200
+    values[min(values)] = 1e100
 
 
 def set_negative_value(line: Content) -> None:
@@ -281,6 +283,27 @@ def test_what_cannot_be_run_is_refused(
     entries = [failure.entry for failure in result.failures]
     assert entries == [PATH]
     assert result.exit_code == DataError.exit_code
+
+
+def test_a_manifest_without_the_hash_of_shift_is_refused_before_a_model_runs(
+    own: ModelBoard, tmp_path: Path
+) -> None:
+    """shift.yaml records this hash, and predictions may take hours."""
+    (own.folder / "shift.yaml").unlink()
+    root = tmp_path / "data"
+    shutil.copytree(own.root / SPLIT, root / SPLIT)
+    (manifest,) = root.rglob("manifest.json")
+    content = json.loads(manifest.read_text())
+    del content["subset_sha256"]["shift"]
+    manifest.write_text(json.dumps(content))
+    stages = []
+
+    def watch(progress: Progress) -> None:
+        stages.append(progress)
+
+    with pytest.raises(DataError):
+        score_on_shift(own.folder, [NAME], root=root, progress=watch)
+    assert stages == []
 
 
 def test_the_command_writes_the_file(

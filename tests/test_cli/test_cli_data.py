@@ -394,6 +394,7 @@ def test_doctor_finds_a_root_that_cannot_be_written(run: Run, tmp_path: Path) ->
     result = run("doctor", "--root", tmp_path / "file" / "data")
     assert result.exit_code == 1
     assert "broken: data folder" in result.stderr
+    assert "--root" in result.stdout
 
 
 STRANGE_FILES = ("notes.txt", "mine.png", "pictures/mine.png")

@@ -84,6 +84,31 @@ thread.join()
 """
 
 
+WITHOUT_DESCRIPTORS = """
+import os, socket, sys
+from lagbench.__main__ import app
+
+sys.argv = ["lagbench", "--version"]
+os.close(0)
+os.close(1)
+try:
+    app()
+except SystemExit:
+    pass
+one, other = socket.socketpair()
+sys.exit(int(min(one.fileno(), other.fileno()) < 3))
+"""
+
+
+def test_no_socket_takes_the_place_of_a_closed_standard_descriptor() -> None:
+    """A socket with such a number would be lost in the processes that we start."""
+    subprocess.run(
+        [sys.executable, "-c", WITHOUT_DESCRIPTORS],
+        check=True,
+        timeout=60,
+    )
+
+
 def test_the_program_runs_in_any_thread() -> None:
     """Only the main thread may set what Ctrl-C does."""
     done = subprocess.run(

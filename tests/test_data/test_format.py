@@ -592,6 +592,22 @@ def test_a_parameter_may_be_stated_after_the_frames(tmp_path: Path) -> None:
             assert file.header.parameters == both
 
 
+@pytest.mark.parametrize("name", ["viscosity", "friction"])
+def test_an_impossible_attribute_is_named_with_its_scenario(
+    tmp_path: Path, name: str
+) -> None:
+    """In plain words and a short message."""
+    path = tmp_path / "0.nc"
+    with open_writer(path, frames=4, parameters={name: "thick" * 1000}) as file:
+        for position in frames_of(3, 4, 8):
+            file.append(position, -position)
+    with read_scenario(path) as scenario, pytest.raises(DataError) as caught:
+        getattr(scenario.header, name)
+    where = f"{KEY.split} {KEY.size}, scenario {KEY.scenario}, attribute {name}"
+    assert caught.value.where == where
+    assert len(str(caught.value)) < 500
+
+
 FRAME = np.zeros((8, 2), np.float32)
 FRAME_IN_DOUBLES = FRAME.astype(np.float64)
 

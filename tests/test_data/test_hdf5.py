@@ -143,6 +143,12 @@ def nothing_stored(file: h5py.File) -> None:
     file.create_dataset("x", (3, 1 << 32, 2), "f4", chunks=(1, 1 << 20, 2))
 
 
+def several_names(file: h5py.File) -> None:
+    """Name a group twice: its arrays would be counted twice."""
+    file["a/x"] = np.zeros(3)
+    file["b"] = file["a"]
+
+
 def crowd(file: h5py.File) -> None:
     """Add more than a thousand groups."""
     for number in range(1100):
@@ -165,6 +171,7 @@ def crowd(file: h5py.File) -> None:
         chunk_bomb,
         inflated,
         nothing_stored,
+        several_names,
         crowd,
     ],
 )

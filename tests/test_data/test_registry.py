@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -282,6 +282,27 @@ def test_a_registry_of_ones_own(
     refused(path, ("format",), lambda: load(path))
 
 
+def test_a_path_that_means_another_file_is_read_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a change of the working folder, also where both files are equally old."""
+    split_counts = []
+    for folder, left_out in (("first", ["fluid"]), ("second", ["fluid", "cavity"])):
+        place = tmp_path / folder
+        place.mkdir()
+        path = edited(place, lambda splits, names=left_out: drop(splits, names))
+        os.utime(path, ns=(10**18, 10**18))
+        monkeypatch.chdir(place)
+        split_counts.append(len(load(Path(path.name)).splits))
+    assert split_counts[0] == split_counts[1] + 1
+
+
+def drop(splits: dict[str, Any], names: Sequence[str]) -> None:
+    """Take splits away."""
+    for name in names:
+        del splits[name]
+
+
 def renamed(split: str, old: str, new: str) -> Change:
     """Return a change of a parameter's name, wherever it stands."""
 
@@ -328,6 +349,8 @@ def lead_out(splits: dict[str, Any]) -> None:
         (cavity("subsets", test="54-x"), ("subsets.test", "no id and no range")),
         (cavity("subsets", tset="90"), ("cavity", "did you mean 'test'?")),
         (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
+        (cavity("subsets", test=None), ("cavity", "no subset 'test'")),
+        (within("cavity", sizes={}), ("cavity.sizes",)),
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
         (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
         (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),

@@ -108,7 +108,22 @@ def test_numbers_are_those_of_yaml_1_2(
 
 @pytest.mark.parametrize(
     "text",
-    ["12e45678", "1e3", "0x10", "0o17", ".5", "59:59:1.5", "true", "-", "a: b", "é"],
+    [
+        "12e45678",
+        "1e3",
+        "0x10",
+        "0o17",
+        ".5",
+        "59:59:1.5",
+        "true",
+        "-",
+        "a: b",
+        "é",
+        "a\nb",
+        "a\x85b",
+        "a\u2028b\u2029",
+        "\ufeffa",
+    ],
 )
 def test_text_stays_text(text: str, tmp_path: Path) -> None:
     """Hashes that look like numbers among them: what is written is read as the same

@@ -1001,7 +1001,11 @@ def test_what_is_no_trajectory_leaves_nothing(
         ),
         (
             {"radius": -1.0},
-            "not a number above 0",
+            "where: --radius",
+        ),
+        (
+            {"frame_interval": 1e-12},
+            "where: --frame-interval",
         ),
         (
             {"horizon": 7},

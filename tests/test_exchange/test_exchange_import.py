@@ -149,6 +149,19 @@ def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
         assert data.attrs["material_property"] == 0.3
 
 
+def test_arrays_in_the_order_of_fortran_are_read(tmp_path: Path) -> None:
+    """Of numbers and of objects: NumPy lists objects in the order of C all the same."""
+    runs = straight_runs(3)
+    source = write_gns(tmp_path / "in", runs)
+    joint = np.empty((2, 2), dtype=object, order="F")
+    for row, run in enumerate(runs[:2]):
+        joint[row, 0] = np.asfortranarray(run)
+        joint[row, 1] = np.full(40, 6)
+    np.savez(source / "train.npz", gns_data=joint)
+    own_split = import_split(source, format="gns-npz", output=tmp_path / "own")
+    assert_array_equal(positions(own_split.folder), np.stack(runs[:2]))
+
+
 def test_kinds_without_a_material(tmp_path: Path) -> None:
     """Walls are refused until the user says what they are; padding is left out by
     itself.

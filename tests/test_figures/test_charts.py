@@ -171,10 +171,12 @@ def test_wide_ranges_are_logarithmic(values: list[float], is_logarithmic: bool) 
         [math.nan],
         [0.0],
         [math.inf, 1e301],
+        [0.0, 5e-324],
+        [-5e-324, 1e-323],
     ],
 )
 def test_series_without_numbers_have_an_axis(values: list[float]) -> None:
-    """Values that are not finite or too large are left out."""
+    """Values that are not finite or too large are left out; the tiniest stand at 0."""
     axis = spanning([values])
     assert axis.high > axis.low
 

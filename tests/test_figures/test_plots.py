@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -20,7 +21,12 @@ from PIL import Image
 from rotating_disc import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 
 from lagbench import errors
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DataError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.exchange import adopt
 from lagbench.figures.canvas import (
     build_palette,
@@ -46,6 +52,7 @@ from lagbench.figures.panels import (
     median_limit,
     strongest_limit,
 )
+from lagbench.figures.pictures import animate, plot
 from lagbench.figures.plot import KINDS, contact_sheet, describe, plot_frame
 from lagbench.figures.recording import open_recording
 from lagbench.store.dataset import open_split
@@ -181,6 +188,43 @@ def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) 
         for source in (of_split, data):
             picture = plot_frame(source, 3, tmp_path / "data.png", kind="vorticity")
             assert picture.read_bytes() == expected
+
+
+@pytest.mark.parametrize("material", [-1, 77])
+def test_a_material_that_is_none_is_refused(tmp_path: Path, material: int) -> None:
+    """In a file and in a data set."""
+    file = write_swirl(tmp_path)
+    with h5py.File(file, "r+") as opened:
+        opened["material"][0] = material
+    with pytest.raises(DataError) as caught:
+        plot_frame(file, 0, tmp_path / "x.png")
+    assert str(file) in str(caught.value.where)
+    with xr.open_dataset(file) as data, pytest.raises(DataError):
+        plot_frame(data, 0, tmp_path / "x.png")
+
+
+def test_a_damaged_file_of_a_named_split_is_damage_of_the_data_set(
+    tmp_path: Path,
+) -> None:
+    """However the split is named; only a file that is named itself is unreadable."""
+    runs = tmp_path / "runs.npy"
+    np.save(runs, np.stack(straight_runs(3)))
+    adopted = adopt(
+        runs,
+        output=tmp_path / "mine",
+        radius=0.1,
+        frame_interval=0.25,
+    )
+    file = adopted.folder / "full/v1/test/0002.nc"
+    file.write_bytes(file.read_bytes()[:2000])
+    picture = tmp_path / "x.png"
+    for source, root in ((adopted.folder, None), ("mine", tmp_path)):
+        with pytest.raises(DataError):
+            plot(source, root=root, output=picture)
+    with pytest.raises(DataError):
+        animate(adopted.folder, output=tmp_path / "x.gif", quiet=True)
+    with pytest.raises(UnreadableFileError):
+        plot(file, output=picture)
 
 
 @pytest.mark.parametrize("frame", [0, 3])

@@ -375,3 +375,21 @@ def test_states_outside_the_bounds_are_refused() -> None:
         with pytest.raises(UsageError) as caught:
             loaded(constants, [moving])
         assert str(caught.value.where).startswith("scenario 0, wall_velocity")
+
+
+@pytest.mark.parametrize(
+    "walls",
+    [
+        np.zeros((3, 2)),
+        np.zeros(0),
+        np.zeros((0, 4, 2)),
+        np.zeros((4, 2)).tolist(),
+        np.full((4, 2), "slow"),
+    ],
+)
+def test_walls_that_are_no_program_are_refused(walls: Any) -> None:
+    """The velocities of walls are an array with finite rows."""
+    state = dataclasses.replace(scenario(NO_SLIP, seed=9), wall_velocity=walls)
+    with pytest.raises(UsageError) as caught:
+        loaded(NO_SLIP, [state])
+    assert "wall_velocity" in str(caught.value.where)

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from turns import of_this_turn
 
 from lagbench.data.registry import Size, load
+from lagbench.errors import WorkFailedError
 from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.constants import free_surface_walls, solver_constants
 from lagbench.generators.constitutive import lame
@@ -689,3 +690,33 @@ def test_dam_break_in_three_dimensions_follows_the_experiment() -> None:
     result = dam_break.run("mini", "fluid-3d")
     assert result.deviation <= 0.05
     assert (np.diff(result.front) > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "name", "length"),
+    [
+        (0, "ball_radius", 0.6),
+        (1, "block_side", 1.2),
+        (2, "column_width", 0.8),
+        (2, "column_height", 0.8),
+        (3, "pool_depth", 0.8),
+        (3, "pool_depth", 0.7),
+        (3, "drop_radius", 0.4),
+    ],
+)
+def test_a_body_of_liquid_without_room_is_refused(
+    scenario: int, name: str, length: float
+) -> None:
+    """It would be drawn across a wall, and its particles squeezed onto the wall.
+
+    The room between the walls is 0.75 wide. Above a pool of depth 0.7 no drop fits.
+    """
+    size = load().size("fluid-3d", "tiny")
+    parameters = dict(size.parameters)
+    for end in ("min", "max"):
+        key = f"{name}_{end}"
+        parameters[key] = parameters[key].model_copy(update={"value": length})
+    own_size = size.model_copy(update={"parameters": parameters})
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(own_size, scenario)
+    assert f"scenario {scenario}" in str(caught.value.where)

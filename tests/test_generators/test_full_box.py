@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,3 +56,45 @@ def test_walls_that_cannot_move_are_refused(wall: int) -> None:
     with pytest.raises(UsageError) as caught:
         solver.load([state])
     assert "wall_velocity" in str(caught.value.where)
+
+
+LATE_NAN = np.zeros((4, 2, 3))
+LATE_NAN[3, 1, 0] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("name", "program"),
+    [
+        ("wall_velocity", np.zeros(0)),
+        ("wall_velocity", np.zeros((0, 6, 3))),
+        ("wall_velocity", np.zeros((6, 2))),
+        ("wall_velocity", np.zeros((6, 3)).tolist()),
+        ("wall_velocity", np.full((6, 3), "slow")),
+        ("body_force", None),
+        ("body_force", np.zeros((0, 2, 3))),
+        ("body_force", np.zeros((2, 3))),
+        ("body_force", np.zeros((4, 2, 3)).tolist()),
+        ("body_force", LATE_NAN),
+    ],
+)
+def test_a_program_that_is_none_is_refused(name: str, program: object) -> None:
+    """A program of walls or forces is an array with finite rows."""
+    state = dataclasses.replace(mixed_state(), **{name: program})  # type: ignore[arg-type]
+    solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
+    with pytest.raises(UsageError) as caught:
+        solver.load([state])
+    assert name in str(caught.value.where)
+    solver.close()
+
+
+def test_positions_may_be_lists() -> None:
+    """As velocities may."""
+    state = mixed_state()
+    position: Any = state.position.tolist()
+    as_list = dataclasses.replace(state, position=position)
+    solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
+    solver.load([as_list])
+    positions = solver.position()[0]
+    solver.load([state])
+    np.testing.assert_array_equal(positions, solver.position()[0])
+    solver.close()

@@ -136,6 +136,8 @@ def test_the_fringe_damps_the_wake_and_keeps_the_stream() -> None:
         ({"obstacle": None}, "obstacle"),
         ({"stream": None}, "stream"),
         ({"stream": np.zeros(3)}, "stream"),
+        ({"stream": [SPEED, 0.0, 0.0]}, "stream"),
+        ({"stream": np.array(["fast", "slow"])}, "stream"),
     ],
 )
 def test_what_does_not_fit_the_solver_is_refused(

@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from lagbench.data import registry
 from lagbench.errors import WorkFailedError
 from lagbench.generators import fluid, multimaterial
+from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.split import InitialState, Material
 
 SPLITS = ("fluid", "multimaterial")
@@ -335,3 +336,18 @@ def test_multimaterial_gives_up_when_there_is_no_room() -> None:
     size = changed(tiny, area_min=0.45, area_max=0.45)
     with pytest.raises(WorkFailedError):
         draw(size, 5)
+
+
+def test_a_column_that_is_higher_than_its_box_is_refused() -> None:
+    """Its particles would be squeezed onto the top wall."""
+    size = registry.load().size("fluid", "mini")
+    parameters = dict(size.parameters)
+    for name, value in (("column_aspect", 10.0), ("area", 0.15)):
+        for end in ("min", "max"):
+            key = f"{name}_{end}"
+            parameters[key] = parameters[key].model_copy(update={"value": value})
+    own_size = size.model_copy(update={"parameters": parameters})
+    column = sorted(own_size.subsets["shift"])[1]
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(own_size, column)
+    assert f"scenario {column}" in str(caught.value.where)

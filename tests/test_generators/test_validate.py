@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -420,3 +421,20 @@ def test_validate_refuses_bad_options(
     assert "Traceback" not in told.err
     assert told.out == ""
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("case", list(Case))
+@pytest.mark.parametrize("grid", [33, 40, 48, 56])
+def test_a_bound_that_a_refusal_states_is_accepted(case: Case, grid: int) -> None:
+    """Bounds are rounded to the side that is allowed."""
+    options: dict[str, Any] = {"substeps": 1, "grid": grid, "reynolds": 1000.0}
+    wrong_settings = {"reynolds": 0.1, "dt": 1.0}
+    if case is Case.CAVITY:
+        wrong_settings["lid_speed"] = 10.0
+    for name, value in wrong_settings.items():
+        with pytest.raises(UsageError) as caught:
+            plan(case, **options | {name: value})
+        expected = str(caught.value.expected)
+        bound = re.search(r"(?:at least|at most) ([^ ]+)", expected)
+        assert bound is not None
+        plan(case, **options | {name: float(bound[1])})

@@ -113,6 +113,18 @@ def test_a_disk_too_small_is_refused_at_once(
     assert files(small_disk) == []
 
 
+@pytest.mark.parametrize("target", ["nothing", "link"])
+def test_a_root_that_is_a_link_to_nowhere_is_refused_in_a_dry_run(
+    target: str, tmp_path: Path
+) -> None:
+    """Also a link to itself: no folder can be made in its place."""
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / target)
+    with pytest.raises(WorkFailedError) as caught:
+        generate(SPLIT, SIZE, root=link, dry_run=True)
+    assert "link" in str(caught.value.got)
+
+
 @pytest.mark.slow
 def test_a_disk_that_fills_up_leaves_whole_files_only(
     small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch

@@ -604,6 +604,24 @@ def test_an_error_in_any_function_of_a_metric_names_the_metric(
     assert "enstrophy_error" in place
 
 
+@pytest.mark.parametrize(
+    ("what", "function"),
+    [
+        ("series", lambda values: values[:1]),
+        ("series", lambda values: None),
+        ("over_frames", lambda values: None),
+        ("over_frames", lambda values: values),
+    ],
+)
+def test_a_metric_of_another_shape_is_refused(what: str, function: Any) -> None:
+    """A series has a value per frame, and a scenario one number."""
+    bad: Any = replace(OTHERS, **{what: function})
+    pieces = tally(pairs(), [bad], CONFIG.predicted_frames)
+    with pytest.raises(WorkFailedError) as caught:
+        aggregate([bad], {0: pieces, 1: pieces})
+    assert "enstrophy_error" in str(caught.value.where)
+
+
 @pytest.mark.parametrize("what", ["statistic", "defined"])
 def test_what_a_metric_raises_keeps_what_it_came_from(what: str) -> None:
     """The error itself goes on, with metric and frame; a package's author sees the

@@ -285,6 +285,40 @@ def test_an_exported_step_sees_the_viscosity(
     assert_allclose(position, expected, rtol=0, atol=1e-5)
 
 
+def test_an_export_leaves_all_else_as_it_was(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """A network that trains goes on training, and no other file is touched. The folder
+    is made.
+    """
+    net = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Dropout(0.5))
+    net[0].eval()
+    folder = tmp_path / "new"
+
+    def step(window: Batch) -> torch.Tensor:
+        before, now = window.position.unbind(1)
+        motion: torch.Tensor = 1e-4 * net(now - before)
+        return now + motion
+
+    def write_model() -> Path:
+        return export_onnx(
+            step,
+            folder / "model.onnx",
+            split=SIZE.split,
+            size=SIZE.name,
+            modules=[net],
+            history=2,
+            root=generated.root,
+        )
+
+    write_model()
+    assert [part.training for part in net.modules()] == [True, False, True]
+    another_export = folder / ".model.exporting.onnx"
+    another_export.write_text("of another process")
+    write_model()
+    assert sorted(os.listdir(folder)) == [another_export.name, "model.onnx"]
+
+
 def test_an_exported_file_states_its_data_set(
     tmp_path: Path, generated: GenerationResult
 ) -> None:

@@ -50,6 +50,18 @@ def test_weights_and_recipe_come_back(sound: Path, generated: GenerationResult) 
     assert examine(str(sound)) == {"refused": None, "fix": None}
 
 
+def test_an_export_touches_no_other_file(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Another process may export to the same file. The folder is made."""
+    folder = tmp_path / "new"
+    path = sound_file(folder / "model.safetensors", generated)
+    another_export = folder / ".model.exporting.safetensors"
+    another_export.write_text("of another process")
+    sound_file(path, generated)
+    assert {another_export, path} == {*folder.iterdir()}
+
+
 @pytest.mark.parametrize("spoil", HOSTILE, ids=lambda spoil: spoil.__name__)
 def test_a_hostile_file_is_refused(spoil: Callable[[Path], None], sound: Path) -> None:
     """With a reason, and soon.

@@ -642,6 +642,28 @@ def test_rollouts_that_take_turns_compile_each_solver_once(
 
 
 @pytest.mark.slow
+def test_a_particle_without_its_material_on_the_coarse_grid_follows_another() -> None:
+    """One crumb of a material may be in no group that carries mass."""
+    size = load().size("multimaterial", "mini")
+    coarse = coarser(size, 2)
+    assert coarse is not None
+    block = lattice(40) / 120 + np.array([0.3, 0.5])
+    material = np.zeros(len(block), np.int8)
+    for crumb in range(10):
+        material[:] = 0
+        material[crumb] = 1
+        carriers = spread_subset(block, material, coarse.particles)
+        if crumb not in carriers:
+            break
+    assert crumb not in carriers
+    frames = np.stack([block, block])
+    area = (40 / 120) ** 2
+    scenario = given("multimaterial", frames, size="mini", area=area, material=material)
+    position = next(predict_with(scenario, coarse))
+    assert np.isfinite(position).all()
+
+
+@pytest.mark.slow
 def test_the_coarse_solver_moves_all_particles() -> None:
     """A block in flight keeps its parabola on the coarser grid."""
     size = load().size("fluid", "mini")

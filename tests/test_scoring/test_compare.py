@@ -23,6 +23,7 @@ from lagbench.figures.tables import Table
 from lagbench.metrics import differ
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.compare import compare
+from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.tables import (
     card_tables,
     comparison_lines,
@@ -218,6 +219,20 @@ def test_a_folder_of_two_methods_is_refused(tmp_path: Path) -> None:
     mixed = publish_seeds(tmp_path / "mixed", [ONES], "a")
     publish(mixed, ONES, method="b")
     assert_refused_on_either_side(mixed, other)
+
+
+def test_seeds_of_other_scenarios_are_refused(tmp_path: Path) -> None:
+    """A mean over seeds pairs them by scenario: of two subsets there is none."""
+    other = publish(tmp_path, TWOS, method="other")
+    ids = {"task": {"scenarios": list(range(100, 106))}}
+    rows = (ONES, ONES[:4], ONES)
+    for name, number, changes in (("fewer", 1, {}), ("others", 2, ids)):
+        seeds = publish_seeds(tmp_path / name, [ONES], "a")
+        path = publish(
+            seeds, rows[number], method="a", **({"predictions_sha256": "b"} | changes)
+        )
+        assert_refused_on_either_side(seeds, other)
+        assert path.exists()
 
 
 def test_the_table_of_means_counts_undefined_frames(tmp_path: Path) -> None:
@@ -783,6 +798,8 @@ MALFORMED: dict[str, dict[str, Any]] = {
     "infinitely many undefined frames": undefined_frames(*[INFINITE] * 6),
     "undefined frames of one scenario": undefined_frames(0),
     "ids that occur twice": scenario_ids(*[28] * 6),
+    "ids that descend": scenario_ids(5, 4, 3, 2, 1, 0),
+    "no scenarios": {"task": {"scenarios": []}, "rows": rows_of([])},
     "an id that is no integer": scenario_ids(0, 1, 2, 3, 4, 5.5),
     "an id that is text": scenario_ids("a"),
     "fewer ids than values": scenario_ids(3),
@@ -924,6 +941,23 @@ def test_lines_below_the_tables_state_flags_and_undefined_frames(
     assert re.search("^flag copy_suspect: raised", text, re.MULTILINE)
     assert "2 scenarios: no p-value" in text
     assert "vorticity_pearson 20" in text
+
+
+def test_lines_count_the_undefined_frames_of_every_metric_shown(
+    half_right_card: ScoreCard,
+) -> None:
+    """Each mark of the whole table has its number in the line that explains marks."""
+    name = "vorticity_mae"
+    assert name not in half_right_card.chosen_metrics
+    score = replace(half_right_card.submission[name], undefined=(3, 0))
+    submission = {**half_right_card.submission, name: score}
+    card = replace(half_right_card, scores={SUBMISSION: submission}, skill=None)
+    whole, *_ = card_tables(card, every=True)
+    marked_names = {row_name(row) for row in whole.rows if row[1].endswith("†")}
+    assert name in marked_names
+    (line,) = [line for line in flag_lines(card, every=True) if line.startswith("†")]
+    _, _, counts = line.partition(": ")
+    assert {count.split()[0] for count in counts.split(", ")} == marked_names
 
 
 def test_wide_tables_come_in_blocks() -> None:

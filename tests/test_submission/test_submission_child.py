@@ -156,6 +156,16 @@ def test_one_process_answers_all_calls() -> None:
         assert child.call("process", None) == child.call("process", None)
 
 
+@pytest.mark.usefixtures("jobs")
+def test_the_encoding_of_the_user_does_not_reach_the_child(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Requests and answers are UTF-8, whatever the user's terminal shows."""
+    monkeypatch.setenv("PYTHONIOENCODING", "utf-16")
+    with LimitedChild("jobs", seconds=SECONDS, wall=WALL) as child:
+        assert child.call("behave", ["äöü"]) == ["äöü"]
+
+
 def test_a_stopped_child_is_an_issue(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

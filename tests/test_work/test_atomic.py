@@ -82,6 +82,8 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
         (errno.EROFS, "can be written to"),
         (errno.ENOENT, "can be written to"),
         (errno.EIO, "can be written to"),
+        (errno.EFBIG, "ulimit -f"),
+        (errno.EMFILE, "ulimit -n"),
     ],
 )
 def test_a_full_disk_and_a_vanished_one_have_their_own_advice(
@@ -95,6 +97,20 @@ def test_a_full_disk_and_a_vanished_one_have_their_own_advice(
     assert hint in caught.value.fix
     assert "--output" in caught.value.fix
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_may_have_the_longest_name(tmp_path: Path) -> None:
+    """The temporary name is no longer than the system allows. Two long names that begin
+    alike do not meet.
+    """
+    first = tmp_path / ("a" * 252 + ".nc")
+    second = tmp_path / ("a" * 251 + "b.nc")
+    with atomic_path(first) as one, atomic_path(second) as two:
+        one.write_text("one")
+        two.write_text("two")
+    assert first.read_text() == "one"
+    assert second.read_text() == "two"
+    assert set(tmp_path.iterdir()) == {first, second}
 
 
 def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ or not.
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -24,11 +25,12 @@ from parallel_jobs import (
 from score_bench import ScoreBench, bench_of, straight
 
 from lagbench.data.registry import Registry
-from lagbench.errors import WorkFailedError
+from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
 from lagbench.scoring.scenario import ScenarioJob, ScenarioScores
 from lagbench.work import run
+from lagbench.work.cluster import LOGGERS, Cluster
 from lagbench.work.pool import Report
 
 distributed = pytest.importorskip(
@@ -47,6 +49,15 @@ def cluster() -> Iterator[Any]:
 def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
     """Tiny curl noise."""
     return bench_of(generated, unmeasured)
+
+
+def test_an_address_that_cannot_be_one_silences_no_logs() -> None:
+    """A program that uses Dask itself goes on logging."""
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    levels = [logger.level for logger in loggers]
+    with pytest.raises(UsageError), Cluster("nonsense"):
+        pass
+    assert [logger.level for logger in loggers] == levels
 
 
 LOSER = """

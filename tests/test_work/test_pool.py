@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import signal
@@ -21,7 +22,7 @@ from cluster_bench import gone
 from lagbench.data.registry import PluginWarning
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.work.machine import available_cores, worker_count
-from lagbench.work.pool import ATTEMPTS, Pool, WorkItem
+from lagbench.work.pool import ATTEMPTS, Pool, WorkItem, error_to_send
 
 HERE = str(Path(__file__).parents[1])
 
@@ -200,6 +201,61 @@ def test_an_error_of_the_system_is_explained_as_elsewhere() -> None:
     assert error.what == "no permission"
     assert error.where == "a file"
     assert error.exit_code == 5
+
+
+def test_a_worker_without_memory_is_no_fault_of_lagbench() -> None:
+    """The message says how to get memory, and no traceback stands in it."""
+    error = error_to_send(MemoryError("Unable to allocate 5.00 GiB"))
+    assert type(error) is WorkFailedError
+    assert "5.00 GiB" in str(error.got)
+    assert "--workers" in str(error.fix)
+
+
+@pytest.mark.parametrize(
+    ("code", "fix"),
+    [
+        (errno.EMFILE, "ulimit -n"),
+        (errno.EAGAIN, "ulimit -u"),
+        (errno.EFBIG, "ulimit -f"),
+    ],
+)
+def test_a_limit_of_the_system_is_no_fault_of_lagbench(code: int, fix: str) -> None:
+    error = error_to_send(OSError(code, os.strerror(code)))
+    assert type(error) is WorkFailedError
+    assert fix in str(error.fix)
+
+
+def test_a_locked_file_is_no_limit_of_processes() -> None:
+    """HDF5 gives a file that is locked the number of a limit of processes."""
+    text = "unable to lock file, errno = 11"
+    error = error_to_send(BlockingIOError(errno.EAGAIN, text))
+    assert "ulimit" not in str(error)
+
+
+def test_a_worker_beyond_its_processor_time_names_the_limit() -> None:
+    """The worker inherits the limit, which the system enforces with a signal."""
+    program = f"""
+import sys
+sys.path.insert(0, {HERE!r})
+import pool_tasks
+from lagbench.errors import WorkFailedError
+from lagbench.work.pool import Pool, WorkItem
+
+with Pool(1) as pool:
+    pool.submit(WorkItem(name="a", function=pool_tasks.die))
+    try:
+        list(pool.events())
+    except WorkFailedError as error:
+        print(error)
+"""
+    done = subprocess.run(
+        ["sh", "-c", 'ulimit -t 100; exec "$0" -c "$1"', sys.executable, program],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    assert "ulimit -t" in done.stdout
 
 
 def test_errors_of_the_system_that_nobody_explains_bring_their_traceback(

@@ -229,7 +229,9 @@ def wrong_walls(path: Path, rng: np.random.Generator) -> None:
 
 
 def other_number(path: Path, rng: np.random.Generator) -> None:
-    """Have one particle, none, or as many as no box holds; or one frame or two."""
+    """Have one particle, none, or as many as no box holds; or one frame or two; or the
+    axes in another order.
+    """
     kind = int(rng.integers(6))
 
     def change(arrays: Arrays) -> None:
