@@ -21,7 +21,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import torch
@@ -51,7 +51,7 @@ class Symmetry(enum.StrEnum):
 
 
 def check_symmetry(
-    symmetry: object, size: Size, *, forcing: Collection[str] = ()
+    symmetry: object, size: Size, *, find_forcing: Callable[[], Collection[str]]
 ) -> None:
     """Refuse all images of the square where some of them are no motion of the split.
 
@@ -61,7 +61,8 @@ def check_symmetry(
     Args:
         symmetry: the images that are asked for.
         size: the data set.
-        forcing: what drives the flow, by the names in batches.
+        find_forcing: returns what drives the flow, by the names in batches. It reads
+            the data, so it is called only where the answer counts.
 
     Raises:
         UsageError: all images of the square are asked for where gravity or a force on
@@ -77,7 +78,18 @@ def check_symmetry(
             got=str(symmetry),
             fix="set model.symmetry=mirror",
         )
-    if "body_force" in forcing:
+    gravity = size.parameters.get("gravity")
+    if gravity and gravity.value:
+        raise UsageError(
+            f"gravity in {size.split} points down; in a rotated image of the square "
+            f"the particles would fall sideways or up",
+            where="model.symmetry",
+            expected=f"{Symmetry.NONE} or {Symmetry.MIRROR} where gravity is "
+            f"{gravity.value}",
+            got=str(symmetry),
+            fix="set model.symmetry=mirror",
+        )
+    if "body_force" in find_forcing():
         raise UsageError(
             f"a force acts on layers along y in {size.split}: y cannot change places "
             "with another axis",
@@ -86,18 +98,6 @@ def check_symmetry(
             got=str(symmetry),
             fix="set model.symmetry=mirror",
         )
-    gravity = size.parameters.get("gravity")
-    if not gravity or not gravity.value:
-        return
-    raise UsageError(
-        f"gravity in {size.split} points down; in a rotated image of the square the "
-        f"particles would fall sideways or up",
-        where="model.symmetry",
-        expected=f"{Symmetry.NONE} or {Symmetry.MIRROR} where gravity is "
-        f"{gravity.value}",
-        got=str(symmetry),
-        fix="set model.symmetry=mirror",
-    )
 
 
 def mirror_matrices(symmetry: Symmetry, dimension: int = 2) -> Tensor:

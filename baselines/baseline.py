@@ -42,10 +42,7 @@ __all__ = [
 
 
 LARGEST_OPTION = 1e12
-"""Greatest whole number that an option may have: counts and steps are far below.
-
-It is the greatest number of epochs, too.
-"""
+"""Greatest number that an option of counts, steps or epochs may have."""
 
 
 class Settings(BaseModel):

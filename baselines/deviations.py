@@ -9,8 +9,8 @@ from collections.abc import Sequence
 def replace_zeros(deviations: Sequence[float]) -> tuple[float, ...]:
     """Return deviations by which numbers can be divided.
 
-    The deviation of a component that never varies is 0. The root mean square of all
-    stands in its place, and 1 where nothing varies.
+    The deviation of a component that never varies is exactly 0. The root mean square of
+    all stands in its place, and 1 where nothing varies.
     """
     if all(deviation != 0.0 for deviation in deviations):
         return tuple(deviations)

@@ -8,6 +8,7 @@ machine does not count, and it compares with that of a solver on one core.
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 import warnings
@@ -549,7 +550,11 @@ def restore_for_size(
     entry = find(checkpoint.baseline)
     options = change_options(entry, checkpoint.options, settings)
     size = registry.size(info.split, info.size)
-    check_symmetry(options.get("symmetry"), size, forcing=find_forcing(size, root))
+    check_symmetry(
+        options.get("symmetry"),
+        size,
+        find_forcing=functools.partial(find_forcing, size, root),
+    )
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:

@@ -8,6 +8,7 @@ of an uninterrupted one.
 
 from __future__ import annotations
 
+import functools
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -182,7 +183,9 @@ def train(
         learned=learned_options,
     )
     check_symmetry(
-        plan.model.get("symmetry"), tier, forcing=find_forcing(tier, root_folder)
+        plan.model.get("symmetry"),
+        tier,
+        find_forcing=functools.partial(find_forcing, tier, root_folder),
     )
     if initial is not None:
         info = initial.info

@@ -379,11 +379,14 @@ def check_program(
             if np.isfinite(program).all():
                 return
             got = "NaN or an infinite number"
-    shape = ", ".join(str(length) for length in row)
+    row_shape = ", ".join(str(length) for length in row)
+    shape = f"shape [frame, {row_shape}]"
+    if has_one_row:
+        shape = f"{shape} or [{row_shape}]"
     raise UsageError(
-        "wrong shape of a program in an initial state, or no such numbers",
+        "a program of an initial state does not fit",
         where=where,
-        expected=f"an array of finite numbers, shape [frame, {shape}]",
+        expected=f"an array of finite numbers, {shape}",
         got=got,
         fix="correct what initial_state returns: docs/extending.md",
     )

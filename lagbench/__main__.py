@@ -34,15 +34,16 @@ def app() -> None:
 def _fill_standard_descriptors() -> None:
     """Open the null device where standard input, output or error is closed.
 
-    Otherwise the next file or socket that is opened would get that number, and a
-    process that we start would put its own input or output in its place.
+    Otherwise the next file or socket that is opened would get that number, here or in a
+    process that we start.
     """
     for standard in range(3):
         try:
             os.fstat(standard)
         except OSError:
             # the system gives the lowest free number, which is this one
-            os.open(os.devnull, os.O_RDWR)
+            null = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(null, True)
 
 
 def _is_interruptible() -> bool:

@@ -360,15 +360,16 @@ def explain_system_error(error: OSError) -> LagbenchError | None:
             got=error.strerror,
             fix="free disk space",
         )
-    # HDF5 names EAGAIN, in a longer text, for a file that another process has locked.
-    is_locked = error.errno == errno.EAGAIN and "lock" in str(error)
-    if error.errno in LIMIT_FIXES and not is_locked:
+    # HDF5 and pipes use EAGAIN, with other texts, for a lock and for a full pipe.
+    code = error.errno or 0
+    is_of_processes = error.strerror == os.strerror(errno.EAGAIN)
+    if code in LIMIT_FIXES and (code != errno.EAGAIN or is_of_processes):
         return WorkFailedError(
             "a limit of the operating system is reached",
             where=os.fsdecode(error.filename or "this process"),
             expected="room for the files and processes of lagbench",
             got=error.strerror,
-            fix=LIMIT_FIXES[error.errno],
+            fix=LIMIT_FIXES[code],
         )
     return None
 

@@ -39,6 +39,9 @@ MAX_ENTRY_BYTES = 64_000
 MOST_FILE_BYTES = 40_000_000
 """Longest file of a board that is hashed [bytes]; all weights have no more."""
 
+ENTRY_FIX = "describe the method in a few lines; predictions go elsewhere"
+"""What to do about a file that is no entry."""
+
 MOST_ISSUES = 20  # issues of one file that are reported
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -65,7 +68,7 @@ def load_plain(
     path: Path,
     *,
     longest: int = MAX_ENTRY_BYTES,
-    fix: str = "describe the method in a few lines; predictions go elsewhere",
+    fix: str = "restore the file",
 ) -> Any:  # noqa: ANN401
     """Return the content of a YAML file of a leaderboard as plain values.
 
@@ -143,7 +146,7 @@ def read_entry(path: Path) -> Entry:
         UnreadableFileError: the file cannot be read.
         ChecksFailedError: it does not fit the schema.
     """
-    entry, issues = examine(Entry, load_plain(path))
+    entry, issues = examine(Entry, load_plain(path, fix=ENTRY_FIX))
     if entry is None:
         count = format_count(len(issues), "mistake")
         if len(issues) == MOST_ISSUES:
@@ -169,7 +172,7 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
     """
     description: object = {}
     if path is not None:
-        description = load_plain(path)
+        description = load_plain(path, fix=ENTRY_FIX)
     if not isinstance(description, dict):
         raise UsageError(
             "the file does not describe a method",

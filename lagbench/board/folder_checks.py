@@ -39,7 +39,7 @@ from .entry import (
     Verification,
 )
 from .entry_checks import check_diverged, check_training
-from .entry_file import examine, load_plain
+from .entry_file import ENTRY_FIX, examine, load_plain
 from .fields import latest_date
 from .folder import GATES, VERIFIED, Folder, Place, entry_path
 from .gates import read_failed_gates
@@ -138,7 +138,8 @@ class FolderChecks:
     def _check_entry(self, path: Path) -> None:
         """Check the YAML file of an entry and its score files."""
         try:
-            entry, schema_issues = examine(Entry, load_plain(self.folder.path / path))
+            content = load_plain(self.folder.path / path, fix=ENTRY_FIX)
+            entry, schema_issues = examine(Entry, content)
         except UnreadableFileError as error:
             self.issues.append(issue_from_error("readable", error, path))
             return

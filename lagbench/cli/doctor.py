@@ -118,7 +118,7 @@ def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
             where="lagbench doctor",
             expected="every part: ok",
             got=f"broken: {', '.join(broken_parts)}",
-            fix="do for each of them what its detail says",
+            fix="follow the detail of each broken part in the table",
         )
 
 

@@ -256,15 +256,9 @@ class ScenarioFile:
         if "material" not in self._variables:
             return
         for block in self.blocks("material"):
-            is_known = np.isin(block, range(len(MATERIALS)))
-            if not is_known.all():
-                raise DataError(
-                    "a particle has an unknown material",
-                    where=f"{self.path}, variable 'material'",
-                    expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
-                    got=block[~is_known][0],
-                    fix=_repair_hint(self.path),
-                )
+            require_known_material(
+                block, where=str(self.path), fix=_repair_hint(self.path)
+            )
 
     def check_attributes(self) -> None:
         """Refuse attributes that make other readers read other values."""
@@ -538,6 +532,28 @@ def _missing_error(path: Path, fix: str) -> DataError:
         got="nothing",
         fix=fix,
     )
+
+
+def require_known_material(material: NDArray[Any], *, where: str, fix: str) -> None:
+    """Refuse numbers that stand for no material.
+
+    Args:
+        material: numbers of materials.
+        where: the file or scenario that has them, for the message.
+        fix: what to do about a wrong number.
+
+    Raises:
+        DataError: there is such a number.
+    """
+    is_known = np.isin(material, range(len(MATERIALS)))
+    if not is_known.all():
+        raise DataError(
+            "a particle has an unknown material",
+            where=f"{where}, variable 'material'",
+            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
+            got=material[~is_known][0],
+            fix=fix,
+        )
 
 
 def _repair_hint(path: Path) -> str:

@@ -7,6 +7,7 @@ generation workers stay small.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import shutil
@@ -21,7 +22,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import DataError, LagbenchError, WorkFailedError
+from lagbench.errors import (
+    LIMIT_FIXES,
+    DataError,
+    LagbenchError,
+    WorkFailedError,
+)
 
 from . import MATERIALS
 from .box import AXES, WALL_NAMES, parse_periodic
@@ -413,7 +419,7 @@ def _write_errors(path: Path) -> Iterator[None]:
             where=str(path),
             expected="a place that can be written to",
             got=f"{error}; {free_bytes:,} bytes free",
-            fix="free disk space, raise the limit of the length of a file (`ulimit -f "
-            "unlimited`), or name a folder that you may write to: --root or "
-            "LAGBENCH_ROOT",
+            # HDF5 does not say which of these it was
+            fix="free disk space, or name a folder that you may write to: --root or "
+            f"LAGBENCH_ROOT; if there is space, {LIMIT_FIXES[errno.EFBIG]}",
         ) from error

@@ -6,6 +6,7 @@ there whole or not at all. One frame of one trajectory is in memory at a time.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import shutil
@@ -44,7 +45,13 @@ from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import format_yaml
-from lagbench.errors import DISK_FULL_ERRORS, DataError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DISK_FULL_ERRORS,
+    LIMIT_FIXES,
+    DataError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.metrics.coverage import Cloud, fitting_cells
 from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
@@ -336,7 +343,7 @@ def _staging_folder(folder: Path) -> Iterator[Path]:
         raise _write_error(folder, error.got) from error
     except OSError as error:
         # others come from the source, or from who watches the progress
-        is_full = error.errno in DISK_FULL_ERRORS
+        is_full = error.errno in DISK_FULL_ERRORS or error.errno == errno.EFBIG
         if not is_full and not _is_below(root, error.filename):
             raise
         raise _write_error(folder, error.strerror or error) from error
@@ -385,7 +392,8 @@ def _write_error(folder: Path, reason: object) -> WorkFailedError:
         where=str(folder),
         expected="a folder that you may write to, on a disk with space",
         got=reason,
-        fix="free disk space, or name another folder: --output",
+        fix="free disk space, or name another folder: --output; if there is space, "
+        f"{LIMIT_FIXES[errno.EFBIG]}",
     )
 
 

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import MATERIALS
 from lagbench.data import grid as gridding
 from lagbench.data.box import parse_obstacle
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
-from lagbench.data.scenario import read_scenario
-from lagbench.errors import DataError, UsageError
+from lagbench.data.scenario import read_scenario, require_known_material
+from lagbench.errors import UsageError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -159,7 +158,9 @@ class Recording:
         self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
         where = file or f"{self.size.split} {self.size.name}, scenario {self.scenario}"
         material = read("material", slice(None))[self._is_present]
-        self.material = _check_material(material, where=where)
+        fix = "state a material of lagbench for every particle"
+        require_known_material(material, where=where, fix=fix)
+        self.material = material.astype(np.int8)
         # [length/s], shape [frame, wall, axis]; zeros without walls
         dimension = self.size.dimension
         self.wall_velocity = np.zeros((frames, 2 * dimension, dimension))
@@ -277,20 +278,6 @@ class Recording:
 
     def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:
         return self._read(name, frame)[self._is_present].astype(np.float64)
-
-
-def _check_material(material: NDArray[Any], *, where: str) -> NDArray[np.int8]:
-    """Return the materials of particles; refuse numbers that stand for none."""
-    is_known = np.isin(material, range(len(MATERIALS)))
-    if not is_known.all():
-        raise DataError(
-            "a particle has an unknown material",
-            where=f"{where}, variable 'material'",
-            expected=f"whole numbers from 0 to {len(MATERIALS) - 1}",
-            got=material[~is_known][0],
-            fix="state a material of lagbench for every particle",
-        )
-    return material.astype(np.int8)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import UsageError
 
 from .frame import Floats, FramePair
 from .metric import Metric, identity, mean, mean_of_rows, root_mean_square
@@ -510,14 +510,8 @@ def _score(metric: Metric, statistics: _SeriesByStatistic) -> Score | None:
         is_measured = is_measured & statistics.measured(name)
     if metric.horizon > len(statistics.frames) or not is_measured.any():
         return None
-    try:
-        series = _series(metric, statistics)
-        values = _over_frames(metric, series)
-    except WorkFailedError:
-        raise  # it names the metric
-    except (Exception, SystemExit) as error:
-        metric.raise_named(error, "over all frames")
-
+    series = _series(metric, statistics)
+    values = _over_frames(metric, series)
     undefined = np.count_nonzero(is_measured & np.isnan(series), axis=1)
     return Score(
         metric=metric,

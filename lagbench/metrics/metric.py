@@ -298,11 +298,14 @@ class Metric:
         Raises:
             WorkFailedError: it has another shape.
         """
-        series = np.asarray(self.series(*statistics), np.float64)
+        place = "over all frames"
+        try:
+            series = np.asarray(self.series(*statistics), np.float64)
+        except (Exception, SystemExit) as error:
+            self.raise_named(error, place)
         if series.shape != statistics[0].shape:
             what = "the series of a metric has another shape"
             expected = f"one value per frame, shape {statistics[0].shape}"
-            place = "over all frames"
             raise self._failure(what, place, expected=expected, got=series.shape)
         return series
 
@@ -312,8 +315,12 @@ class Metric:
         Raises:
             WorkFailedError: it is no number.
         """
-        value: object = self.over_frames(series)
-        return self._to_number(value, "over all frames")
+        place = "over all frames"
+        try:
+            value: object = self.over_frames(series)
+        except (Exception, SystemExit) as error:
+            self.raise_named(error, place)
+        return self._to_number(value, place)
 
     def _to_number(self, value: object, place: str) -> float:
         """Return a statistic as a float; an array of one element is converted."""

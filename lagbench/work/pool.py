@@ -249,8 +249,8 @@ class Pool:
     def _bury(self, worker: _Worker, attempt: _Attempt) -> Event:
         """Forget a dead worker; queue its item again unless it was tried often."""
         self._workers.remove(worker)
-        code = _end(worker.process)
         worker.channel.close()
+        code = _end(worker.process)
         next_attempt = _Attempt(attempt.item, attempt.deaths + 1)
         if next_attempt.deaths >= ATTEMPTS:
             cause = f"exit status {code}"
@@ -261,7 +261,7 @@ class Pool:
                 where=attempt.item.name,
                 expected="a worker that lives as long as the work",
                 got=cause,
-                fix=_advise_on_death(),
+                fix=_advise_on_death(code),
             )
         self._enqueue(next_attempt)
         return Event(item=attempt.item, kind="lost", value=worker.progress)
@@ -279,16 +279,17 @@ def _end(process: subprocess.Popen[bytes]) -> int:
         return process.wait()
 
 
-def _advise_on_death() -> str:
-    """Return what a user can do whose workers die."""
+def _advise_on_death(code: int) -> str:
+    """Return what a user can do whose workers die with an exit code."""
     memory = (
         "free memory; where the command has the option --workers, take fewer of them"
     )
-    if has_time_limit():
-        return (
-            "raise the limit of processor time: `ulimit -t unlimited`; if that was not "
-            f"the cause, {memory}"
-        )
+    time = "raise the limit of processor time: `ulimit -t unlimited`"
+    if code == -signal.SIGXCPU:
+        return time
+    # beyond the hard limit the system kills, as where memory is short
+    if code == -signal.SIGKILL and has_time_limit():
+        return f"{time}; if that was not the cause, {memory}"
     return memory
 
 

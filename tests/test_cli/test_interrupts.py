@@ -85,23 +85,27 @@ thread.join()
 
 
 WITHOUT_DESCRIPTORS = """
-import os, socket, sys
+import os, socket, subprocess, sys
 from lagbench.__main__ import app
 
 sys.argv = ["lagbench", "--version"]
-os.close(0)
-os.close(1)
+for standard in range(3):
+    os.close(standard)
 try:
     app()
 except SystemExit:
     pass
 one, other = socket.socketpair()
-sys.exit(int(min(one.fileno(), other.fileno()) < 3))
+assert min(one.fileno(), other.fileno()) > 2
+program = "import os; [os.fstat(standard) for standard in range(3)]"
+subprocess.run([sys.executable, "-c", program], check=True)
 """
 
 
 def test_no_socket_takes_the_place_of_a_closed_standard_descriptor() -> None:
-    """A socket with such a number would be lost in the processes that we start."""
+    """A socket with such a number would be lost in the processes that we start. They
+    have all three descriptors too.
+    """
     subprocess.run(
         [sys.executable, "-c", WITHOUT_DESCRIPTORS],
         check=True,

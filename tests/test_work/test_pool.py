@@ -232,8 +232,8 @@ def test_a_locked_file_is_no_limit_of_processes() -> None:
     assert "ulimit" not in str(error)
 
 
-def test_a_worker_beyond_its_processor_time_names_the_limit() -> None:
-    """The worker inherits the limit, which the system enforces with a signal."""
+def test_the_death_of_a_worker_with_a_limit_of_processor_time_names_the_limit() -> None:
+    """The system may have killed the worker at the end of that time."""
     program = f"""
 import sys
 sys.path.insert(0, {HERE!r})
