@@ -8,6 +8,7 @@ import hashlib
 import os
 import secrets
 import shlex
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -63,6 +64,27 @@ def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) ->
     """Write bytes to a file that appears whole or not at all."""
     with atomic_path(target, option=option) as temporary:
         temporary.write_bytes(data)
+
+
+@contextmanager
+def checked_path(target: Path, *, option: str) -> Iterator[Path]:
+    """Yield a file of the same name in a temporary folder, to write and to check.
+
+    On a clean exit the target gets its content. An error of the check names the target
+    too: the temporary folder is gone when the user reads it.
+
+    Raises:
+        WorkFailedError: the operating system refused.
+    """
+    check_writable(target.parent, option=option)
+    with tempfile.TemporaryDirectory() as folder:
+        unchecked = Path(folder) / target.name
+        try:
+            yield unchecked
+        except LagbenchError as error:
+            error.add_note(f"which was to become {target}")
+            raise
+        write_atomically(target, unchecked.read_bytes(), option=option)
 
 
 def move_together(moves: Sequence[tuple[Path, Path]]) -> None:

@@ -70,7 +70,7 @@ def collect_shifted(board: Path, size: str) -> list[tuple[Tab, list[ShiftedRow]]
             "no method was scored on shift",
             where="--board, --size",
             expected="a size with scores on shift, such as mini",
-            got=ascii(size),
+            got=f"{board}, {size!a}",
             fix="name another size, or another board",
         )
     return chosen

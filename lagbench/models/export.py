@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
 from lagbench.arguments import check_arguments
-from lagbench.atomic import check_writable, write_atomically
+from lagbench.atomic import checked_path
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, check_installed, require
 from lagbench.tensors import Batch
@@ -117,14 +116,14 @@ def export_onnx(
         inputs["obstacle"] = window.obstacle[0]
     wrapped = _Exported(step, modules, history=history, input_names=tuple(inputs))
 
-    check_writable(target.parent, option="path")
-    with _evaluation_mode(wrapped), tempfile.TemporaryDirectory() as folder:
-        unchecked = Path(folder) / target.name
+    with (
+        _evaluation_mode(wrapped),
+        checked_path(target, option="path") as unchecked,
+    ):
         _write(wrapped, inputs, unchecked)
         _state_data_set(unchecked, data.size)
         check_onnx(unchecked)
         _require_same(wrapped, inputs, unchecked)
-        write_atomically(target, unchecked.read_bytes(), option="path")
     return target
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lagbench.arguments import check_arguments
-from lagbench.atomic import check_writable, write_atomically
+from lagbench.atomic import checked_path
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
@@ -96,10 +95,7 @@ def export_safetensors(
         },
     )
     restore(checkpoint, where=str(target))
-    check_writable(target.parent, option="path")
-    with tempfile.TemporaryDirectory() as folder:
-        unchecked = Path(folder) / target.name
+    with checked_path(target, option="path") as unchecked:
         save(unchecked, checkpoint)
         load(unchecked)
-        write_atomically(target, unchecked.read_bytes(), option="path")
     return target

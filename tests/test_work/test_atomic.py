@@ -12,6 +12,7 @@ from lagbench.atomic import (
     atomic_path,
     check_output_file,
     check_writable,
+    checked_path,
     move_together,
     remove_leftovers,
     write_atomically,
@@ -169,3 +170,15 @@ def test_a_file_of_another_kind_is_never_replaced(tmp_path: Path) -> None:
             check_output_file(path, overwrite=False, signs=signs)
     with pytest.raises(UsageError):
         check_output_file(tmp_path, overwrite=True, signs=signs)
+
+
+def test_an_error_of_a_check_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    """The file that was checked lies in a folder which is gone afterwards."""
+    target = tmp_path / "model.onnx"
+    with (
+        pytest.raises(DataError) as caught,
+        checked_path(target, option="path") as unchecked,
+    ):
+        raise DataError("damaged", where=str(unchecked))
+    assert str(target) in str(caught.value.where)
+    assert list(tmp_path.iterdir()) == []
