@@ -542,10 +542,10 @@ def test_one_bad_file_hides_nothing(
     """An unexpected error in one entry leaves the issues of the others."""
     original = folder_checks.load_plain
 
-    def failing(path: Path) -> Any:
+    def failing(path: Path, **options: Any) -> Any:
         if path.stem == "damped":
             raise OverflowError("too large")
-        return original(path)
+        return original(path, **options)
 
     monkeypatch.setattr(folder_checks, "load_plain", failing)
     own.edit("noisy", set_mean)
