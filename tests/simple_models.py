@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from lagbench.baselines import catalogue
 from lagbench.baselines.baseline import Baseline, Batch, DatasetInfo
 from lagbench.baselines.baseline import Options as Base
+from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Operator
@@ -317,6 +318,18 @@ def train(
         loss.backward()
         optimiser.step()
         falling.step()
+
+
+def save_untrained(path: Path, name: str, model: Baseline, info: DatasetInfo) -> None:
+    """Write the weights of a model that has made no step of a training."""
+    checkpoint = Checkpoint(
+        baseline=name,
+        options=model.options.model_dump(mode="json"),
+        info=info,
+        weights=model.state_dict(),
+        training={},
+    )
+    save(path, checkpoint)
 
 
 def rolled(model: Baseline, given: Batch, frames: int) -> Tensor:

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from simple_models import save_untrained
 from torch.testing import assert_close
 
 import lagbench
 from lagbench.baselines.augmentation import mirror_batch, shift_batch
-from lagbench.baselines.checkpoint import Checkpoint, save
 from lagbench.baselines.dataset_info import find_forcing, read_dataset_info
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import predict as predict_file
@@ -232,14 +232,7 @@ def test_no_image_turns_the_layers_of_a_force(root: Path, tmp_path: Path) -> Non
     options = {"cells": 12, "width": 8, "symmetry": "mirror", "body_force": True}
     model = NeuralMPM.build(options, info)
     weights = tmp_path / "weights.pt"
-    checkpoint = Checkpoint(
-        baseline="neuralmpm",
-        options=model.options.model_dump(mode="json"),
-        info=info,
-        weights=model.state_dict(),
-        training={},
-    )
-    save(weights, checkpoint)
+    save_untrained(weights, "neuralmpm", model, info)
     predictions = tmp_path / "predictions.nc"
     average = "model.average=true"
     with pytest.raises(UsageError) as caught:

@@ -16,7 +16,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import INFO, Bursting, Drift, State, install
+from simple_models import INFO, Bursting, Drift, State, install, save_untrained
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
@@ -648,14 +648,7 @@ def test_no_image_falls_sideways(
     model = NeuralMPM.build({"symmetry": "mirror"}, info)
     weights = tmp_path / "weights.pt"
     output = tmp_path / "p.nc"
-    checkpoint = Checkpoint(
-        baseline="neuralmpm",
-        options=model.options.model_dump(mode="json"),
-        info=info,
-        weights=model.state_dict(),
-        training={},
-    )
-    save(weights, checkpoint)
+    save_untrained(weights, "neuralmpm", model, info)
     with pytest.raises(UsageError) as caught:
         predict(weights, output, root=root, settings=["model.symmetry=square"])
     assert caught.value.where == "model.symmetry"

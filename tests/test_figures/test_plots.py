@@ -170,20 +170,26 @@ def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
     assert caught.value.where == "coordinate frame"
 
 
-def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) -> None:
-    """An opened split and one of its files know the split that stands beside them."""
-    runs = tmp_path / "runs.npy"
+def adopt_straight_runs(folder: Path) -> Path:
+    """Return a new local split ``mine`` in a folder; scenario 2 is its test."""
+    runs = folder / "runs.npy"
     np.save(runs, np.stack(straight_runs(3)))
     adopted = adopt(
         runs,
-        output=tmp_path / "mine",
+        output=folder / "mine",
         radius=0.1,
         frame_interval=0.25,
     )
-    file = adopted.folder / "full/v1/test/0002.nc"
+    return adopted.folder
+
+
+def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) -> None:
+    """An opened split and one of its files know the split that stands beside them."""
+    folder = adopt_straight_runs(tmp_path)
+    file = folder / "full/v1/test/0002.nc"
     from_file = plot_frame(file, 3, tmp_path / "file.png", kind="vorticity")
     expected = from_file.read_bytes()
-    with open_split(str(adopted.folder)) as split, xr.open_dataset(file) as data:
+    with open_split(str(folder)) as split, xr.open_dataset(file) as data:
         of_split = split.isel(scenario=0)
         for source in (of_split, data):
             picture = plot_frame(source, 3, tmp_path / "data.png", kind="vorticity")
@@ -207,22 +213,15 @@ def test_a_damaged_file_of_a_named_split_is_damage_of_the_data_set(
     tmp_path: Path,
 ) -> None:
     """However the split is named; only a file that is named itself is unreadable."""
-    runs = tmp_path / "runs.npy"
-    np.save(runs, np.stack(straight_runs(3)))
-    adopted = adopt(
-        runs,
-        output=tmp_path / "mine",
-        radius=0.1,
-        frame_interval=0.25,
-    )
-    file = adopted.folder / "full/v1/test/0002.nc"
+    folder = adopt_straight_runs(tmp_path)
+    file = folder / "full/v1/test/0002.nc"
     file.write_bytes(file.read_bytes()[:2000])
     picture = tmp_path / "x.png"
-    for source, root in ((adopted.folder, None), ("mine", tmp_path)):
+    for source, root in ((folder, None), ("mine", tmp_path)):
         with pytest.raises(DataError):
             plot(source, root=root, output=picture)
     with pytest.raises(DataError):
-        animate(adopted.folder, output=tmp_path / "x.gif", quiet=True)
+        animate(folder, output=tmp_path / "x.gif", quiet=True)
     with pytest.raises(UnreadableFileError):
         plot(file, output=picture)
 
