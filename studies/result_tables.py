@@ -85,10 +85,13 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             continue
         against = results.against_classical(model)
         if against is None:
-            unmatched.append(_cheaper_than_solvers(results, model))
             continue
-        verdict = verdict_of_interval(*against.interval)
-        if verdict is LearningVerdict.PAYS:
+        verdict = verdict_of_interval(
+            *against.interval, solver_costs_more=against.solver_costs_more
+        )
+        if verdict is LearningVerdict.NO_SOLVER:
+            unmatched.append(_cheaper_than_solvers(results, model))
+        elif verdict is LearningVerdict.PAYS:
             pays.append(results.where)
             time_ratios.append(time_over_simulator(results, model))
         elif verdict is LearningVerdict.DOES_NOT_PAY:
@@ -214,14 +217,13 @@ def _join(names: Sequence[str]) -> str:
 def _format_against(results: SplitResults, model: str) -> str:
     against = results.against_classical(model)
     if against is None:
-        if results.seconds_per_frame(model) is None:
-            return "-"
-        return "no solver is as cheap"
+        return "-"
     low, high = against.interval
-    return (
-        f"{number(against.value)} ({number(low)} to {number(high)}),"
-        f" {label(against.reference)}"
-    )
+    ratio = f"{number(against.value)} ({number(low)} to {number(high)})"
+    solver = label(against.reference)
+    if against.solver_costs_more:
+        solver += ", which costs more"
+    return f"{ratio}, {solver}"
 
 
 def _name_score_and_cost(results: SplitResults, name: str | None, beside: str) -> str:

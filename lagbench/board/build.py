@@ -824,7 +824,9 @@ def _classical(
 def _against_classical(
     method: ScoredMethod, references: Sequence[ReferenceScores], costs: ComparedCosts
 ) -> AgainstClassical | None:
-    """Return the score over that of the best classical solver that costs no more."""
+    """Return the score over that of the best classical solver that costs no more, or of
+    the cheapest one.
+    """
     scores = {}
     for name, reference in _classical(references, method.ranking).items():
         if name in costs.solvers:

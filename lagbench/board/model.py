@@ -121,8 +121,8 @@ class BoardRow:
     verified: Verification | None  # the maintainers scored these predictions again
     # 1 - score / score of the best naive baseline, where the score files say it
     skill: Value | None
-    # score / score of the best classical solver that costs no more per frame; None
-    # where no cost is stated, or every classical solver costs more
+    # score / score of the best classical solver that costs no more per frame, or of
+    # the cheapest one where all cost more; None where no cost is stated
     against_classical: Value | None
     solver: str | None  # name of that classical solver
     values: Mapping[str, Value]

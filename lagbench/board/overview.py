@@ -26,7 +26,9 @@ class LearningVerdict(enum.Enum):
     PAYS = enum.auto()  # the interval of the ratio lies below 1
     OPEN = enum.auto()  # it contains 1, or there is none
     DOES_NOT_PAY = enum.auto()
-    NO_SOLVER = enum.auto()  # every classical solver costs more
+    # every classical solver costs more, and the cheapest one is not clearly less
+    # accurate
+    NO_SOLVER = enum.auto()
 
 
 ANSWERS = {
@@ -261,7 +263,7 @@ class Conclusion:
         """
         if self.learned is None:
             return None
-        return _verdict_on(self.learned.against_classical)
+        return _verdict_on(self.learned)
 
 
 def judge(tab: Tab) -> Conclusion | None:
@@ -285,7 +287,7 @@ def judge(tab: Tab) -> Conclusion | None:
     return Conclusion(
         tab=tab,
         row=best,
-        verdict=_verdict_on(best.against_classical),
+        verdict=_verdict_on(best),
         better_has_no_cost=least_error < _error_of(best, tab),
         learned=learned,
     )
@@ -296,21 +298,31 @@ def _most_accurate(rows: Sequence[BoardRow], tab: Tab) -> BoardRow:
     return min(rows, key=lambda row: _error_of(row, tab))
 
 
-def _verdict_on(ratio: Value | None) -> LearningVerdict:
-    """Return the verdict of a row's ratio to a solver that costs no more per frame."""
+def _verdict_on(row: BoardRow) -> LearningVerdict:
+    """Return the verdict of a row's ratio to a classical solver."""
+    ratio = row.against_classical
     if ratio is None:
         return LearningVerdict.NO_SOLVER
-    return verdict_of_interval(ratio.low, ratio.high)
+    return verdict_of_interval(ratio.low, ratio.high, solver_costs_more=row.is_cheapest)
 
 
-def verdict_of_interval(low: float, high: float) -> LearningVerdict:
+def verdict_of_interval(
+    low: float, high: float, *, solver_costs_more: bool = False
+) -> LearningVerdict:
     """Return the verdict of the interval of a ratio; NaN where there is none.
+
+    A solver that costs more than the model can show that learning pays, but not that it
+    does not.
 
     >>> verdict_of_interval(0.8, 0.9).name, verdict_of_interval(0.8, 1.1).name
     ('PAYS', 'OPEN')
+    >>> verdict_of_interval(1.1, 1.2, solver_costs_more=True).name
+    'NO_SOLVER'
     """
     if high < 1.0:
         return LearningVerdict.PAYS
+    if solver_costs_more:
+        return LearningVerdict.NO_SOLVER
     if low > 1.0:
         return LearningVerdict.DOES_NOT_PAY
     return LearningVerdict.OPEN
@@ -339,11 +351,11 @@ def _format_ratio(ratio: Value) -> str:
 
 def is_open(ratio: Value) -> bool:
     """Tell whether the interval of a ratio contains 1, or is missing."""
-    return _verdict_on(ratio) is LearningVerdict.OPEN
+    return verdict_of_interval(ratio.low, ratio.high) is LearningVerdict.OPEN
 
 
 def format_comparison(row: BoardRow) -> str:
-    """Return the ratio to the solvers of the row's cost, as in "0.86× (0.8 to 0.9)"."""
+    """Return the ratio to a classical solver, as in "0.86× (0.8 to 0.9)"."""
     ratio = row.against_classical
     if ratio is None:
         return "no solver is as cheap"
@@ -357,10 +369,10 @@ def _compare(row: BoardRow, ratio: Value) -> str:
     interval = ""
     if not math.isnan(ratio.low + ratio.high):
         interval = f" (95\u00a0%: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
-    return (
-        f"{_format_ratio(ratio)}{interval} the error of {row.solver}, the best "
-        "classical solver that costs no more per frame"
-    )
+    solver = f"{row.solver}, the best classical solver that costs no more per frame"
+    if row.is_cheapest:
+        solver = f"{row.solver}, the cheapest classical solver, which costs more"
+    return f"{_format_ratio(ratio)}{interval} the error of {solver}"
 
 
 def conclude(tab: Tab) -> str:
@@ -372,7 +384,7 @@ def conclude(tab: Tab) -> str:
     row = conclusion.row
     model = f"{row.entry.name}, {conclusion.model}"
     ratio = row.against_classical
-    if ratio is None:
+    if ratio is None or conclusion.verdict is LearningVerdict.NO_SOLVER:
         sentences = [
             f"On {data_set} no classical solver is as cheap as {model}.",
             *_place_among_solvers(row, tab),
@@ -461,7 +473,7 @@ def _name_exception(tab: Tab) -> list[str]:
     """
     best = None
     for row in _models_of(tab):
-        if _verdict_on(row.against_classical) is not LearningVerdict.PAYS:
+        if _verdict_on(row) is not LearningVerdict.PAYS:
             continue
         if best is None or _error_of(row, tab) < _error_of(best, tab):
             best = row
@@ -534,8 +546,8 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
         win_count = learned_verdicts.count(LearningVerdict.PAYS)
         open_count = learned_verdicts.count(LearningVerdict.OPEN)
         sentences.append(
-            f"Purely learned models beat the solvers that cost no more on {win_count} "
-            f"of {len(learned_verdicts)}; on {open_count} the question is open."
+            f"With purely learned models learning pays on {win_count} of "
+            f"{len(learned_verdicts)}; on {open_count} the question is open."
         )
     return sentences
 

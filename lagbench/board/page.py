@@ -152,9 +152,9 @@ OVERVIEW_WORDS = (
 
 CELL_WORDS = (
     "A cell has the skill, the rank on this data set, and the error beside that of the "
-    "best classical solver that costs no more per frame. The last one is missing where "
-    "the cost is unknown, or every classical solver costs more. A question mark stands "
-    "where its 95 % interval contains 1. A rank such as 2–4 "
+    "best classical solver that costs no more per frame. Where all cost more, the "
+    "cheapest one takes its place. The last one is missing where the cost is unknown. A "
+    "question mark stands where its 95 % interval contains 1. A rank such as 2–4 "
     "names the places that a method takes when the test scenarios are drawn again "
     "(95 %). Ranks count entries only: classical solvers and baselines have none. "
     "Variants of a method are folded behind it, without a rank."
@@ -772,6 +772,11 @@ def _leader_tiles(
             "error of the leader beside the best classical solver that costs no more "
             "per frame"
         )
+        if leader.is_cheapest:
+            label = (
+                "error of the leader beside the cheapest classical solver, which costs "
+                "more per frame"
+            )
         yield _tile(label, ratio, leader.solver)
 
 

@@ -256,6 +256,7 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "skill": skill,
         "against_classical": against_classical,
         "classical_solver": row.solver,
+        "classical_solver_costs_more": row.is_cheapest,
         "metrics": metrics,
         **_plain_shift(row.on_shift),
     }

@@ -57,7 +57,7 @@ class ScoreCard:
     # as scored: it does not follow a replaced `scores`; None where no reference that
     # counts has a score
     skill: Skill | None
-    # None where the predictions state no cost, or every classical solver costs more
+    # None where the predictions state no cost, or no solver has a score
     against_classical: AgainstClassical | None
     flags: tuple[Flag, ...]  # hints for the reader of a score
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
@@ -318,6 +318,7 @@ def _classical_as_json(against: AgainstClassical | None) -> dict[str, Any] | Non
         return None
     return {
         "solver": against.reference,
+        "solver_costs_more": against.solver_costs_more,
         "value": digits(against.value),
         "interval": _interval_as_json(against.interval),
     }

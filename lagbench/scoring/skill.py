@@ -5,9 +5,10 @@ perfect, 0 means that nothing was learned, below 0 the method is worse than not
 learning.
 
 ``against_classical = score / score of the best classical solver that costs no more per
-frame``. Below 1 learning pays: at this cost no solver here is as accurate. It keeps the
-rule of McGreivy and Hakim (Nature Machine Intelligence 6 (2024) 1256): compare at equal
-cost or at equal accuracy, and with an efficient solver.
+frame``. Below 1 learning pays: at this cost no solver here is as accurate. Where every
+solver costs more, it is the ratio to the cheapest one. It keeps the rule of McGreivy
+and Hakim (Nature Machine Intelligence 6 (2024) 1256): compare at equal cost or at equal
+accuracy, and with an efficient solver.
 
 The best predictor has the least mean over its own scenarios (see
 :mod:`lagbench.references`); the ratio is over the scenarios that both have.
@@ -62,21 +63,27 @@ class Skill:
 @dataclass(frozen=True, kw_only=True)
 class AgainstClassical:
     """Score of a submission over that of the best classical solver that costs no more
-    per frame.
+    per frame; where every solver costs more, over that of the cheapest one.
     """
 
     metric: str  # name of the ranking metric
     reference: str  # name of the classical solver
-    value: float  # score / score of that solver; below 1 learning pays
+    # score / score of that solver; below 1 learning pays, above 1 it does not unless
+    # the solver costs more
+    value: float
     interval: tuple[float, float]  # 95 %, as that of a skill
     std: float = math.nan  # sample standard deviation over seeds; NaN for one
+    solver_costs_more: bool = False  # whether every solver does; this is the cheapest
 
     def __str__(self) -> str:
         """Return value, interval (where there is one) and solver, as in a table."""
+        solver = self.reference
+        if self.solver_costs_more:
+            solver += ", which costs more"
         low, high = self.interval
         if math.isnan(low):
-            return f"{self.value:.2f} of {self.reference}"
-        return f"{self.value:.2f} [{low:.2f}, {high:.2f}] of {self.reference}"
+            return f"{self.value:.2f} of {solver}"
+        return f"{self.value:.2f} [{low:.2f}, {high:.2f}] of {solver}"
 
 
 def best_reference(references: Mapping[str, Score]) -> str | None:
@@ -134,6 +141,9 @@ def compute_against_classical(
     """Return a method's score over that of the best classical solver that costs no more
     per frame.
 
+    Where every solver costs more, the cheapest one takes its place. So a method never
+    loses the comparison by becoming cheaper.
+
     Args:
         seeds: score of each seed, over the same scenarios.
         solvers: scores of the classical solvers, by name, in the same metric.
@@ -141,25 +151,32 @@ def compute_against_classical(
         seconds_per_frame: the same of the method, on the same machine [s].
 
     Returns:
-        None where every solver costs more, without a scenario that both have, and for
-        a metric of which less is not better.
+        None without a solver, without a scenario that both have, and for a metric of
+        which less is not better.
     """
+    if not solvers:
+        return None
     affordable = {}
     for name, score in solvers.items():
         if seconds[name] <= seconds_per_frame:
             affordable[name] = score
-    name_of_best = best_reference(affordable)
-    if name_of_best is None:
+    solver: str | None
+    if affordable:
+        solver = best_reference(affordable)
+    else:
+        solver = min(solvers, key=lambda name: seconds[name])
+    if solver is None:
         return None
-    ratio = _compute_ratio(seeds, affordable[name_of_best])
+    ratio = _compute_ratio(seeds, solvers[solver])
     if ratio is None:
         return None
     return AgainstClassical(
         metric=seeds[0].metric.name,
-        reference=name_of_best,
+        reference=solver,
         value=ratio.value,
         interval=ratio.interval,
         std=ratio.std,
+        solver_costs_more=not affordable,
     )
 
 
@@ -191,7 +208,7 @@ def compare_with_solvers(
     classical: Mapping[str, ReferenceScores],
 ) -> tuple[AgainstClassical | None, str | None]:
     """Return the submission's score over that of the best classical solver that costs
-    no more per frame.
+    no more per frame, or of the cheapest one where all cost more.
 
     Where there is no such ratio, the reason comes instead.
 
@@ -230,8 +247,6 @@ def compare_with_solvers(
     )
     if ratio is not None:
         return ratio, None
-    if min(costs.values()) > seconds:
-        return None, "every classical solver costs more per frame than the model"
     return None, "the classical solvers have no score in these scenarios"
 
 

@@ -130,7 +130,10 @@ def _over_horizon(
     if card.against_classical is not None:
         against = card.against_classical
         cell = _with_interval(against.value, against.interval)
-        rows.append((f"against {against.reference} ↓", cell, *[""] * len(references)))
+        solver = against.reference
+        if against.solver_costs_more:
+            solver += ", which costs more"
+        rows.append((f"against {solver} ↓", cell, *[""] * len(references)))
 
     for name in names:
         score = card.submission[name]

@@ -479,8 +479,10 @@ class SplitResults:
     def against_classical(self, name: str) -> AgainstClassical | None:
         """Return the score over that of the best classical solver of no greater cost.
 
+        Where all cost more, the cheapest one takes its place.
+
         Costs that we measured in one run are compared as they are, as the leaderboard
-        does. None where a cost is not known, or every classical solver costs more.
+        does. None where a cost is not known.
         """
         measured = self.methods[name].measured
         seconds = self.seconds_per_frame(name)

@@ -130,19 +130,19 @@ def test_a_metric_of_which_more_is_better_gives_no_skill() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "solver_seconds", "has_ratio"),
+    ("seconds", "solver_seconds", "solver"),
     [
-        (1e3, 1.0, True),
-        (1e-9, 1.0, False),
-        (None, 1.0, False),
-        (1.0, None, False),
+        (1e3, 1.0, "projection-2x"),
+        (1e-9, 1.0, "projection"),
+        (None, 1.0, None),
+        (1.0, None, None),
     ],
 )
-def test_a_missing_comparison_with_solvers_has_a_reason(
-    seconds: float | None, solver_seconds: float | None, has_ratio: bool
+def test_the_comparison_is_with_a_solver_of_the_cost_of_the_model(
+    seconds: float | None, solver_seconds: float | None, solver: str | None
 ) -> None:
-    """A slow model is compared; one that is faster than every solver, or states no
-    cost, is not, and the reason says which.
+    """A slow model is compared with the best solver, one that is faster than all with
+    the cheapest. Without a cost there is no ratio, and a reason.
     """
     size = load().size("cavity", "mini")
     references = shipped(size)
@@ -168,8 +168,13 @@ def test_a_missing_comparison_with_solvers_has_a_reason(
     for name in CLASSICAL.intersection(references):
         solvers[name] = references[name]
     ratio, reason = compare_with_solvers(header, size, persistence, solvers)
-    assert (ratio is not None) is has_ratio
-    assert (reason is None) is has_ratio
+    if ratio is None:
+        assert solver is None
+        assert reason is not None
+    else:
+        assert ratio.reference == solver
+        assert ratio.solver_costs_more is (solver == "projection")
+        assert reason is None
     names_solver_cost = "solver_seconds_per_frame" in str(reason)
     assert names_solver_cost is (solver_seconds is None)
 
