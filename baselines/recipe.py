@@ -244,6 +244,8 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "noise_spread": False,
         "compression": 0.0,
         "free_flight": None,
+        "relaxation": 0,
+        "densest": 1.1,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.

@@ -48,6 +48,7 @@ from .graph import (
     radius_graph,
 )
 from .network import EncodeProcessDecode
+from .relaxation import Relaxation
 from .torch_grid import TensorFields, tensor_fields, transfer
 
 
@@ -81,6 +82,8 @@ class ParticleState:
     # centre and radius of each window's obstacle [length], shape [window, axis + 1];
     # None where the model does not see it
     obstacle: Tensor | None = None
+    # largest density that relaxation leaves alone [1], shape [window]; None without it
+    density_limit: Tensor | None = None
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
@@ -323,6 +326,11 @@ class GraphNetworkOptions(Options):
     # keep particles in the box, and their velocities true to that, in training and in
     # rollouts
     clamp: bool = True
+    # iterations after each step of a rollout that move crowded particles apart; 0 for
+    # none
+    relaxation: int = Field(default=0, ge=0)
+    # largest density that they leave alone, over the mean of the last given frame
+    densest: float = Field(default=1.1, gt=1.0, allow_inf_nan=False)
 
 
 class GraphNetwork(Baseline):
@@ -383,6 +391,14 @@ class GraphNetwork(Baseline):
                 info,
                 reach=options.free_flight * self.radius,
                 unit=self.acceleration_std,
+            )
+        self.relaxation: Relaxation | None = None
+        if options.relaxation:
+            self.relaxation = Relaxation(
+                self.box,
+                radius=self.radius,
+                iterations=options.relaxation,
+                densest=options.densest,
             )
         last_layer = self.network.decoder[-1]
         for parameter in last_layer.parameters():
@@ -579,7 +595,7 @@ class GraphNetwork(Baseline):
         self.eval()
         try:
             for _ in range(frame_count):
-                state, _ = self.step(state)
+                state, _ = self.advance(state)
         finally:
             self.train(was_training)
         return state, frame_count
@@ -681,20 +697,34 @@ class GraphNetwork(Baseline):
             next_frame = min(given.frames, known_frames - 1)
             per_second = given.wall_velocity[:, next_frame:]
             walls = per_second * self.info.frame_interval
+        position = given.position[:, -1]
+        density_limit = None
+        if self.relaxation is not None:
+            density_limit = self.relaxation.limit(position, given.sample)
         return ParticleState(
-            position=given.position[:, -1],
+            position=position,
             velocity=last_velocities(given.position, self.options.velocities, self.box),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
             body_force=self.forcing.coming_force(given),
             obstacle=self.forcing.find_obstacle(given),
+            density_limit=density_limit,
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
         following, _ = self.step(state)
-        return following, following.position
+        if self.relaxation is None or following.density_limit is None:
+            return following, following.position
+        position = self.relaxation(
+            following.position, following.sample, following.density_limit
+        )
+        correction = self.box.displacement(following.position, position)
+        velocity = following.velocity.clone()
+        velocity[:, -1] += correction
+        following = replace(following, position=position, velocity=velocity)
+        return following, position
 
     def step(
         self, state: ParticleState, generator: torch.Generator | None = None
