@@ -10,9 +10,6 @@ centre and radius of the obstacle. The force is that of the way to the next fram
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -28,7 +25,6 @@ __all__ = [
     "force_at",
     "obstacle_features",
     "require_force",
-    "root_mean_square",
     "skip_frames",
 ]
 
@@ -140,15 +136,6 @@ class ForcingFeatures(nn.Module):
             features = obstacle_features(position, own_obstacle, self.reach, self.box)
             parts.append(features)
         return torch.cat(parts, dim=1)
-
-
-def root_mean_square(deviations: Sequence[float]) -> float:
-    """Return the deviation of one component, from those along each axis.
-
-    It is 1 where nothing varies: models divide by it.
-    """
-    variance = np.mean(np.square(deviations))
-    return float(np.sqrt(variance)) or 1.0
 
 
 def coming_force(given: Batch, info: DatasetInfo) -> Tensor:

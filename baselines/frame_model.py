@@ -30,8 +30,8 @@ from lagbench.tensors import TensorBox
 
 from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
-from .deviations import replace_zeros
-from .forcing import ForcingFeatures, require_force, root_mean_square, skip_frames
+from .deviations import replace_zeros, root_mean_square
+from .forcing import ForcingFeatures, require_force, skip_frames
 from .graph import MATERIALS
 
 OBSTACLE_REACH = 3.0  # how far a particle sees an obstacle's surface [radius]

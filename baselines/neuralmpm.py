@@ -38,6 +38,7 @@ from .augmentation import (
     velocity_towards_path,
 )
 from .baseline import Baseline, Batch, DatasetInfo, last_velocities
+from .deviations import root_mean_square
 from .forcing import require_force, skip_frames
 from .free_flight import FALL_UNIT
 from .neuralmpm_accelerations import (
@@ -83,8 +84,9 @@ class NeuralMPM(Baseline):
         weight_unit = radii_per_cell**info.box.dimension
         # The network reads velocities in units of their deviation [length/frame], and
         # predicts accelerations in units of theirs [length/frame^2].
-        self.velocity_std = _isotropic_std(info, "velocity_std")
-        self.acceleration_std = _isotropic_std(info, "acceleration_std")
+        # A model that is trained on mirror images must not distinguish the axes.
+        self.velocity_std = root_mean_square(info.statistics["velocity_std"])
+        self.acceleration_std = root_mean_square(info.statistics["acceleration_std"])
         self.encoder = FieldEncoder(
             self.grid,
             options,
@@ -468,16 +470,3 @@ class NeuralMPM(Baseline):
             walls=walls,
             body_force=force,
         )
-
-
-def _isotropic_std(info: DatasetInfo, name: str) -> float:
-    """Return one deviation for all axes, the root of their mean square.
-
-    A model that is trained on mirror images must not distinguish the axes. It is 1
-    where nothing varies: the model divides by it.
-    """
-    dimension = info.box.dimension
-    mean_square = 0.0
-    for std in info.statistics[name]:
-        mean_square += std**2 / dimension
-    return float(mean_square**0.5) or 1.0

@@ -41,7 +41,7 @@ SHARE = 0.5
 
 
 class Pairs(NamedTuple):
-    """Pairs of particles within the support of the kernel, both directions of each."""
+    """Pairs of particles near each other, both directions of each pair."""
 
     sender: Tensor  # int64, shape [pair]
     receiver: Tensor  # int64, shape [pair]
@@ -76,7 +76,7 @@ class Relaxation(nn.Module):
                 [particle, axis].
             sample: window of each particle, ascending, int64, shape [particle].
         """
-        pairs = self._find_pairs(position, sample)
+        pairs = self._measure(position, *self._find_neighbours(position, sample))
         density = _density(pairs, len(position))
         size = sample.bincount()
         sums = density.new_zeros(len(size)).index_add(0, sample, density)
@@ -86,14 +86,18 @@ class Relaxation(nn.Module):
     def forward(self, position: Tensor, sample: Tensor, limit: Tensor) -> Tensor:
         """Return corrected positions [length], shape [particle, axis].
 
+        Neighbours are sought once: the kernel of a particle that enters the support in
+        an iteration is nearly 0.
+
         Args:
             position: positions [length], shape [particle, axis].
             sample: window of each particle, ascending, int64, shape [particle].
             limit: largest density of each window that is left alone, shape [window].
         """
         own_limit = limit[sample]
+        sender, receiver = self._find_neighbours(position, sample)
         for _ in range(self.iterations):
-            pairs = self._find_pairs(position, sample)
+            pairs = self._measure(position, sender, receiver)
             density = _density(pairs, len(position))
             excess = (density / own_limit - 1.0).clamp(min=0.0)  # C_i
             if not excess.any():
@@ -102,10 +106,16 @@ class Relaxation(nn.Module):
             position = self.box.inside(position + self.support * movement)
         return position
 
-    def _find_pairs(self, position: Tensor, sample: Tensor) -> Pairs:
+    def _find_neighbours(
+        self, position: Tensor, sample: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return senders and receivers of pairs within the support."""
         sender, receiver = radius_graph(
             position, self.support, sample, box=self.box.box
         )
+        return sender, receiver
+
+    def _measure(self, position: Tensor, sender: Tensor, receiver: Tensor) -> Pairs:
         way = self.box.displacement(position[sender], position[receiver])
         return Pairs(sender, receiver, way / self.support)
 

@@ -39,7 +39,8 @@ from .baseline import (
     check_moving_walls,
     last_velocities,
 )
-from .forcing import ForcingFeatures, root_mean_square, skip_frames
+from .deviations import root_mean_square
+from .forcing import ForcingFeatures, skip_frames
 from .free_flight import FreeFlight
 from .graph import (
     NodeFeatures,
