@@ -11,7 +11,8 @@ average.
     python benchmarks/flag_calibration.py --size mini --root DATA [--splits
         cavity,fluid] [--trained runs/cavity/mini/gns-0/predictions.nc ...]
 
-``--trained`` adds predictions of trained models to the honest ones.
+``--trained`` adds predictions of trained models to the honest ones, on the splits and
+the size that are named.
 
 The thresholds in lagbench/scoring/flags.py lie between the extremes that this prints.
 """
@@ -19,6 +20,7 @@ The thresholds in lagbench/scoring/flags.py lie between the extremes that this p
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 from lagbench.data.grid import Grid, fields
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
+from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.metrics import FramePair, Scenario, snapshots
 from lagbench.scoring.flags import Trace, Tracer, analyse_error, judge_copying
 from lagbench.scoring.task import ScoredTask, load_scored_task
@@ -305,6 +308,44 @@ def read_tests(task: ScoredTask) -> dict[int, CalibrationScenario]:
     return tests
 
 
+def check_splits(splits: Sequence[str]) -> None:
+    """Refuse splits for which these predictions are not made.
+
+    Positions jump at periodic boundaries, and fields are those of two axes.
+
+    Raises:
+        UsageError: one of the splits has such a boundary, or three axes.
+    """
+    for split in splits:
+        if split not in SPLITS:
+            raise UsageError(
+                "no predictions are made for this split",
+                where="--splits",
+                expected=f"some of {', '.join(SPLITS)}",
+                got=repr(split),
+                fix=suggest_name(split, SPLITS),
+            )
+
+
+def check_trained(paths: Sequence[Path], splits: Sequence[str], size: str) -> None:
+    """Refuse predictions of other data sets, of which no line would be printed.
+
+    Raises:
+        UsageError: a file has another split or another size.
+    """
+    for path in paths:
+        with open_predictions(path) as predictions:
+            header = predictions.header
+        if header.split not in splits or header.size != size:
+            raise UsageError(
+                "these are predictions of another data set",
+                where=f"--trained {path}",
+                expected=f"{' or '.join(splits)}, size {size}",
+                got=f"{header.split} {header.size}",
+                fix="leave the file out, or name its data set: --splits, --size",
+            )
+
+
 def open_trained(
     paths: Sequence[Path], split: str, size: str
 ) -> Iterator[tuple[str, Predictions]]:
@@ -336,6 +377,9 @@ def main() -> int:
     parser.add_argument("--trained", type=Path, nargs="*", default=[])
     options = parser.parse_args()
     root = resolve_root(options.root)
+    splits = options.splits.split(",")
+    check_splits(splits)
+    check_trained(options.trained, splits, options.size)
     heads = ""
     for column in (*COLUMNS, "energy", "area"):
         heads += f"{column:>17s}"
@@ -345,7 +389,6 @@ def main() -> int:
     all_numbers: dict[str, list[Numbers]] = {}
     for kind in (*tables, "trained"):
         all_numbers[kind] = []
-    splits = options.splits.split(",")
     for split in splits:
         size = load().size(split, options.size)
         task = load_scored_task(size, root)
@@ -422,4 +465,8 @@ def format_ranges(numbers: Sequence[Sequence[float]]) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"flag_calibration: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -37,6 +37,7 @@ from lagbench.board.reproduce import score_positions
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
+from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.figures.tables import markdown
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
@@ -876,11 +877,12 @@ def active_frames(path: Path) -> int | None:
 
 
 def measured_frames(size: Size, every: int, active: int | None) -> tuple[int, ...]:
-    """Return the absolute frames at which clouds are compared."""
+    """Return the absolute frames at which clouds are compared, one at least."""
     first = size.task.input_frames
     count = size.task.horizon
     if active is not None:
-        count = min(active, count)
+        # Where nothing moves any more the first predicted frame counts.
+        count = min(max(1, active), count)
     end = first + count
     first_measured = first + MEASURED_EVERY - 1
     frames = range(first_measured, end, every)
@@ -1030,6 +1032,27 @@ def run(
     return result
 
 
+def check_attempts(names: Sequence[str], sizes: Sequence[Size], root: Path) -> None:
+    """Refuse names of attempts that no data set has.
+
+    Raises:
+        UsageError: there is no such attempt.
+    """
+    known: dict[str, None] = {}  # a set that keeps its order
+    for size in sizes:
+        for attempt in attempts_on(Library(size, root)):
+            known[attempt.name] = None
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                "no such attempt on these data sets",
+                where="--attempt",
+                expected="the name of an attempt",
+                got=repr(name),
+                fix=suggest_name(name, list(known)),
+            )
+
+
 def needs_run(result: Mapping[str, object] | None, *, is_scored: bool) -> bool:
     """Return whether an attempt is to be run: it is not kept, or not yet scored."""
     if result is None:
@@ -1055,13 +1078,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.output and options.output.is_file():
         kept = json.loads(options.output.read_text())
 
-    rows = []
+    sizes = []
     for split in options.split or SPLITS:
-        size = load().size(split, options.size)
+        sizes.append(load().size(split, options.size))
+    check_attempts(options.attempt or (), sizes, root)
+    rows = []
+    for size in sizes:
         library = Library(size, root)
         cases = cases_of_train(size, root)
         baseline = baseline_score(size)
-        data_set = f"{split} {size.name}"
+        data_set = f"{size.split} {size.name}"
         results = kept.setdefault(data_set, {})
         for attempt in attempts_on(library):
             if options.attempt and attempt.name not in options.attempt:
@@ -1091,6 +1117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _row(
     data_set: str, attempt: str, result: Mapping[str, object], baseline: float
 ) -> tuple[str, ...]:
+    """Return the row of an attempt; a dash stands for test where it is not scored."""
     chosen = result["chosen"]
     parameters = []
     if isinstance(chosen, dict):
@@ -1116,4 +1143,8 @@ def _row(
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"naive_attempts: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

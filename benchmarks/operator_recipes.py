@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -24,6 +25,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.machine import multiplies_bfloat16
 from lagbench.baselines.recipe import Recipe, recipe_for
+from lagbench.errors import LagbenchError
 from lagbench.torch import WindowDataset, collate
 
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
@@ -115,6 +117,7 @@ def main() -> int:
     parser.add_argument("--split", choices=SPLITS, nargs="*", default=SPLITS)
     parser.add_argument("--operator", nargs="*", default=OPERATORS)
     options = parser.parse_args()
+    entries = [find(name) for name in options.operator]
     torch.set_num_threads(1)
     print(
         "| split | operator | terms at the start | s per step | steps | minutes "
@@ -122,8 +125,7 @@ def main() -> int:
     )
     for split in options.split:
         info = read_dataset_info(split, options.size, root=options.root)
-        for name in options.operator:
-            entry = find(name)
+        for entry in entries:
             recipe = recipe_for(entry, split, options.size, variant=options.recipe)
             torch.manual_seed(0)
             model = entry.model.build(recipe.model, info)
@@ -141,12 +143,16 @@ def main() -> int:
             count = recipe.training.steps or 0
             minutes = count * cost / 60
             print(
-                f"| {split} | {name} | {', '.join(terms)} | {cost:.3f} | {count} | "
-                f"{minutes:.1f} |",
+                f"| {split} | {entry.name} | {', '.join(terms)} | {cost:.3f} | "
+                f"{count} | {minutes:.1f} |",
                 flush=True,
             )
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"operator_recipes: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -31,6 +31,7 @@ from table_3_1 import THESIS, ThesisRow
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario
 from lagbench.data.statistics import file_moments
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.batch import (
     ScenarioBatch,
     SimulationJob,
@@ -206,19 +207,48 @@ def apart(row: ThesisRow, frames: int, what: str) -> Any:  # noqa: ANN401 (plain
     """Measure in a process of its own, whose peak memory is nobody else's."""
     measurement = f"{row.q},{frames},{what}"
     command = [sys.executable, __file__, "--one", measurement]
-    process = subprocess.run(command, capture_output=True, check=True, text=True)
+    # What the process says on stderr stays there.
+    process = subprocess.run(command, stdout=subprocess.PIPE, check=False, text=True)
+    if process.returncode != 0:
+        raise WorkFailedError(
+            "a measurement failed",
+            where=f"q = {row.q}, {frames} frames, {what}",
+            expected="exit code 0",
+            got=process.returncode,
+            fix="see the error above",
+        )
     return json.loads(process.stdout)
 
 
-def row_of(q: int) -> ThesisRow:
-    """Return the row of a quality factor."""
-    return next(row for row in THESIS if row.q == q)
+def row_of(q: str) -> ThesisRow:
+    """Return the row of a quality factor, as the user writes it.
+
+    Raises:
+        UsageError: there is no such row.
+    """
+    names = []
+    for row in THESIS:
+        name = str(row.q)
+        if q == name:
+            return row
+        names.append(name)
+    raise UsageError(
+        "Table 3.1 has no such row",
+        where="--rows",
+        expected=f"values of q, some of {', '.join(names)}",
+        got=repr(q),
+        fix="give them as in --rows 2,4",
+    )
 
 
 def one(text: str) -> int:
-    """Measure one thing and print it as JSON."""
+    """Measure one thing and print it as JSON.
+
+    Args:
+        text: q, the number of frames, and "parts" or "whole", as in "2,4,parts".
+    """
     q, frames, what = text.split(",")
-    row = row_of(int(q))
+    row = row_of(q)
     with tempfile.TemporaryDirectory() as folder:
         if what == "parts":
             measure = measure_parts
@@ -351,9 +381,9 @@ def main() -> int:
     if options.one:
         return one(options.one)
 
+    rows = [row_of(q) for q in options.rows.split(",")]
     measured = []
-    for number in options.rows.split(","):
-        row = row_of(int(number))
+    for row in rows:
         part_costs = apart(row, FRAMES[0], "parts")
         parts = Parts(**part_costs)
         runs = []
@@ -362,7 +392,7 @@ def main() -> int:
             runs.append(Whole(**run_costs))
         measured.append((row, parts, runs))
 
-    million = row_of(8)
+    million = row_of("8")
     _, largest_parts, _ = measured[-1]
     memory = extrapolate_memory(measured, million.particles)
     lines = [
@@ -394,4 +424,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"scaling_plan: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.errors import UsageError
 
 from .box_tables import LANES, Singles
@@ -188,13 +189,16 @@ class FullBox(Driver[FullBoxParameters]):
         moves_well = may_move & (speeds <= speed_bound)
         is_allowed = (speeds == 0.0) | moves_well
         if not is_allowed.all():
+            first = tuple(np.argwhere(~is_allowed)[0])
+            wall_number, axis = first[-2:]
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
                 where=where,
-                expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}, zeros along "
-                "periodic axes",
-                got=f"speeds up to {speeds.max():.6g}",
+                expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g} along no-slip "
+                "walls, zeros across walls and along periodic axes",
+                got=f"speed {speeds[first]:.6g} of wall {WALL_NAMES[wall_number]} "
+                f"along {AXES[axis]}",
                 fix="correct what initial_state returns: docs/extending.md",
             )
 

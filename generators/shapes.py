@@ -46,6 +46,10 @@ _ROBERTS = {
 }
 
 
+LEAST_SHARE = 1e-6
+"""Share of the square or cube around a body that the body fills, at least."""
+
+
 class Shape(Protocol):
     """A body's outline about the origin."""
 
@@ -252,6 +256,24 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
     return body_at(shape, *centre)
 
 
+def _check_share(shape: Shape, volume: float) -> None:
+    """Refuse a shape that fills next to nothing of the square or cube around it.
+
+    The search for points inside it would not end.
+    """
+    least = LEAST_SHARE * volume
+    is_thick_enough = min(shape.reach) > 0.0 and shape.measure > least > 0.0
+    if not is_thick_enough:
+        raise WorkFailedError(
+            "a body is too thin to hold particles",
+            where=type(shape).__name__,
+            expected=f"an area or volume above {LEAST_SHARE:g} of the square or cube "
+            "around the body",
+            got=f"{shape.measure:g} of {volume:g}",
+            fix="correct the lengths of the shape",
+        )
+
+
 def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     """Spread particles evenly inside a body.
 
@@ -262,12 +284,17 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
 
     Returns:
         Positions [length], multiples of 2^-20, shape [count, axis].
+
+    Raises:
+        WorkFailedError: the body is so thin that next to no point lies inside it, or
+            its sides are no positive numbers.
     """
     reach = body.shape.reach
     dimension = len(reach)
     steps = _ROBERTS[dimension]
     shift = rng.random(steps.shape)
     side = 2.0 * max(reach)
+    _check_share(body.shape, side**dimension)
     # in blocks: a million particles take no memory beside their own
     block_size = min(4 * count, 1 << 16)
     blocks = [np.empty((0, dimension))]

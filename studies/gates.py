@@ -47,7 +47,7 @@ from lagbench.board.folder import GATES, Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
-from lagbench.errors import UsageError
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.tensors import Batch
 
 from .thesis.split_results import BOARD
@@ -382,13 +382,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--recorded", action="store_true", help="print recorded measures only"
     )
     options = parser.parse_args(arguments)
-    if options.recorded:
-        folder = Folder(options.output or BOARD)
-        sys.stdout.write(to_markdown(active_rows(folder)))
-        return 0
-    if options.root is None:
+    if not options.recorded and options.root is None:
         parser.error("name the folder of all data sets: --root FOLDER")
+    for option in ("scenarios", "rollouts"):
+        if getattr(options, option) < 1:
+            parser.error(f"--{option}: at least one scenario is needed")
+    try:
+        if options.recorded:
+            folder = Folder(options.output or BOARD)
+            folder.require()
+            rows = active_rows(folder)
+        else:
+            rows = _measure_all(options)
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    sys.stdout.write(to_markdown(rows))
+    return 0
 
+
+def _measure_all(options: argparse.Namespace) -> list[Gates]:
+    """Measure the weights that the options name; write gates.json if they name it."""
     torch.set_num_threads(1)
     rows = []
     paths = options.weights
@@ -405,9 +419,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.output is not None:
         path = options.output / "gates.json"
         text = to_json(rows, recorded=read_recorded(path))
-        write_atomically(path, text.encode())
-    sys.stdout.write(to_markdown(rows))
-    return 0
+        write_atomically(path, text.encode(), option="--output")
+    return rows
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from lagbench.board.entry import Entry, Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder, entry_path
 from lagbench.data.registry import Size, load
+from lagbench.errors import LagbenchError
 from lagbench.figures.tables import markdown
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.lagrangebench import mean_of_every_tenth
@@ -186,7 +187,12 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--board", type=Path, default=Path("leaderboard"))
     options = parser.parse_args(words)
-    print(table(options.board))  # noqa: T201 - the result of the program
+    try:
+        text = table(options.board)
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    sys.stdout.write(f"{text}\n")
     return 0
 
 

@@ -34,7 +34,7 @@ SMALLEST_SHARE = 1e-9
 SMALLEST_TOP = sys.float_info.min / SMALLEST_SHARE
 """Smaller tops have no logarithmic range: its ends may read back as zero."""
 
-DIGITS = 9  # most digits of a zero
+DIGITS = 9  # most digits of a zero, unless the range is narrower than they tell
 # Values are divided by the rounded step, so its rounding moves no value.
 STEP_DIGITS = 3
 
@@ -88,6 +88,9 @@ def scale_for(
         low = math.log(finite_values[finite_values > SMALLEST_SHARE * high].min())
         high = math.log(high)
     zero = round_digits(low, DIGITS)
+    if abs(zero - low) > high - low > 0.0:
+        # a range so narrow needs all digits: else its levels would not fit into 16 bits
+        zero = low
     step = (high - low) / levels
     if step == 0.0:
         step = 1.0

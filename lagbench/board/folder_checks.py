@@ -186,13 +186,17 @@ class FolderChecks:
             if prediction.path is None:
                 continue
             length = self._describe_length(Path(prediction.path))
-            if length != prediction.bytes:
-                self._add(
-                    "predictions",
-                    f"{path}, predictions.{number}",
-                    length,
-                    expected=f"{prediction.path}, a file of {prediction.bytes} bytes",
-                )
+            if length == prediction.bytes:
+                continue
+            expected = f"{prediction.path}, a file of {prediction.bytes} bytes"
+            if prediction.bytes is None:
+                expected = f"{prediction.path}, and its length in bytes"
+            self._add(
+                "predictions",
+                f"{path}, predictions.{number}",
+                length,
+                expected=expected,
+            )
 
     def _describe_length(self, path: Path) -> str | int:
         """Return the length of a file in the folder [bytes], or why it has none."""
@@ -438,12 +442,13 @@ class FolderChecks:
                 is_active = scored.entry.status is Status.ACTIVE
                 if is_active and scored.score_path not in paths:
                     paths.append(scored.score_path)
-            for path in paths[1:]:
+            first_paths: dict[tuple[str, ...], Path] = {}  # by data set
+            for path in paths:
                 # the parts of a path are scores, split, size and file
-                is_same_data_set = path.parts[1:3] == paths[0].parts[1:3]
-                if is_same_data_set and path not in reported:
+                first_path = first_paths.setdefault(path.parts[1:3], path)
+                if path != first_path and path not in reported:
                     reported.add(path)
-                    self._add("duplicate", path, f"those of {paths[0]}")
+                    self._add("duplicate", path, f"those of {first_path}")
 
     def _check_names(self) -> None:
         """Check that no two names of active entries look alike."""

@@ -153,8 +153,8 @@ OVERVIEW_WORDS = (
 CELL_WORDS = (
     "A cell has the skill, the rank on this data set, and the error beside that of the "
     "best classical solver that costs no more per frame. Where all cost more, the "
-    "cheapest one takes its place. The last one is missing where the cost is unknown. A "
-    "question mark stands where its 95 % interval contains 1. A rank such as 2–4 "
+    "cheapest one takes its place. The last one is missing where the cost is unknown. "
+    "A question mark stands where its 95 % interval contains 1. A rank such as 2–4 "
     "names the places that a method takes when the test scenarios are drawn again "
     "(95 %). Ranks count entries only: classical solvers and baselines have none. "
     "Variants of a method are folded behind it, without a rank."
@@ -345,8 +345,14 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
     counts = dict.fromkeys(Level, 0)
     machines = set()
     whole_count = 0
+    run_count = 0
+    differing_count = 0
     for row in rows:
         counts[level_of(row)] += 1
+        if row.verified is not None and row.verified.reproduced:
+            run_count += 1
+            if not all(model.agrees for model in row.verified.reproduced):
+                differing_count += 1
         if row.verified is not None and row.verified.is_reproduced_wholly:
             whole_count += 1
         if row.verified is not None and row.verified.cost is not None:
@@ -370,14 +376,21 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
     if counts[Level.SCORED_AGAIN]:
         predictions = _count(counts[Level.SCORED_AGAIN], "entry", "entries")
         clauses.append(f"scored the predictions of {predictions} again")
+    differing = ""
+    if differing_count:
+        models = _count(differing_count, "entry", "entries")
+        differing = f" The models of {models} gave other scores."
     if not clauses:
-        return "All entries stand as submitted: nobody has scored them again yet."
+        sentence = "All entries stand as submitted"
+        if not run_count:
+            sentence += ": nobody has scored them again yet"
+        return f"{sentence}.{differing}"
     sentence = f"The maintainers of this leaderboard {' and '.join(clauses)}"
     if machines:
         sentence += f"; machine: {', '.join(sorted(machines))}"
     if counts[Level.AS_SUBMITTED]:
         sentence += ". The others stand as submitted"
-    return f"{sentence}."
+    return f"{sentence}.{differing}"
 
 
 def _describe_extent(whole: int, partly: int) -> str:

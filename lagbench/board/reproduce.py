@@ -157,6 +157,7 @@ def reproduce(
         UsageError: there is no leaderboard, no such entry, or one without a model; or
             torch is missing.
         DataError: the data of a named entry are missing or others.
+        ChecksFailedError: a model of a named entry is not the one that it names.
         UnreadableFileError: a model of a named entry cannot be read.
         WorkFailedError: the disk or the memory is full.
     """
@@ -209,7 +210,8 @@ def open_model(
 
     Raises:
         UsageError: the seed has no model, or its architecture is not installed.
-        UnreadableFileError: the file is damaged, or not the one that the entry names.
+        ChecksFailedError: the file is not the one that the entry names.
+        UnreadableFileError: the file is damaged.
         DataError: it was trained on other data.
     """
     if prediction.weights is None:

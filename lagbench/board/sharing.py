@@ -80,8 +80,8 @@ def find_keeper(folder: Folder, place: Place, path: Path) -> Entry | None:
     """Return the entry that keeps a file of weights on this board.
 
     Returns:
-        None where the file lies elsewhere, or where its keeper is the entry of this
-        place.
+        None where the file lies elsewhere, where no entry names it, or where its keeper
+        is the entry of this place.
     """
     board = folder.path.resolve()
     whole_path = path.resolve()

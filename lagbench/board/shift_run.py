@@ -100,6 +100,8 @@ def score_on_shift(
         UsageError: there is no leaderboard, no such entry, one without a model, or
             nothing to run.
         DataError: the data of a named entry are missing or others.
+        ChecksFailedError: a model of a named entry is not the one that it names, or
+            its ranking metric has no value.
         UnreadableFileError: a model of a named entry cannot be read.
         WorkFailedError: the disk or the memory is full.
     """

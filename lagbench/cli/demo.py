@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from lagbench.board.build import BuildResult, build
 from lagbench.board.entry import Meta
 from lagbench.board.folder import Folder
@@ -42,6 +40,7 @@ from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
 from .output import format_seconds, print_result, print_table
 from .progress import progress_bar
 from .solver_bench import SolverBench, bench_in_own_process
+from .stderr import print_on_stderr
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
@@ -114,7 +113,7 @@ def demo_command(
     splits: dict[str, DemoResult] = {}
     for split in demo_splits(registry):
         if not quiet:
-            typer.echo(f"{split}: generating, verifying, drawing", err=True)
+            print_on_stderr(f"{split}: generating, verifying, drawing")
         with progress_bar(quiet=quiet) as progress:
             splits[split] = demo_split(
                 split, root=root, workers=workers, progress=progress
@@ -126,7 +125,7 @@ def demo_command(
     if model_left_out is None:
         if not quiet:
             steps = f"training {MODEL}, predicting, scoring, submitting"
-            typer.echo(f"{MODEL_SPLIT}: {steps}", err=True)
+            print_on_stderr(f"{MODEL_SPLIT}: {steps}")
         with progress_bar(quiet=quiet, unit="done") as progress:
             model = demo_model(root=root, progress=progress)
 

@@ -64,6 +64,7 @@ from .output import (
 )
 from .progress import note_at_start, progress_bar
 from .solver_bench import try_bench
+from .stderr import print_on_stderr
 
 REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
 
@@ -181,7 +182,7 @@ def check_command(
         )
     if not as_json:
         for issue in result.findings:
-            typer.echo(str(issue), err=True)
+            print_on_stderr(str(issue))
     lines = _describe_check(result, recording=recording)
     print_result(result, lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
@@ -360,7 +361,7 @@ def reproduce_command(
         )
     if not as_json:
         for failure in result.failures:
-            typer.echo(f"{failure.entry}: {failure.error}", err=True)
+            print_on_stderr(f"{failure.entry}: {failure.error}")
     lines = _describe_reproduced(result, with_costs=not no_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
@@ -482,7 +483,7 @@ def shift_command(
         )
     if not as_json:
         for failure in result.failures:
-            typer.echo(f"{failure.entry}: {failure.error}", err=True)
+            print_on_stderr(f"{failure.entry}: {failure.error}")
     print_result(
         result.to_plain(), _describe_shift(result), as_json=as_json, quiet=quiet
     )

@@ -17,6 +17,8 @@ from rich.text import Text
 
 from lagbench.figures.tables import Table
 
+from .stderr import print_on_stderr
+
 if TYPE_CHECKING:
     from lagbench.submission.issues import ValidationResult
 
@@ -64,12 +66,12 @@ def print_line(text: str, *, quiet: bool = False) -> None:
 
 def print_warning(text: str) -> None:
     """Print a warning on stderr."""
-    typer.echo(f"warning: {text}", err=True)
+    print_on_stderr(f"warning: {text}")
 
 
 def print_note(text: str) -> None:
     """Print on stderr what a command does meanwhile."""
-    typer.echo(f"lagbench: {text}", err=True)
+    print_on_stderr(f"lagbench: {text}")
 
 
 def print_json(value: object) -> None:
@@ -101,7 +103,7 @@ def print_errors(result: ValidationResult) -> None:
     """
     if len(result.errors) > 1:
         lines = [str(error) for error in result.errors]
-        typer.echo("\n".join(lines), err=True)
+        print_on_stderr("\n".join(lines))
 
 
 def split_table(

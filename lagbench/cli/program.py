@@ -36,6 +36,7 @@ from .commands import (
     SEASON_COMMANDS,
     CommandEntry,
 )
+from .stderr import print_on_stderr
 from .typed_settings import (
     NEGATIVE_NUMBER,
     advise_on_baselines,
@@ -225,7 +226,7 @@ class _Program(_LazyGroup):
             with _errors_as_messages(), _output_errors(), _command_line_errors():
                 return super().make_context(*args, **extra)
         except KeyboardInterrupt:
-            _print_error(_interruption_message(None))
+            print_on_stderr(_interruption_message(None))
             raise typer.Exit(INTERRUPTED) from None
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
@@ -238,26 +239,15 @@ class _Program(_LazyGroup):
             ):
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            _print_error(_interruption_message(ctx.invoked_subcommand))
+            print_on_stderr(_interruption_message(ctx.invoked_subcommand))
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             if _is_click_error(error) or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
-            _print_error(_unexpected_error_message(error))
+            print_on_stderr(_unexpected_error_message(error))
             raise typer.Exit(FAILED) from error
-
-
-def _print_error(text: str) -> None:
-    """Print a message on stderr; where that is full, the exit code alone tells."""
-    try:
-        typer.echo(text, err=True)
-    except OSError:
-        # What is buffered would fail again at the end, and change the exit code.
-        with suppress(AttributeError, OSError):
-            null_device = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null_device, sys.stderr.fileno())
 
 
 def _is_click_error(error: Exception) -> bool:
@@ -569,7 +559,7 @@ def _errors_as_messages() -> Iterator[None]:
     try:
         yield
     except LagbenchError as error:
-        _print_error(f"lagbench: {error}")
+        print_on_stderr(f"lagbench: {error}")
         raise typer.Exit(error.exit_code) from error
 
 
@@ -640,7 +630,7 @@ def _short_warnings() -> Iterator[None]:
                 if category.__name__ == "PluginWarning" and text in printed_texts:
                     return
                 printed_texts.add(text)
-                typer.echo(f"warning: {text}", err=True)
+                print_on_stderr(f"warning: {text}")
             else:
                 show_in_full(message, category, *place, **more)
 

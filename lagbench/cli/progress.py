@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
-import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -21,6 +20,7 @@ from lagbench.store.copy import silence_fetching
 from lagbench.work.progress import Progress, watched
 
 from .output import format_seconds, print_note
+from .stderr import print_on_stderr
 
 SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
 
@@ -119,8 +119,7 @@ def _print_lines(unit: str, seconds_per_line: float) -> Listener:
         seconds_left = _seconds_left(progress)
         if math.isfinite(seconds_left):
             parts.append(f"{format_seconds(seconds_left)} left")
-        with suppress(OSError):  # the work goes on without a reader
-            typer.echo(f"{progress.stage}: {', '.join(parts)}", err=True)
+        print_on_stderr(f"{progress.stage}: {', '.join(parts)}")
 
     return print_progress
 

@@ -169,12 +169,14 @@ def _describe_season(season: Season, path: Path, board: Path) -> Iterator[str]:
     if season.is_waiting:
         yield f"the seeds wait for: {season.source}"
     else:
-        commands = _commands_after_close(season.season, board)
-        yield f"commit the file, then: {commands}"
+        yield f"commit the file, then: {_next_commands(season, board)}"
 
 
-def _commands_after_close(name: str, board: Path) -> str:
-    place = f"{name}{board_option(board)}"
+def _next_commands(season: Season, board: Path) -> str:
+    """Return the commands that lead from a closed season to its scores."""
+    place = f"{season.season}{board_option(board)}"
+    if season.is_waiting:
+        return f"lagbench season close {place} --value VALUE, once it is known"
     return f"lagbench generate --season {place}; lagbench season run {place}"
 
 
@@ -280,6 +282,14 @@ def show_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Print public and blind skill of a season, and their gap."""
+    if as_json and as_markdown:
+        raise UsageError(
+            "the table is printed in one form",
+            where="--json and --markdown",
+            expected="one of the two",
+            got="both",
+            fix="leave one of them out",
+        )
     board = find_board(board, reads=True)
     folder = Folder(board)
     season = read_season(folder, name)
@@ -290,7 +300,7 @@ def show_command(
             where=str(board / season_path(name, SEASON_SCORES)),
             expected="the scores of its run",
             got="no such file",
-            fix=_commands_after_close(name, board),
+            fix=_next_commands(season, board),
         )
     rows = season_rows(season, scores)
     if as_json:

@@ -234,7 +234,8 @@ class Box:
         if not self.is_periodic or not len(points):
             return points
         first = points[0]
-        return np.asarray(first + self.displacement(first, points))
+        images = first + self.displacement(first, points)
+        return np.where(self.periodic, images, points)
 
     def tree(self, position: ArrayLike) -> cKDTree:
         """Return a tree of points in which periodic axes have no end.

@@ -324,7 +324,8 @@ def record_hashes(
 ) -> None:
     """Note content hashes of files that this machine has just hashed or written.
 
-    Where the folder cannot be written to, nothing is noted.
+    Where the folder cannot be written to, nothing is noted. A file that is gone by now
+    gets no note.
 
     Args:
         folder: folder of the data set.
@@ -338,7 +339,10 @@ def record_hashes(
     old_notes = _read_hash_notes(folder)
     new_notes = {}
     for path, content in contents.items():
-        stamp = _file_stamp(path)
+        try:
+            stamp = _file_stamp(path)
+        except FileNotFoundError:
+            continue  # another process has removed it meanwhile
         name = _relative_name(path, folder)
         old_note = old_notes.get(name)
         if old_note is not None and old_note.says(stamp, content):

@@ -65,7 +65,7 @@ def url_of(root: Path) -> str | None:
     try:
         text = (root / STORE_FILE).read_text(encoding="utf-8")
         url = json.loads(text)["url"]
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return None
     if not isinstance(url, str):
         return None

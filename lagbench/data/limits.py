@@ -79,6 +79,12 @@ NEEDED = {
 }
 """Parameters of every split: reading, estimating and writing need them."""
 
+STATED_NUMBERS = {
+    "gravity": Limit(),
+    "liquid_viscosity": Limit(low=0),
+}
+"""Parameters that readers take for numbers, where a split has them."""
+
 FRAMES = Limit(low=1, high=1_000_000, whole=True)
 """Frames of one scenario."""
 
@@ -114,14 +120,15 @@ def check_parameters(
                 f"parameters: no {name!r}, which every split needs; {hint}"
             )
 
+    known_limits = NEEDED | STATED_NUMBERS
     for name, default in declared.items():
         key = f"parameters.{name}.value"
         if name in values:
             key = f"sizes.{size}.parameters.{name}"
         value = values.get(name, default)
+        limit = known_limits.get(name, Limit())
         # A split may have texts and switches of its own.
-        is_own_choice = isinstance(value, bool | str) and name not in NEEDED
-        limit = NEEDED.get(name, Limit())
+        is_own_choice = isinstance(value, bool | str) and name not in known_limits
         if not is_own_choice and not limit.holds(value):
             raise ValueError(f"{key}: expected {limit}; got {describe_value(value)}")
 

@@ -116,9 +116,9 @@ def _acquire(
 
 
 def read_holder(folder: Path) -> Holder | None:
-    """Return the last holder of a data set's lock; None where none is written."""
+    """Return the last holder of a data set's lock; None where none can be read."""
     try:
         text = (folder / HOLDER_NAME).read_text(encoding="utf-8")
         return Holder(**json.loads(text))
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         return None

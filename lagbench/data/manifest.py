@@ -141,8 +141,20 @@ class Manifest(_ManifestModel):
             return ()
         means = []
         for column in zip(*errors, strict=False):
-            means.append(round_digits(math.fsum(column) / len(column)))
+            means.append(round_digits(mean(column)))
         return tuple(means)
+
+
+def mean(values: Sequence[float]) -> float:
+    """Return the mean of numbers; infinity where their sum is beyond every float.
+
+    >>> mean([1.0, 2.0]), mean([1e308, 1e308])
+    (1.5, inf)
+    """
+    try:
+        return math.fsum(values) / len(values)
+    except OverflowError:
+        return math.inf
 
 
 def describe_file(

@@ -299,8 +299,8 @@ class Size(BaseModel):
     def record_name(self) -> str:
         """Name of the file that describes the size and records its hashes.
 
-        It is datasets.yaml of lagbench, a file in the folder of another package, or the
-        description of a local split.
+        It is datasets.yaml of lagbench, a file in the folder of another package, the
+        description of a local split, or the scores of a season with blind scenarios.
         """
         if self.draw_seed is not None:
             return "scores.yaml of the season"

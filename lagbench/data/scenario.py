@@ -6,6 +6,7 @@ variable.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -20,7 +21,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.errors import DataError, LagbenchError
+from lagbench.errors import LIMIT_FIXES, DataError, LagbenchError, WorkFailedError
 
 from . import MATERIALS
 from .checksums import ContentHasher, to_plain
@@ -52,6 +53,9 @@ MAX_FACTS_LENGTH = 4096
 
 MOST_LETTERS = 80
 """Letters of a wrong attribute in a message."""
+
+MOST_ATTRIBUTES = 10
+"""Wrong attributes that a message names."""
 
 STATED_NAMES = frozenset(
     (
@@ -235,7 +239,10 @@ class ScenarioFile:
         return mass
 
     def blocks(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield a variable in order, in pieces of at most about 1 MiB."""
+        """Yield a variable in order, in pieces of at most about 1 MiB.
+
+        An entry of the first dimension that is longer is a piece of its own.
+        """
         with _damage_errors(self.path, name):
             shape = self._variables[name].shape
         length = 1
@@ -281,8 +288,9 @@ class ScenarioFile:
             differing = list_differing_attributes(expected, attributes)
             if differing:
                 values = []
-                for key in differing:
-                    values.append(f"{key} = {attributes.get(key, 'missing')}")
+                for key in differing[:MOST_ATTRIBUTES]:
+                    value = str(attributes.get(key, "missing"))
+                    values.append(f"{key} = {value}"[:MOST_LETTERS])
                 raise DataError(
                     "attributes of a variable are not those of the format",
                     where=f"{self.path}, variable {name!r}",
@@ -390,7 +398,7 @@ def _hash_error(
     return DataError(
         what,
         where=where,
-        expected=expected or "a stored hash",
+        expected=str(expected or "a stored hash")[:MOST_LETTERS],
         got=got,
         fix=_repair_hint(path),
     )
@@ -489,10 +497,32 @@ def _damage_errors(path: Path, variable: str | None = None) -> Iterator[None]:
         if str(path) in (error.where or ""):
             raise
         raise damage_error(path, error.what, variable) from error
-    except Exception as error:  # damage surfaces as nearly any type
-        raise damage_error(
-            path, f"{type(error).__name__}: {error}", variable
-        ) from error
+    except Exception as error:
+        raise reading_error(path, error, variable) from error
+
+
+def reading_error(
+    path: Path,
+    error: Exception,
+    variable: str | None = None,
+    *,
+    fix: str | None = None,
+) -> LagbenchError:
+    """Return our error for one that a library raised on reading a scenario file.
+
+    Damage surfaces as nearly any type. A system that opens no more files is no damage.
+    """
+    limits = (errno.EMFILE, errno.ENFILE)
+    if isinstance(error, OSError) and error.errno in limits:
+        return WorkFailedError(
+            "the system opens no more files",
+            where=str(path),
+            expected="room for another open file",
+            got=os.strerror(error.errno),
+            fix=f"{LIMIT_FIXES[error.errno]}; or open fewer data sets at a time",
+        )
+    got = f"{type(error).__name__}: {error}"
+    return damage_error(path, got, variable, fix=fix)
 
 
 def damage_error(

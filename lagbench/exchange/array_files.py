@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 import zipfile
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +26,14 @@ from lagbench.data.variables import open_netcdf
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .axis_order import ORDER, OrderedArray, check_order
-from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
+from .trajectory import (
+    Frame,
+    Trajectory,
+    check_array,
+    check_inflation,
+    check_names,
+    read_header,
+)
 
 READABLE = (".npy", ".npz", ".nc")
 """Files that are adopted: an array, named arrays, netCDF."""
@@ -335,19 +341,7 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as archive:
-        # numpy reads position.npy and position as one array
-        names = Counter(
-            member.filename.removesuffix(".npy") for member in archive.infolist()
-        )
-        repeated_names = [name for name, count in names.items() if count > 1]
-        if repeated_names:
-            raise UnreadableFileError(
-                "an archive holds two arrays of one name",
-                where=str(path),
-                expected="each name once",
-                got=", ".join(map(ascii, repeated_names[:5])),
-                fix="write it again with numpy.savez",
-            )
+        check_names(path, archive)
         for member in archive.infolist():
             if member.filename.removesuffix(".npy") not in ARRAYS:
                 continue  # it is never read

@@ -28,7 +28,14 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError
 
 from .metadata import Format, find_materials
-from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
+from .trajectory import (
+    Run,
+    Trajectory,
+    check_array,
+    check_inflation,
+    check_names,
+    read_header,
+)
 
 JOINT = "gns_data"
 """Key under which some files hold all trajectories together."""
@@ -103,7 +110,8 @@ def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajecto
     """
     try:
         archive = zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
+        # A name that is no text is a ValueError, an unknown version is not implemented.
         raise UnreadableFileError(
             "cannot read an npz file",
             where=str(path),
@@ -112,6 +120,7 @@ def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajecto
             fix="fetch it again, or name the format that it has: --format",
         ) from error
     with archive:
+        check_names(path, archive)
         for member in archive.namelist():
             key = member.removesuffix(".npy")
             name = f"{path}, key {key!r}"

@@ -298,7 +298,7 @@ class SourceMetadata(BaseModel):
 
 
 def round_down(value: float) -> float:
-    """Return the largest multiple of 2^-20 below a value.
+    """Return the largest multiple of 2^-20 that is not above a value.
 
     Taken off a float32 beyond it, nothing is lost.
     """

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -656,6 +658,28 @@ def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
             expected=f"at most {most} bytes",
             got=f"{unpacked} bytes",
             fix="save it without compression if it is yours; else leave it out",
+        )
+
+
+def check_names(path: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse an npz file with two arrays of one name, since a reader finds one of them.
+
+    Raises:
+        UnreadableFileError: it has such arrays.
+    """
+    # numpy reads position.npy and position as one array
+    names = Counter(name.removesuffix(".npy") for name in archive.namelist())
+    repeated_names = []
+    for name, count in names.items():
+        if count > 1:
+            repeated_names.append(name)
+    if repeated_names:
+        raise UnreadableFileError(
+            "an archive holds two arrays of one name",
+            where=str(path),
+            expected="each name once",
+            got=", ".join(map(ascii, repeated_names[:5])),
+            fix="write it again with numpy.savez",
         )
 
 

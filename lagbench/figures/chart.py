@@ -28,6 +28,7 @@ DEEPEST = 1e-6
 
 HUGE = 1e300  # values beyond are no numbers of a chart
 TINY = 1e-300  # magnitudes below it stand at 0
+ROUNDING = 1e-12  # values that differ by less than this share differ by rounding
 MOST_LABELS = 8  # of a logarithmic axis; of more ticks the powers of ten stay
 PLAIN_POWERS = range(-3, 4)  # powers of ten that are written out
 ROUND_FACTORS = (1.0, 2.0, 2.5, 5.0, 10.0)
@@ -79,10 +80,12 @@ def linear(
 ) -> AxisScale:
     """Return a linear axis that covers a range with about so many steps.
 
-    A tight axis ends at the range, others at the next ticks.
+    A tight axis ends at the range, others at the next ticks. A range of rounding is
+    widened.
     """
-    if not high > low:
-        middle = abs(low) or 1.0
+    greatest = max(abs(low), abs(high))
+    if not high - low > ROUNDING * greatest:
+        middle = greatest or 1.0
         high = low + 0.5 * middle
         low = low - 0.5 * middle
     step = _round_up((high - low) / count)

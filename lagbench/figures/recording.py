@@ -32,6 +32,9 @@ Read = Callable[[str, slice | int], NDArray[Any]]
 
 IDENTITY = ("split", "size", "scenario")  # what names a scenario
 
+# variables that every picture needs
+DRAWN_VARIABLES = ("position", "material", "particle_mass")
+
 # folders between the root of all data sets and a scenario file
 DEPTH = 4
 
@@ -45,7 +48,8 @@ class Scene:
     position: NDArray[np.float64]  # [length], shape [particle, axis]
     # velocity of the solver [length/s], shape [particle, axis]
     velocity: NDArray[np.float64]
-    # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
+    # x(f) - x(f-1) [length/frame]; at frame 0 velocity times frame interval, or
+    # x(1) - x(0) where no velocity is recorded
     displacement: NDArray[np.float64]
 
     @property
@@ -257,15 +261,24 @@ class Recording:
         """Return one frame; negative numbers count from the end.
 
         Raises:
-            UsageError: the scenario has no such frame.
+            UsageError: the scenario has no such frame, or a single one and no
+                velocities.
         """
         number = self.frame_number(frame)
+        if self.frames == 1 and not self._has_velocity:
+            raise UsageError(
+                "nothing says how the particles move",
+                where=f"scenario {self.scenario}",
+                expected="two frames, or velocities",
+                got="one frame without velocities",
+                fix="draw a scenario of more frames",
+            )
         position = self._read_particles("position", number)
         interval = self.size.frame_interval
         if number > 0:
             before = self._read_particles("position", number - 1)
             displacement = self.size.box.displacement(before, position)
-        elif not self._has_velocity and self.frames > 1:
+        elif not self._has_velocity:
             after = self._read_particles("position", 1)
             displacement = self.size.box.displacement(position, after)
         else:
@@ -291,7 +304,8 @@ def open_recording(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: the data set has several scenarios, or lacks frames.
+        UsageError: the data set has several scenarios, or lacks frames, variables or
+            attributes.
         DataError: the scenario file is missing or damaged.
     """
     if not isinstance(source, str | Path):
@@ -328,6 +342,7 @@ def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
             fix="choose one: data.sel(scenario=3)",
         )
     attributes: dict[str, Any] = {str(name): v for name, v in data.attrs.items()}
+    _require_complete(data)
     identity = {}
     for name in IDENTITY:
         if name in data.coords:
@@ -355,6 +370,27 @@ def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
         read=read,
         registry=registry,
     )
+
+
+def _require_complete(data: xr.Dataset) -> None:
+    """Refuse a data set that lacks what every picture needs."""
+    missing = []
+    for name in IDENTITY:
+        if name not in data.coords and name not in data.attrs:
+            missing.append(f"attribute {name}")
+    for name in DRAWN_VARIABLES:
+        if name not in data:
+            missing.append(f"variable {name}")
+    if missing:
+        raise UsageError(
+            "the data set lacks what a picture needs",
+            where="the data set that is drawn",
+            expected=f"attributes {', '.join(IDENTITY)}; variables "
+            f"{', '.join(DRAWN_VARIABLES)}",
+            got=f"no {', no '.join(missing)}",
+            fix="keep all variables and attributes of a scenario, as "
+            "xr.set_options(keep_attrs=True) does",
+        )
 
 
 def _count_frames(data: xr.Dataset) -> int:

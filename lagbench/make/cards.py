@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from lagbench.atomic import ROOT_OPTION, write_atomically
 from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.data.layout import CARD_NAME, CROISSANT_NAME, PICTURES, format_ids
-from lagbench.data.manifest import FileEntry, Manifest
+from lagbench.data.manifest import FileEntry, Manifest, mean
 from lagbench.data.registry import Parameter, Registry, Size, Split
 from lagbench.errors import format_count
 from lagbench.figures.tables import escape, escape_prose, markdown
@@ -68,6 +67,15 @@ NOTES: Mapping[str, str] = {
 
 FORCE_PARAMETER = "force_max"
 """Parameter of the splits that a body force drives."""
+
+COMPRESSIBILITY: tuple[tuple[str, str, Callable[[Iterable[float]], float]], ...] = (
+    ("speed over speed of sound, 99.9 %", "mach_999", max),
+    ("speed over speed of sound, largest", "mach_max", max),
+    ("J of liquid, 99.9 % lie above", "liquid_jacobian_999", min),
+    ("J of liquid, smallest at any substep", "liquid_jacobian_min", min),
+    ("Jp of snow, smallest at any substep", "snow_jp_min", min),
+)
+"""Rows of the compressibility: title, number of a file, and which file is the worst."""
 
 
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
@@ -206,15 +214,22 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         data_hash = f"`{manifest.dataset_sha256}`"
 
     frame_counts = []
+    particle_counts = []
     byte_count = 0
     for entry in manifest.files:
         frame_counts.append(entry.frames)
+        particle_counts.append(entry.particles)
         byte_count += entry.bytes
     fewest = min(frame_counts, default=0)
     most = max(frame_counts, default=0)
     frame_range = str(fewest)
     if most > fewest:
         frame_range = f"{fewest} to {most}"
+    fewest_particles = min(particle_counts, default=size.particles)
+    most_particles = max(particle_counts, default=size.particles)
+    particle_range: int | str = most_particles
+    if most_particles > fewest_particles:
+        particle_range = f"{fewest_particles:,} to {most_particles:,}"
 
     sides = []
     for low, high in size.bounds:
@@ -227,7 +242,7 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         ("scenarios", len(manifest.files)),
         ("frames per scenario", frame_range),
         ("frames of all scenarios", sum(frame_counts)),
-        ("particles", size.particles),
+        ("particles", particle_range),
         ("frame interval", f"{size.frame_interval:.6g} s"),
         ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
         ("box", " x ".join(sides)),
@@ -321,8 +336,8 @@ def _task_table(size: Size, manifest: Manifest) -> str:
         if entry.twin_floor:
             limits.append(entry.twin_floor)
     if limits:
-        first = math.fsum(limit[0] for limit in limits) / len(limits)
-        last = math.fsum(limit[-1] for limit in limits) / len(limits)
+        first = mean([limit[0] for limit in limits])
+        last = mean([limit[-1] for limit in limits])
         at_first = f"{first:.3g} at the first predicted frame"
         text = f"position RMSE {at_first}, {last:.3g} at the last"
         rows.append(("perturbed run, which starts 2^-20 away", text))
@@ -342,23 +357,22 @@ def _statistics_section(size: Size, manifest: Manifest) -> list[str]:
 
 
 def _soundness_section(manifest: Manifest) -> list[str]:
-    """Return how compressible a free surface is; empty for a full box."""
-    entries = [entry for entry in manifest.files if "mach_999" in entry.facts]
-    if not entries:
+    """Return how compressible a free surface is; empty for a full box.
+
+    A number counts where a file states it: files of others may state some only.
+    """
+    rows: list[tuple[str, str]] = []
+    for title, name, choose in COMPRESSIBILITY:
+        numbers = _stated_numbers(manifest, name)
+        if numbers:
+            rows.append((title, f"{choose(numbers):.4g}"))
+    clamped = _stated_numbers(manifest, "clamped_particles")
+    if clamped:
+        clamped_count = str(int(sum(clamped)))
+        rows.append(("particles that reached a numerical bound", clamped_count))
+    if not rows:
         return []
 
-    def extreme(choose: Callable[[Iterable[float]], float], name: str) -> str:
-        return f"{choose(entry.facts[name] for entry in entries):.4g}"
-
-    clamped = sum(int(entry.facts["clamped_particles"]) for entry in entries)
-    rows = [
-        ("speed over speed of sound, 99.9 %", extreme(max, "mach_999")),
-        ("speed over speed of sound, largest", extreme(max, "mach_max")),
-        ("J of liquid, 99.9 % lie above", extreme(min, "liquid_jacobian_999")),
-        ("J of liquid, smallest at any substep", extreme(min, "liquid_jacobian_min")),
-        ("Jp of snow, smallest at any substep", extreme(min, "snow_jp_min")),
-        ("particles that reached a numerical bound", str(clamped)),
-    ]
     return [
         "## Compressibility",
         "The worst scenario of each row; quantiles are over particles and frames of "
@@ -367,6 +381,15 @@ def _soundness_section(manifest: Manifest) -> list[str]:
         "counted as bounds.",
         markdown(("", ""), rows),
     ]
+
+
+def _stated_numbers(manifest: Manifest, name: str) -> list[float]:
+    """Return a number of each file that states it."""
+    numbers = []
+    for entry in manifest.files:
+        if name in entry.facts:
+            numbers.append(entry.facts[name])
+    return numbers
 
 
 def _parameter_table(size: Size) -> str:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.atomic import write_atomically
+from lagbench.data.field_errors import describe_value
 from lagbench.data.layout import (
     CACHE_VARIABLE,
     MAX_ID,
@@ -167,6 +168,15 @@ def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
             got=repr(scenarios)[:80],
             fix="name fewer",
         )
+    for scenario in ids:
+        if abs(scenario) > MAX_ID:
+            raise UsageError(
+                "a number is too large for an id",
+                where="--scenarios",
+                expected=f"ids from 0 to {MAX_ID}",
+                got=describe_value(scenario),
+                fix="name ids that `lagbench info` lists",
+            )
     return ids
 
 

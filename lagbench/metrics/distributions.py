@@ -51,10 +51,10 @@ def kl(p: Floats, q: Floats) -> float:
     """Return ``sum(P ln(P / Q))`` [nat] (Eqs. 5.23, 5.25); 0 where P and Q agree.
 
     Not symmetric: Q small where P is not costs most. Clipped at 0, below which only
-    rounding leads.
+    rounding leads. NaN where a share is NaN.
     """
     divergence = float((p * np.log(p / q)).sum())
-    return max(0.0, divergence)
+    return max(divergence, 0.0)  # in this order NaN stays NaN
 
 
 def histograms(truth: Floats, prediction: Floats) -> tuple[Floats, Floats] | None:

@@ -337,14 +337,19 @@ class Metric:
         The name is also the error's attribute ``metric_name``.
 
         Raises:
-            WorkFailedError: the error would end the program.
+            WorkFailedError: the error would end the program, or takes no attribute.
         """
         if isinstance(error, SystemExit):
             what = "a metric would end the program"
             failure = self._failure(what, place, expected="a number", got=error)
             raise failure from error
-        error.add_note(f"in metric {self.name}, {place}")
-        error.metric_name = self.name  # type: ignore[attr-defined]
+        try:
+            error.add_note(f"in metric {self.name}, {place}")
+            error.metric_name = self.name  # type: ignore[attr-defined]
+        except AttributeError:  # such as an exception that is a frozen dataclass
+            what = "a metric failed"
+            failure = self._failure(what, place, expected="a number", got=error)
+            raise failure from error
         raise error
 
     def _failure(

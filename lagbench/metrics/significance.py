@@ -264,7 +264,11 @@ def _table(seeds: Sequence[Mapping[int, float]], scenarios: Sequence[int]) -> Fl
 
 
 def mean_loss(seeds: Seeds) -> float:
-    """Return the loss of the mean over seeds, then scenarios; infinite without any."""
+    """Return the mean of the losses over seeds, then scenarios; infinite without any.
+
+    Of a metric with a target it is not the loss of the mean: errors to both sides do
+    not cancel.
+    """
     losses = [_losses(score) for score in _as_sequence(seeds)]
     scenarios = sorted(set().union(*losses))
     loss = mean(mean_over_seeds(_table(losses, scenarios)))

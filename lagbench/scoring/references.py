@@ -91,16 +91,17 @@ def sizes_with_test_files(
     Args:
         root: folder of all data sets.
         split: the only split.
-        name: the only size; with a split it is returned whether its files are there or
-            not.
+        name: the only size, of the splits that have it; with a split it is returned
+            whether its files are there or not.
         registry: the splits; ours when None.
+
+    Raises:
+        UsageError: there is no such split, or no such size.
     """
     if registry is None:
         registry = load()
-    splits = [split] if split else list(registry.splits)
-
     sizes = []
-    for one_split in splits:
+    for one_split in _choose_splits(registry, split, name):
         names = [name] if name else list(registry.split(one_split).sizes)
         for one_name in names:
             sizes.append(registry.size(one_split, one_name))
@@ -111,6 +112,23 @@ def sizes_with_test_files(
         if _has_files(size, root, "test"):
             sizes_with_data.append(size)
     return sizes_with_data
+
+
+def _choose_splits(
+    registry: Registry, split: str | None, name: str | None
+) -> list[str]:
+    """Return the named split; else those that have a size of the name."""
+    if split:
+        return [split]
+    every = list(registry.splits)
+    if not name:
+        return every
+    chosen = []
+    for one_split in every:
+        if name in registry.split(one_split).sizes:
+            chosen.append(one_split)
+    # a name that no split has is refused where the first one is looked up
+    return chosen or every
 
 
 def remeasure(

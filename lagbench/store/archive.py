@@ -143,7 +143,7 @@ def _read_complete_manifest(size: Size, root: Path) -> Manifest:
         where=str(size.folder(root)),
         expected=f"data set hash {recorded_hash}",
         got=dataset_hash,
-        fix=suggest_repair(size),
+        fix=suggest_repair(size, root=root),
     )
 
 

@@ -62,8 +62,8 @@ FRESH_SECONDS = 30.0
 _manifests: dict[str, tuple[float, Manifest | None]] = {}
 """Time of the last answer and manifest, by address."""
 
-_copies_of_writers: set[Path] = set()
-"""Working copies from which this process writes to a store."""
+_copies_of_writers: list[Path] = []
+"""Working copies from which this process writes to a store, one for each data set."""
 
 _is_silent: ContextVar[bool] = ContextVar("is_silent", default=False)
 
@@ -458,7 +458,8 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     """Take over finished scenarios of another root folder; return the joint manifest.
 
     Each job of an array generates some scenarios into a root folder of its own. The
-    result is what one call would have left.
+    result is what one call would have left. A file that the root folder has stays. It
+    is not named where only the source has an entry, of another file.
 
     Args:
         size: the data set.
@@ -476,19 +477,38 @@ def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest
     _require_other_folder(size, root, source)
     taken_entries = []
     new_entries = []
-    for entry in source_manifest.files:
-        if not _adds_to(manifest.entry(entry.scenario), entry):
+    for entry in _list_known_entries(size, source_manifest):
+        old_entry = manifest.entry(entry.scenario)
+        if not _adds_to(old_entry, entry):
             continue
-        taken_entries.append(entry)
         target = target_folder / entry.path
         if not target.exists():
             check_scenario(source_folder / entry.path, entry.content_sha256)
             new_entries.append(entry)
             _link_or_copy(source_folder / entry.path, target)
+            taken_entries.append(entry)
+        elif old_entry is not None:
+            # The file there may be packed otherwise: its own entry stays.
+            limit = {"twin_floor": entry.twin_floor}
+            taken_entries.append(old_entry.model_copy(update=limit))
+        elif target.is_file() and file_sha256(target) == entry.file_sha256:
+            taken_entries.append(entry)
     record_entry_hashes(target_folder, new_entries)
     for environment in source_manifest.environments:
         manifest = merge_entries(size, manifest, environment=environment)
     return merge_entries(size, manifest, taken_entries)
+
+
+def _list_known_entries(size: Size, manifest: Manifest) -> list[FileEntry]:
+    """Return the entries of scenarios that the size has in the same subset.
+
+    A source of another minor version may have more scenarios.
+    """
+    entries = []
+    for entry in manifest.files:
+        if entry.scenario in size.subsets.get(entry.subset, ()):
+            entries.append(entry)
+    return entries
 
 
 def _adds_to(old_entry: FileEntry | None, entry: FileEntry) -> bool:
@@ -523,7 +543,7 @@ def list_scenarios_to_gather(size: Size, root: Path, source: Path) -> tuple[int,
     source_folder = size.folder(source)
     target_folder = size.folder(root)
     scenarios = []
-    for entry in source_manifest.files:
+    for entry in _list_known_entries(size, source_manifest):
         is_new = target_manifest.entry(entry.scenario) is None
         has_source_file = (source_folder / entry.path).is_file()
         has_target_file = (target_folder / entry.path).exists()
@@ -562,12 +582,15 @@ def _refuse_source(size: Size, source: Path, *, got: str) -> UsageError:
 
 @contextlib.contextmanager
 def suspend_fetching(root: Path) -> Iterator[None]:
-    """Fetch nothing into a working copy from which this process writes to the store."""
-    _copies_of_writers.add(root)
+    """Fetch nothing into a working copy from which this process writes to the store.
+
+    Where several data sets are written, fetching begins again after the last of them.
+    """
+    _copies_of_writers.append(root)
     try:
         yield
     finally:
-        _copies_of_writers.discard(root)
+        _copies_of_writers.remove(root)
         _manifests.clear()
 
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import xarray as xr
 
 from lagbench.arguments import check_arguments
@@ -15,7 +16,7 @@ from lagbench.data import registry
 from lagbench.data.box import AXES, parse_obstacle
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
-from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
+from lagbench.data.scenario import parse_viscosity, reading_error, select_parameters
 from lagbench.errors import DataError
 
 from .copy import scenario_files, update_working_copy
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 4 << 20
 """Dask reads position and velocity in chunks of about this size [bytes]."""
+
+MOST_LETTERS = 200
+"""Letters of a library's error in a message."""
 
 PADDING = -1
 """Material of particles that a scenario does not have."""
@@ -93,9 +97,9 @@ def open_split(
         ``frame_count`` and ``particle_count`` (scenario). Coordinate ``scenario`` holds
         the ids, ``viscosity`` (scenario) the kinematic viscosity that a model is given
         [length^2/s], NaN where none is known; where there is a fixed obstacle,
-        ``obstacle`` (scenario, disc) holds its centre and radius [length]. Scenarios
-        with fewer frames or particles than the largest are padded with NaN, material
-        with -1.
+        ``obstacle`` (scenario, disc) holds its centre and radius [length], NaN in
+        scenarios without one. Scenarios with fewer frames or particles than the largest
+        are padded with NaN, material with -1.
 
     Raises:
         UsageError: unknown split, size or subset.
@@ -116,15 +120,25 @@ def open_split(
             parameters = select_parameters(file.attrs, where=str(path))
             viscosities.append(_read_viscosity(parameters, tier, path))
             obstacle = parse_obstacle(parameters, tier.dimension, where=str(path))
-            if obstacle is not None:
-                obstacles.append(obstacle)
+            if obstacle is None:
+                obstacle = np.full(tier.dimension + 1, np.nan, np.float32)
+            obstacles.append(obstacle)
         _check_layers(scenarios, list(paths.values()), hint)
-        joined = _join_scenarios(scenarios, list(paths))
+        try:
+            joined = _join_scenarios(scenarios, list(paths))
+        except (ValueError, TypeError) as error:
+            raise DataError(
+                "scenario files do not fit together",
+                where=str(tier.folder(root_folder)),
+                expected="variables of the same kinds in all of them",
+                got=f"{type(error).__name__}: {error}"[:MOST_LETTERS],
+                fix=f"lagbench verify names wrong files; {hint}",
+            ) from error
         # Lengths have no unit, as in scenario files.
         attributes = {"long_name": "given kinematic viscosity", "units": "s-1"}
         coordinate = ("scenario", viscosities, attributes)
         joined = joined.assign_coords(viscosity=coordinate)
-        if obstacles:
+        if np.isfinite(obstacles).any():
             attributes = {"long_name": "centre and radius of the fixed obstacle"}
             numbers = [*AXES[: tier.dimension], "radius"]
             joined = joined.assign_coords(
@@ -223,9 +237,9 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
                 attributes[name] = _require_text(scenario.attrs[name])
             attributes["scenario"] = int(scenario.attrs["scenario"])
             _check_positions(file["position"])
+            _check_coordinates(file)
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-            reason = f"{type(error).__name__}: {error}"
-            raise damage_error(path, reason, fix=fix) from error
+            raise reading_error(path, error, fix=fix) from error
         if not _is_of(key, attributes):
             raise DataError(
                 "a file holds another scenario",
@@ -247,6 +261,21 @@ def _check_positions(position: xr.DataArray) -> None:
     if position.dtype.kind != "f" or position.dims != ("frame", "particle", "space"):
         message = f"position holds {position.dtype}, with axes {position.dims}"
         raise ValueError(message)
+
+
+def _check_coordinates(file: xr.Dataset) -> None:
+    """Refuse a file whose frames or particles are not numbered from 0, or without time.
+
+    Raises:
+        ValueError: it is such a file.
+    """
+    for name in ("frame", "particle"):
+        numbers = np.arange(file.sizes[name])
+        if not np.array_equal(file[name].to_numpy(), numbers):
+            message = f"{name} holds other numbers than 0 to {len(numbers) - 1}"
+            raise ValueError(message)
+    if "time" not in file.variables:
+        raise ValueError("there is no variable 'time'")
 
 
 def _require_text(attribute: object) -> str:

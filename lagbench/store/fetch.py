@@ -115,12 +115,12 @@ def fetch_scenarios(
             for transfer in as_completed(pending):
                 scenario = pending[transfer]
                 try:
-                    transfer.result()
+                    is_resumed = transfer.result()
                 except NotInStoreError as error:
                     yield scenario, error
                 else:
                     # Here and not in the threads: HDF5 is not safe in several threads.
-                    accept(requests[scenario])
+                    _accept_fetched(requests[scenario], count, is_resumed=is_resumed)
                     yield scenario, None
         except DataError:
             stop.set()
@@ -137,17 +137,21 @@ class _StoppedError(Exception):
     """The transfer of another object has failed."""
 
 
-def _fetch(request: FetchRequest, report: Callable[[int], None]) -> None:
-    """Fetch one object under its temporary name, going on after an earlier attempt."""
+def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
+    """Fetch one object under its temporary name, going on after an earlier attempt.
+
+    Returns:
+        Whether a part of the file is from an earlier attempt.
+    """
     partial = partial_name(request.target)
     rate = TransferRate(request.url)
 
-    def attempt() -> None:
+    def attempt() -> bool:
         report(0)
         with partial.open("ab") as file:
             offset = file.tell()
             if offset and offset == request.length:
-                return
+                return True
             with closing(open_object(request.url, offset, hint=request.hint)) as answer:
                 if answer.start < offset:
                     file.seek(answer.start)
@@ -163,9 +167,30 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> None:
                 for block in blocks:
                     file.write(block)
                     report(len(block))
+                return answer.start > 0
 
     with partial_file_errors(partial):
-        retry(attempt, request.url, partial)
+        return retry(attempt, request.url, partial)
+
+
+def _accept_fetched(
+    request: FetchRequest, report: Callable[[int], None], *, is_resumed: bool
+) -> None:
+    """Accept a fetched file; fetch it anew where its first part may be another's.
+
+    The store may have replaced the object since the earlier attempt, or a crash of the
+    machine may have spoiled the part.
+    """
+    partial = partial_name(request.target)
+    try:
+        with partial_file_errors(partial):
+            accept(request)
+    except WrongContentError:
+        if not is_resumed:
+            raise
+        _fetch(request, report)
+        with partial_file_errors(partial):
+            accept(request)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import operator
 import os
 from bisect import bisect_right
@@ -25,9 +24,14 @@ from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import damage_error, parse_viscosity, select_parameters
+from lagbench.data.scenario import (
+    damage_error,
+    parse_viscosity,
+    reading_error,
+    select_parameters,
+)
 from lagbench.data.summary import summarise_arrays
-from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
+from lagbench.errors import DataError, LagbenchError, UsageError
 
 from .copy import scenario_files
 
@@ -287,20 +291,9 @@ class FrameStore:
             yield
         except LagbenchError:
             raise
-        except Exception as error:  # damage surfaces as nearly any type
-            limits = (errno.EMFILE, errno.ENFILE)
-            if isinstance(error, OSError) and error.errno in limits:
-                raise WorkFailedError(
-                    "the system opens no more files",
-                    where=str(path),
-                    expected="one open file for each scenario",
-                    got=f"{len(self._open_scenarios)} scenario files are open",
-                    fix="allow more, as by `ulimit -n 4096`, or open fewer data sets "
-                    "at a time",
-                ) from error
-            reason = f"{type(error).__name__}: {error}"
+        except Exception as error:
             hint = self._repair_hint(scenario)
-            raise damage_error(path, reason, fix=hint) from error
+            raise reading_error(path, error, fix=hint) from error
 
     def _repair_hint(self, scenario: int) -> str:
         root = self._paths[scenario].parents[4]

@@ -279,12 +279,18 @@ class IssueCollector:
 
     def add_exception(self, check: str, error: LagbenchError) -> None:
         """Add the issue that one of our exceptions describes; it rejects the file."""
+        expected = error.expected
+        if expected is None:
+            expected = "an undamaged file"
+        got = error.got
+        if got is None:
+            got = "nothing"
         self.error(
             check,
             error.what,
             where=error.where or "the file",
-            expected=error.expected or "an undamaged file",
-            got=error.got or "nothing",
+            expected=expected,
+            got=got,
             fix=error.fix or "make it again",
         )
 

@@ -137,7 +137,7 @@ def is_permutation(predicted: Positions, reference: Positions) -> bool:
 
 
 def sort_particles(position: Positions) -> Positions:
-    """Return positions ordered by x, then y, shape [particle, space]."""
+    """Return positions ordered by x, then y, then z, shape [particle, space]."""
     order = np.lexsort(position.T[::-1])
     return position[order]
 

@@ -483,7 +483,8 @@ def _recorded_hash(size: Size, root: Path) -> str:
     Raises:
         DataError: none is recorded.
     """
-    update_working_copy(size, root)
+    if size.measured is None:
+        update_working_copy(size, root)
     recorded = dataset_hash_of(size, root)
     if recorded is None:
         raise DataError(
@@ -610,7 +611,7 @@ def _by_scenario(
     """Return values by scenario id; an array holds scenarios by ascending id."""
     if isinstance(values, Mapping):
         return values
-    array = np.asarray(values)
+    array = _numbers_of(values, "positions or velocities")
     if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
             "the array does not hold one entry per test scenario",

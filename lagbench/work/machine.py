@@ -211,7 +211,7 @@ def has_time_limit() -> bool:
 
 
 class ChildStopped(Exception):
-    """A child under limits has ended before it answered; its text says why."""
+    """A child under limits ended, or gave no answer; its text says why."""
 
     def __init__(self, reason: str, *, is_late: bool = False) -> None:
         """Set why it ended, and whether it was the time of the clock."""
@@ -265,7 +265,8 @@ class LimitedChild:
             argument: what JSON can hold.
 
         Raises:
-            ChildStopped: the child crashed, or went beyond a limit.
+            ChildStopped: the child crashed, went beyond a limit, or wrote something
+                else than an answer.
             WorkFailedError: an exception in the child, as where it cannot import the
                 module.
         """
@@ -282,7 +283,12 @@ class LimitedChild:
         finally:
             timer.cancel()
             self._seconds_left -= time.monotonic() - start
-        return json.loads(answer)
+        try:
+            return json.loads(answer)
+        except (ValueError, RecursionError):
+            # Its next line may be anything: no other call can be answered.
+            process.kill()
+            raise ChildStopped("its answer is no JSON") from None
 
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(

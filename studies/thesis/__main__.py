@@ -372,12 +372,13 @@ def _parse_seeds(text: str) -> tuple[int, ...]:
         seeds = tuple(int(part) for part in text.split(","))
     except ValueError:
         seeds = ()
-    if not seeds or min(seeds) < 0:
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
         raise UsageError(
             "cannot understand the seeds",
             where="--seeds",
-            expected="as in 0,1",
+            expected="whole numbers from 0, each once, as in 0,1",
             got=text,
+            fix="give them as in --seeds 0,1",
         )
     return seeds
 

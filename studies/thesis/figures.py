@@ -351,7 +351,7 @@ def case_curves(plan: Plan, item: ThesisItem) -> Sheet:
 
 
 def losses(plan: Plan, item: ThesisItem) -> Sheet:
-    """Return the losses of trainings over their steps.
+    """Return the losses of trainings over their steps, those of the first seed.
 
     An item of several splits has one model in each: a curve per split, and a table of
     the losses at the end. An item of one split has a curve per model, and a table of

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
 from lagbench.figures.tables import Table
@@ -133,7 +134,10 @@ def statistics(plan: Plan, item: ThesisItem) -> Sheet:
     if not measured:
         raise DataError(
             "the statistics of train are recorded nowhere",
-            fix=f"lagbench generate --split {split}",
+            where=str(tier.folder(plan.root)),
+            expected="statistics in the manifest, or in datasets.yaml",
+            got="none",
+            fix=suggest_repair(tier, root=plan.root),
         )
 
     rows = []

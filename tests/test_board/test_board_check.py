@@ -656,6 +656,39 @@ def test_later_entries_may_supersede_the_same_predictions(own: BoardBench) -> No
     assert found(own) == []
 
 
+def test_an_entry_of_other_data_does_not_hide_predictions_that_stand_twice(
+    own: BoardBench,
+) -> None:
+    """The same hash of an old data set comes first in the folder."""
+    copy_of(own, "noisy", "other", name="Something else")
+    old = yaml.safe_load(own.entry("noisy").read_text())
+    old["size"] = "full"
+    old["dataset"]["version"] = "9.0.0"
+    for path, content in (
+        (own.entry("noisy"), yaml.safe_dump(old).encode()),
+        (scores_of(own, "noisy"), scores_of(own, "noisy").read_bytes()),
+    ):
+        copy = Path(str(path).replace("/cavity/tiny/", "/cavity/full/"))
+        copy.parent.mkdir(parents=True)
+        copy.write_bytes(content)
+    assert found(own).count("duplicate") == 1
+
+
+def test_predictions_without_a_length_are_found(own: BoardBench) -> None:
+    """The finding names the key and the length that the file has."""
+    path = own.folder / "x.nc"
+    with netCDF4.Dataset(path, "w"):
+        pass
+    put("predictions", 0, path="x.nc")(own)
+    own.edit("noisy", lambda entry: entry["predictions"][0].pop("bytes", None))
+    result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
+    (finding,) = result.findings
+    assert finding.check == "predictions"
+    assert "bytes" in str(finding.expected)
+    assert str(path.stat().st_size) in str(finding)
+    assert "None" not in str(finding)
+
+
 @pytest.mark.parametrize(
     ("one", "other"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 
 import numpy as np
@@ -54,6 +55,20 @@ def test_numbers_come_back_within_half_a_step(
         error = np.abs(restored[is_known] - array[is_known])
         scale = 1.0 + abs(zero)
         assert np.all(error <= half_step + 1e-5 * scale)
+
+
+@pytest.mark.parametrize("low", [float(np.float32(0.1)), 1.23456789499, -3.3333333333])
+@pytest.mark.parametrize("share", [1e-15, 1e-12, 1e-10])
+@pytest.mark.parametrize("prefer_logarithmic", [False, True])
+def test_values_that_differ_by_rounding_come_back(
+    low: float, share: float, prefer_logarithmic: bool
+) -> None:
+    """Their range is narrower than the digits of a short zero."""
+    values = np.array([low, low * (1.0 + share), math.nan, low * (1.0 + share / 2)])
+    store = ArrayStore()
+    reference = store.add(values, kind="a", prefer_logarithmic=prefer_logarithmic)
+    restored = restore(store, reference)[:, 0]
+    assert_allclose(restored, values, rtol=share + 1e-15)
 
 
 @given(

@@ -544,6 +544,28 @@ def test_the_page_distinguishes_whole_and_partial_reproductions(board: Board) ->
     assert "scores on a part of the test scenarios." in with_rows(board, partly, other)
 
 
+def test_the_header_counts_models_that_gave_other_scores(board: Board) -> None:
+    """Somebody has run them again, though the entry stands as submitted."""
+    whole = run_again_on(16)
+    other_scores = whole.reproduced[0].model_copy(update={"difference": 1.0})
+    differing = whole.model_copy(
+        update={"level": Level.AS_SUBMITTED, "reproduced": (other_scores,)}
+    )
+    row = row_of(board, "Other", "other", verified=differing)
+    nobody = row_of(board, "Nobody", "nobody", verified=None)
+    words_of_others = "1 entry gave other scores"
+    for page in (
+        with_rows(board, row),
+        with_rows(board, row, nobody),
+        with_rows(board, row, row_of(board, "Whole", "whole", verified=whole)),
+    ):
+        assert words_of_others in page
+        assert "nobody has scored them again" not in page
+    page = with_rows(board, nobody)
+    assert "nobody has scored them again" in page
+    assert words_of_others not in page
+
+
 def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
     """Return a tab with classical solvers of some errors as references."""
     references = []

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from model_board import NAME, PATH, ModelBoard
-from typer.testing import Result
+from typer.testing import CliRunner, Result
 
 from lagbench.board.entry import Level
 from lagbench.board.entry_file import yaml_bytes
@@ -35,6 +35,7 @@ from lagbench.board.season_run import SeasonResult, run_season
 from lagbench.board.season_scores import frozen_models, read_scores
 from lagbench.board.season_table import record_blind, season_rows
 from lagbench.board.verified import read_verified
+from lagbench.cli.program import app
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import ChecksFailedError, DataError, UsageError
@@ -572,6 +573,8 @@ def test_the_commands_say_what_is_wrong(
         result = run(*words, *board)
         assert result.exit_code == 2, words
         assert "results go to" not in result.stderr
+    both = run("season", "show", SEASON, "--json", "--markdown", *board[:2])
+    assert both.exit_code == 2
     shown = run("season", "show", SEASON, "--markdown", "--board", own.folder)
     assert shown.exit_code == 0
     assert "gns" in shown.stdout
@@ -581,6 +584,18 @@ def test_the_commands_say_what_is_wrong(
     early = run("season", "show", SEASON, "--board", own.folder)
     assert early.exit_code == 1
     assert f"generate --season {SEASON} --board {own.folder}" in early.stderr
+
+
+def test_a_season_without_its_random_value_is_shown_as_one_to_reveal(
+    own: ModelBoard,
+) -> None:
+    """No command can draw its scenarios yet, so none of these is the remedy."""
+    close_season(own, "later", source="lottery of 1 May")
+    words = ["season", "show", "later", "--board", str(own.folder)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 1
+    assert f"season close later --board {own.folder} --value" in result.stderr
+    assert "generate --season" not in result.stderr
 
 
 @pytest.mark.parametrize("budget", [-5.0, 0.0])

@@ -220,6 +220,41 @@ def test_a_full_disk_exits_5() -> None:
 @pytest.mark.skipif(
     not Path("/dev/full").exists(), reason="this system has no /dev/full"
 )
+@pytest.mark.parametrize("is_full", [True, False], ids=["full disk", "no reader"])
+def test_a_warning_that_cannot_be_printed_stops_nothing(
+    is_full: bool, tmp_path: Path
+) -> None:
+    """The command says what it was asked for, as with an stderr that takes it."""
+    package = tmp_path / "absent-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Name: absent\nVersion: 1.0\n")
+    entry_points = "[lagbench.generators]\nabsent = no_such_module\n"
+    (package / "entry_points.txt").write_text(entry_points)
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    with (
+        open("/dev/full", "w") as full,
+        open(write_end, "w") as without_reader,
+    ):
+        outputs = []
+        for stderr in (subprocess.PIPE, full if is_full else without_reader):
+            done = subprocess.run(
+                [*PROGRAM, "list"],
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                env=environment,
+                check=False,
+            )
+            assert done.returncode == 0
+            outputs.append(done)
+    assert b"absent" in outputs[0].stderr
+    assert outputs[1].stdout == outputs[0].stdout
+
+
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
 @pytest.mark.parametrize(
     ("words", "code"), [(("info", "none"), 2), (("info", "-x"), 2)]
 )

@@ -122,6 +122,16 @@ def test_contained_points_lie_between_the_walls() -> None:
     assert WALLED.contains([0.92, 0.5], tolerance=0.03)
 
 
+def test_unwrapping_keeps_the_bits_along_walls() -> None:
+    """Images lie next to the first point; components between walls stay as they are."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    points = random_points(rng, CHANNEL, 100).astype(np.float32)
+    unwrapped = CHANNEL.unwrap(points)
+    assert_array_equal(unwrapped[:, 1], points[:, 1])
+    assert np.abs(unwrapped[:, 0] - points[0, 0]).max() <= 1.0
+    assert_allclose(CHANNEL.wrap(unwrapped)[:, 0], points[:, 0], atol=1e-6)
+
+
 def test_walls_are_named_by_the_axes_that_have_them() -> None:
     assert WALLED.walls == ("left", "right", "bottom", "top")
     assert CHANNEL.walls == ("bottom", "top")

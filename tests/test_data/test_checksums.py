@@ -20,6 +20,8 @@ from lagbench.data.checksums import (
     dataset_hash,
     dtype_name,
     file_sha256,
+    load_recorded_hashes,
+    record_hashes,
     subset_hash,
     to_plain,
 )
@@ -343,3 +345,14 @@ def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         dataset_hash("cavity", "tiny", 1, subsets)
     assert caught.value.where == "cavity tiny"
+
+
+def test_a_file_that_vanished_gets_no_note(tmp_path: Path) -> None:
+    """Another process may remove it while the notes are written."""
+    path = tmp_path / "0001.nc"
+    path.write_bytes(b"values")
+    content_hash = "ab" * 32
+    gone = tmp_path / "0000.nc"
+    record_hashes(tmp_path, {gone: content_hash, path: content_hash})
+    find_hashes = load_recorded_hashes(tmp_path)
+    assert find_hashes(path) == (content_hash, file_sha256(path))

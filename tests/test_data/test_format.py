@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -277,6 +279,18 @@ def test_attributes_that_change_the_meaning_are_refused(
     assert_refused(path, f"variable '{variable}'", name)
 
 
+def test_long_attributes_make_no_long_message(written: Written) -> None:
+    path, _ = written
+    with netCDF4.Dataset(path, "r+") as file:
+        file["position"].units = "x" * 50_000
+        for number in range(100):
+            file["position"].setncattr(f"attribute_{number}", "y")
+    with pytest.raises(DataError) as caught:
+        check_scenario(path)
+    assert "position" in str(caught.value.where)
+    assert len(str(caught.value)) < 2000
+
+
 def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -> None:
     """The error is that of the variable, not a traceback of HDF5."""
     path, _ = write_scenario(tmp_path, KEY, frames=4, particles=2000)
@@ -337,6 +351,22 @@ def test_a_file_that_vanishes_while_it_is_read_is_not_called_damaged(
     assert error.where == str(path)
     path.write_bytes(b"x")
     assert "damaged" in damage_error(path, "OSError: no signature").what
+
+
+def test_the_systems_limit_of_files_is_no_damage(written: Written) -> None:
+    """Reading goes on once the system opens files again."""
+    path, content_hash = written
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with open(os.devnull) as file:
+        lowest_free = file.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard_limit))
+    try:
+        with pytest.raises(WorkFailedError) as caught:
+            check_scenario(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft_limit, hard_limit))
+    assert caught.value.where == str(path)
+    assert check_scenario(path) == content_hash
 
 
 def test_other_netcdf_files_are_refused(tmp_path: Path) -> None:

@@ -124,6 +124,7 @@ def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
         '{"pid": 1}',
         '{"pid": 1, "host": "a", "since": "b", "more": 2}',
         "\x00",
+        "[" * 100_000,
     ):
         (folder / ".lock.holder.json").write_text(text)
         assert read_holder(folder) is None

@@ -405,6 +405,10 @@ def lead_out(splits: dict[str, Any]) -> None:
             renamed("cavity", "density", "denstiy"),
             ("'density'", "did you mean 'denstiy'?", "needs"),
         ),
+        (
+            always("gravity", value="down"),
+            ("parameters.gravity", "a finite number", "'down'"),
+        ),
     ],
 )
 def test_mistakes_are_named_on_load(
@@ -425,8 +429,8 @@ def test_mistakes_are_named_on_load(
             ("parameter gravity", "did you mean 'gravty'?"),
         ),
         (
-            always("gravity", value="down"),
-            ("parameter gravity", "a finite number", "'down'"),
+            always("liquid_modulus", value="soft"),
+            ("parameter liquid_modulus", "a finite number", "'soft'"),
         ),
         (
             always("liquid_modulus", value=-1.0),
@@ -714,6 +718,19 @@ def test_statistics_of_train_are_those_of_the_thesis(
         spread = (uniform, uniform)
         assert statistics["position_std"] == pytest.approx(spread, rel=1e-3)
         assert uniform == pytest.approx(0.272, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["gravity", "liquid_viscosity"])
+@pytest.mark.parametrize("value", ["strong", True, float("nan")])
+def test_parameters_that_readers_compute_with_are_numbers(
+    name: str, value: object
+) -> None:
+    """Texts and switches are a split's own choice elsewhere only."""
+    values = dict.fromkeys(NEEDED, 4)
+    declared = dict.fromkeys([*values, name, "shape"])
+    check_parameters("tiny", {**values, name: 0.5, "shape": "disc"}, declared)
+    with pytest.raises(ValueError, match=name):
+        check_parameters("tiny", {**values, name: value, "shape": "disc"}, declared)
 
 
 def test_an_integer_beyond_every_float_is_no_finite_number() -> None:

@@ -477,6 +477,34 @@ def test_a_damaged_npz_is_unreadable(
         imported(gns)
 
 
+@pytest.mark.parametrize("fault", ["version", "name"])
+def test_a_damaged_directory_of_an_npz_file_is_unreadable(
+    gns: Path, tmp_path: Path, fault: str
+) -> None:
+    """A version that no program writes, and a name that is no text."""
+    target = gns / "test.npz"
+    raw = bytearray(target.read_bytes())
+    central = raw.index(b"PK\x01\x02")
+    if fault == "version":
+        raw[central + 6] = 200
+    else:
+        raw[central + 9] |= 8  # the name is in UTF-8
+        raw[central + 46] = 0xFF
+    target.write_bytes(raw)
+    with refused(tmp_path, target.name):
+        imported(gns)
+
+
+def test_two_trajectories_of_one_name_are_refused(gns: Path, tmp_path: Path) -> None:
+    """A reader by names would take the last one twice and lose the first one."""
+    target = gns / "train.npz"
+    with zipfile.ZipFile(target, "a") as archive:
+        (member,) = archive.namelist()
+        archive.writestr(member.removesuffix(".npy"), archive.read(member))
+    with refused(tmp_path, target.name):
+        imported(gns)
+
+
 @pytest.mark.parametrize("name", ["00000/position", "position"])
 @pytest.mark.parametrize("way", ["soft", "external", "beside", "virtual", "raw"])
 def test_a_file_that_leads_elsewhere_is_refused(

@@ -182,6 +182,26 @@ def test_series_without_numbers_have_an_axis(values: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
+    "values",
+    [
+        [10.0, 10.000000000000002],
+        [1e5, 1e5 * (1.0 + 1e-15)],
+        [-7e-50, -7.000000000000001e-50],
+        [1e19, 1e19 * (1.0 + 4e-16)],
+    ],
+)
+def test_values_that_differ_by_rounding_have_an_axis(values: list[float]) -> None:
+    """It has a width, and no two ticks have the same label."""
+    axis = spanning([values], zero=False, log=False)
+    assert axis.high > axis.low
+    shares = axis.share(values)
+    assert np.all((shares >= 0.0) & (shares <= 1.0))
+    labels = [tick.label for tick in axis.ticks]
+    assert len(labels) >= 2
+    assert len(set(labels)) == len(labels)
+
+
+@pytest.mark.parametrize(
     ("value", "expected"),
     [
         (0.5, "0.500"),

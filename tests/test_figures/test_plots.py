@@ -360,6 +360,44 @@ def test_a_frame_that_does_not_exist_is_refused(
     assert not (tmp_path / "x.png").exists()
 
 
+def test_one_frame_without_velocities_is_refused(swirl: Path, tmp_path: Path) -> None:
+    """Nothing says how its particles move. With velocities it is drawn."""
+    path = tmp_path / "x.png"
+    with xr.open_dataset(swirl) as data:
+        first_frame = data.isel(frame=[0])
+        plot_frame(first_frame, 0, tmp_path / "first.png")
+        with pytest.raises(UsageError) as caught:
+            plot_frame(first_frame.drop_vars("velocity"), 0, path)
+    assert caught.value.where == "scenario 0"
+    assert caught.value.fix
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["position", "material", "particle_mass"])
+def test_a_data_set_without_a_variable_is_refused(
+    swirl: Path, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / "x.png"
+    with xr.open_dataset(swirl) as data, pytest.raises(UsageError) as caught:
+        plot_frame(data.drop_vars(name), 0, path)
+    assert name in str(caught.value.got)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["split", "size", "scenario"])
+def test_a_data_set_without_a_name_is_refused(
+    swirl: Path, tmp_path: Path, name: str
+) -> None:
+    """Its attributes went, as in sums of data sets."""
+    path = tmp_path / "x.png"
+    with xr.open_dataset(swirl) as data:
+        nameless = data.copy()
+        del nameless.attrs[name]
+        with pytest.raises(UsageError) as caught:
+            plot_frame(nameless, 0, path)
+    assert name in str(caught.value.got)
+
+
 def draw_empty_box(path: Path) -> Pixels:
     """Return the walls of a scenario at its first frame."""
     with open_recording(path) as recording, figure(2.0, 2.0) as page:

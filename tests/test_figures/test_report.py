@@ -7,7 +7,7 @@ import io
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -28,6 +28,7 @@ from board_bench import (
     runaway,
     still,
 )
+from exchange_readers import straight_runs
 from html_check import Reading, read_html
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -39,6 +40,7 @@ import lagbench.figures
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
+from lagbench.exchange import adopt
 from lagbench.figures.html import Markup, tag, text
 from lagbench.figures.report.maps import crop_to_walls
 from lagbench.figures.report.report import write_report
@@ -46,7 +48,9 @@ from lagbench.figures.report.subject import Subject, limit_of
 from lagbench.figures.report.summary import describe_stability
 from lagbench.metrics import METRICS, Tally, TaskConfig, aggregate
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
 from lagbench.scoring.task import ScoredTask
+from lagbench.submission import write
 from lagbench.submission.truth import Truth
 
 ROOT = Path(__file__).parents[2]
@@ -594,6 +598,62 @@ def test_style_sheet_is_packaged() -> None:
     for name in names:
         is_packaged = [fnmatch(name, pattern) for pattern in patterns]
         assert any(is_packaged), name
+
+
+def report_on_adopted(folder: Path, *, counts: Sequence[int], interval: float) -> str:
+    """Return a report on a local split with so many particles in each scenario.
+
+    The last two scenarios are its test.
+    """
+    paths = []
+    predictions = {}
+    for scenario, count in enumerate(counts):
+        (run,) = straight_runs(1, frames=8, particles=count, seed=scenario)
+        path = folder / f"run{scenario}.npz"
+        np.savez(path, position=run)
+        paths.append(path)
+        if scenario >= len(counts) - 2:
+            predictions[scenario] = run[2:]
+    adopted = adopt(
+        paths,
+        output=folder / "mine",
+        valid=1,
+        test=2,
+        radius=0.1,
+        frame_interval=interval,
+        input_frames=2,
+    )
+    file = write(
+        folder / "predictions.nc", predictions, split=adopted.folder, method="straight"
+    )
+    card = score(file, root=folder, workers=1, write=False)
+    page = write_report(folder / "report", [card], [file], root=folder)
+    return page.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ((90, 60, 40, 40), "40 particles"),
+        ((90, 60, 50, 40), "40 to 50 particles"),
+        ((40, 40, 40, 40), "40 particles"),
+    ],
+)
+def test_the_head_counts_the_particles_of_the_scenarios_that_are_scored(
+    tmp_path: Path, counts: Sequence[int], words: str
+) -> None:
+    """A scenario of train may have more."""
+    page = report_on_adopted(tmp_path, counts=counts, interval=0.1)
+    assert f", {words}, data set version" in page
+    assert "90 particles" not in page
+
+
+def test_each_picture_over_time_states_another_time(tmp_path: Path) -> None:
+    """Frames may be less than a hundredth of a second apart."""
+    page = report_on_adopted(tmp_path, counts=(40, 40, 40, 40), interval=0.002)
+    times = set(re.findall(r"frame (\d+)\u2002([0-9.]+) s", page))
+    assert ("3", "0.006") in times
+    assert len({seconds for _, seconds in times}) == len(times) >= 2
 
 
 def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:

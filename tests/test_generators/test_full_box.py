@@ -10,7 +10,7 @@ import pytest
 from box_scenarios import ALL_LIDS, NO_SLIP, after, box, scenario
 from full_box_scenarios import MIXED_BOX, MIXED_COUNTS, constants, mixed_state
 
-from lagbench.data.box import Box
+from lagbench.data.box import WALL_NAMES, Box
 from lagbench.errors import UsageError
 from lagbench.generators.full_box import FullBox
 from lagbench.generators.full_box_parameters import FullBoxParameters
@@ -51,11 +51,14 @@ def test_walls_that_cannot_move_are_refused(wall: int) -> None:
     """A wall moves along itself only, and a periodic axis has none."""
     walls = np.zeros((6, 3))
     walls[wall, 1] = 0.1
+    walls[3, 0] = 0.2  # a motion that is allowed
     state = dataclasses.replace(mixed_state(), wall_velocity=walls)
     solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
     with pytest.raises(UsageError) as caught:
         solver.load([state])
     assert "wall_velocity" in str(caught.value.where)
+    assert "0.1" in str(caught.value.got)
+    assert WALL_NAMES[wall] in str(caught.value.got)
 
 
 LATE_NAN = np.zeros((4, 2, 3))

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from scenario_draws import neighbours
 
 from lagbench.errors import WorkFailedError
-from lagbench.generators import draws, shapes
+from lagbench.generators import draws, shapes, solids
 
 # Three overlapping unit discs in a row, and one that touches them from above.
 ROW = np.array(
@@ -158,3 +158,23 @@ def test_place_refuses_a_body_that_does_not_fit() -> None:
     stream = source()
     with pytest.raises(WorkFailedError):
         shapes.place(stream, SHAPES["rectangle"], narrow)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        shapes.Rectangle(0.5, 0.0),
+        shapes.Rectangle(0.5, 1e-12),
+        shapes.Rectangle(-0.5, -0.5),
+        shapes.Rectangle(math.nan, 0.1),
+        shapes.Rectangle(math.inf, 0.1),
+        shapes.Disc(math.nan),
+        solids.Ball(math.nan),
+    ],
+    ids=str,
+)
+def test_a_body_without_room_for_particles_is_refused(shape: shapes.Shape) -> None:
+    """The search for points inside it would not end."""
+    body = shapes.Body(shape, np.full(len(shape.reach), 0.5))
+    with pytest.raises(WorkFailedError):
+        shapes.sample_points(source(), body, 3)

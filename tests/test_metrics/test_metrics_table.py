@@ -9,7 +9,7 @@ import pickle
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -620,6 +620,28 @@ def test_a_metric_of_another_shape_is_refused(what: str, function: Any) -> None:
     with pytest.raises(WorkFailedError) as caught:
         aggregate([bad], {0: pieces, 1: pieces})
     assert "enstrophy_error" in str(caught.value.where)
+
+
+@dataclass(frozen=True)
+class FrozenError(Exception):
+    """An error that takes no attribute, as those of some packages."""
+
+    size: int
+
+
+@pytest.mark.parametrize("what", ["applies", "statistic", "series", "over_frames"])
+def test_an_error_that_takes_no_note_is_named_too(what: str) -> None:
+    """The error of lagbench has metric and place, and came from the package's."""
+
+    def fail(*_: object) -> Any:
+        raise FrozenError(3)
+
+    bad: Any = replace(OTHERS, **{what: fail})
+    with pytest.raises(WorkFailedError) as caught:
+        aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
+    assert "enstrophy_error" in str(caught.value.where)
+    assert getattr(caught.value, "metric_name", None) == "enstrophy_error"
+    assert isinstance(caught.value.__cause__, FrozenError)
 
 
 @pytest.mark.parametrize("what", ["statistic", "defined"])

@@ -269,6 +269,15 @@ def test_divergences_are_scipys_entropy() -> None:
         assert divergence == pytest.approx(expected, rel=1e-9)
 
 
+def test_a_divergence_of_undefined_shares_is_undefined() -> None:
+    """It is NaN, not the 0 of equal distributions."""
+    equal = np.full(4, 0.25)
+    undefined = np.full(4, math.nan)
+    assert kl(equal, equal) == 0.0
+    assert math.isnan(kl(equal, undefined))
+    assert math.isnan(kl(undefined, equal))
+
+
 def test_values_on_an_edge_belong_to_the_bin_above() -> None:
     """Truth 0..64 has edges at whole numbers: one value per bin, two in the last; 3
     falls into bin 3.

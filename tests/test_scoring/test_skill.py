@@ -15,7 +15,7 @@ import scipy.stats
 from numpy.testing import assert_allclose, assert_array_equal
 from score_bench import ScoreBench, right, still, straight
 
-from lagbench.data.registry import Measured, Size, load
+from lagbench.data.registry import Measured, Registry, Size, load
 from lagbench.errors import ChecksFailedError, DataError, UsageError
 from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
@@ -492,6 +492,20 @@ def test_sizes_that_lie_in_a_root_can_be_measured(bench: ScoreBench) -> None:
     sizes = sizes_with_test_files(bench.root, registry=bench.registry)
     names = [size.name for size in sizes]
     assert names == [bench.size.name]
+
+
+def test_a_size_that_only_some_splits_have_can_be_measured(bench: ScoreBench) -> None:
+    """A split of another package need not have all sizes of ours."""
+    split = bench.registry.split(bench.size.split)
+    other_size = {"other": split.sizes[bench.size.name]}
+    other_split = split.model_copy(update={"sizes": other_size})
+    splits = {"beside": other_split, **bench.registry.splits}
+    registry = Registry(splits, bench.registry.measured)
+    sizes = sizes_with_test_files(bench.root, name=bench.size.name, registry=registry)
+    assert [size.split for size in sizes] == [bench.size.split]
+    assert sizes_with_test_files(bench.root, name="other", registry=registry) == []
+    with pytest.raises(UsageError):
+        sizes_with_test_files(bench.root, name="none", registry=registry)
 
 
 def test_an_interrupted_measurement_goes_on(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -14,14 +16,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpy.testing import assert_array_equal, assert_equal
-from scenario_factory import frames_of, make_key, write_scenario
+from scenario_factory import PARAMETERS, frames_of, make_key, write_scenario
 
 import lagbench
 from lagbench.data import registry
 from lagbench.data.manifest import build_manifest, write_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.data.writer import ScenarioWriter
-from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.store.dataset import list_splits, load_manifest, open_split
 
 TEST_IDS = registry.load().size("cavity", "tiny").subsets["test"]
@@ -127,6 +129,16 @@ def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
             assert_equal(viscosity, expected)
 
 
+def test_a_scenario_without_an_obstacle_has_nan(tmp_path: Path) -> None:
+    """Others of the same subset may have one."""
+    disc = {"obstacle_x": 0.25, "obstacle_y": 0.5, "obstacle_diameter": 0.125}
+    first, second = TEST_IDS
+    write_scenario(tmp_path, make_key(first))
+    write_scenario(tmp_path, make_key(second), parameters={**PARAMETERS, **disc})
+    with open_tiny(tmp_path) as data:
+        assert_equal(data.obstacle.values, [[np.nan] * 3, [0.25, 0.5, 0.0625]])
+
+
 def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
     """Positions are dask arrays in chunks of some megabytes, one scenario each."""
     for scenario in TEST_IDS:
@@ -193,6 +205,20 @@ def test_a_truncated_file_is_damage(ragged: Path) -> None:
         open_tiny(ragged)
 
 
+def test_the_systems_limit_of_files_is_no_damage(ragged: Path) -> None:
+    open_tiny(ragged).close()
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with open(os.devnull) as file:
+        lowest_free = file.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard_limit))
+    try:
+        with pytest.raises(WorkFailedError):
+            open_tiny(ragged)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft_limit, hard_limit))
+    open_tiny(ragged).close()
+
+
 def test_a_file_of_another_scenario_is_refused(ragged: Path) -> None:
     path = scenario_path(ragged, TEST_IDS[0])
     set_scenario_id(path, 17)
@@ -242,6 +268,45 @@ def list_open_files(root: Path) -> list[str]:
             if target.is_relative_to(root):
                 names.append(str(target))
     return names
+
+
+@pytest.mark.parametrize("name", ["frame", "particle"])
+def test_other_numbers_of_frames_or_particles_are_damage(
+    ragged: Path, name: str
+) -> None:
+    path = scenario_path(ragged, TEST_IDS[1])
+    with netCDF4.Dataset(path, "r+") as file:
+        file[name][:] = 0
+    with pytest.raises(DataError) as caught:
+        open_tiny(ragged)
+    assert str(path) in str(caught.value.where)
+
+
+def test_a_file_without_time_is_damage(ragged: Path) -> None:
+    path = scenario_path(ragged, TEST_IDS[1])
+    with h5py.File(path, "r+") as file:
+        del file["time"]
+    with pytest.raises(DataError) as caught:
+        open_tiny(ragged)
+    assert str(path) in str(caught.value.where)
+
+
+@pytest.mark.parametrize(
+    ("variable", "attribute", "value"),
+    [
+        ("material", "units", "days since 1900-01-01"),
+        ("position", "coordinates", "material time"),
+    ],
+)
+def test_files_of_unlike_kinds_are_not_joined(
+    ragged: Path, variable: str, attribute: str, value: str
+) -> None:
+    """An attribute may make dates or coordinates of numbers."""
+    path = scenario_path(ragged, TEST_IDS[1])
+    with netCDF4.Dataset(path, "r+") as file:
+        file[variable].setncattr(attribute, value)
+    with pytest.raises(DataError):
+        open_tiny(ragged)
 
 
 def test_nothing_stays_open_after_an_error(ragged: Path) -> None:

@@ -176,6 +176,12 @@ def test_only_right_data_are_packed(
     assert not list(output.glob("*"))
 
 
+def test_an_incomplete_data_set_is_made_whole_in_its_own_root(tmp_path: Path) -> None:
+    with pytest.raises(LagbenchError) as caught:
+        archive.write_archive(SPLIT, SIZE, root=tmp_path, output=tmp_path / "new")
+    assert str(tmp_path) in str(caught.value.fix)
+
+
 def test_releases_have_one_address(
     generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.program import app
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
@@ -127,6 +127,20 @@ def test_half_a_file_is_completed(
             f"/own/full/v1/{FIRST}",
             f"bytes={len(whole) // 3}-",
         ) in store.server.asked
+    assert (here / "own/full/v1" / FIRST).read_bytes() == whole
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_a_part_of_other_content_is_fetched_anew(
+    store: Store, here: Path, original: LocalSplit, share: float
+) -> None:
+    """The store may have replaced the object, or the machine may have crashed."""
+    whole = (original.folder / "full/v1" / FIRST).read_bytes()
+    part = fetch.partial_name(here / "own/full/v1" / FIRST)
+    part.parent.mkdir(parents=True)
+    part.write_bytes(whole[:8] + bytes(round(share * len(whole)) - 8))
+    result = download("own", root=here, mirror=store.url, scenarios="0")
+    assert result.downloaded == (0,)
     assert (here / "own/full/v1" / FIRST).read_bytes() == whole
 
 
@@ -345,6 +359,14 @@ def test_no_generate_stops_where_the_store_does(
     with pytest.raises(error):
         download("own", root=here, mirror=server.url, or_generate=False)
     assert "0000.nc" not in left(here)
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(store: Store, here: Path) -> None:
+    place = here / "own/full/v1" / FIRST
+    place.mkdir(parents=True)
+    with pytest.raises(WorkFailedError) as caught:
+        download("own", root=here, mirror=store.url, or_generate=False)
+    assert str(place.parent) in str(caught.value.where)
 
 
 def test_no_store_at_all(here: Path) -> None:

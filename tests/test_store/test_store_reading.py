@@ -369,6 +369,12 @@ def test_a_copy_of_a_working_copy_has_no_url(tmp_path: Path) -> None:
     assert url_of(copied_root) is None
 
 
+def test_a_store_file_that_is_damage_is_no_store(tmp_path: Path) -> None:
+    for text in ("", "[1]", "{}", "[" * 100_000):
+        (tmp_path / "store.json").write_text(text)
+        assert url_of(tmp_path) is None
+
+
 @pytest.mark.parametrize(
     "path",
     [

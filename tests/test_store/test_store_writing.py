@@ -26,6 +26,7 @@ from lagbench.exchange import download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.store import publication
+from lagbench.store.copy import suspend_fetching, update_working_copy
 from lagbench.store.objects import Objects
 
 FOLDER = f"{SPLIT}/{SIZE}/v2"
@@ -356,3 +357,17 @@ def test_a_file_simulated_again_is_not_fetched_back(
     assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
     assert path.stat().st_size == new.bytes
     assert named(objects(full)[MANIFEST])[0] == "train/0000.nc"
+
+
+def test_nothing_is_fetched_before_the_last_data_set_is_written(
+    full: str, unmeasured: Registry
+) -> None:
+    """Two data sets may be written into one store side by side."""
+    size = unmeasured.size(SPLIT, SIZE)
+    root = resolve_root(full)
+    with suspend_fetching(root):
+        with suspend_fetching(root):
+            assert not update_working_copy(size, root, [0])
+        assert not update_working_copy(size, root, [0])
+    assert update_working_copy(size, root, [0])
+    assert (root / FOLDER / "train/0000.nc").is_file()

@@ -21,6 +21,7 @@ from studies.gates import (
     StepErrors,
     board_weights,
     count_densest,
+    main,
     read_recorded,
     to_json,
 )
@@ -154,3 +155,30 @@ def test_shared_weights_of_an_inactive_entry_are_measured_once(board: Path) -> N
     assert weights_of(board) == [path]
     entry.write_text(f"{entry.read_text()}status: withdrawn\nreason: a trial\n")
     assert weights_of(board) == [path]
+
+
+def test_weights_that_are_missing_are_no_crash(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They end with the exit code of a file that cannot be read."""
+    absent = tmp_path / "absent.pt"
+    assert main(["--root", str(tmp_path), "--weights", str(absent)]) == 3
+    assert str(absent) in capsys.readouterr().err
+
+
+def test_measures_of_no_board_are_not_an_empty_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder that is misspelt has no recorded measures to show."""
+    assert main(["--recorded", "-o", str(tmp_path / "bord")]) == 2
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("option", ["--scenarios", "--rollouts"])
+def test_gates_are_measured_on_one_scenario_or_more(
+    tmp_path: Path, option: str
+) -> None:
+    """Without a scenario there is no error to measure, and no cell to count."""
+    with pytest.raises(SystemExit) as caught:
+        main(["--root", str(tmp_path), option, "0"])
+    assert caught.value.code == 2

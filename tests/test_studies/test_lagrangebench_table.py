@@ -11,7 +11,7 @@ from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.data.registry import load
 from lagbench.scoring.score_file import read_statistics
-from studies.lagrangebench import errors_of, table
+from studies.lagrangebench import errors_of, main, table
 
 REPOSITORY = Path(__file__).parents[2]
 BOARD = REPOSITORY / "leaderboard"
@@ -44,3 +44,13 @@ def test_errors_of_an_entry_by_hand() -> None:
         e_kin.append((gap[:20][1::10] ** 2).mean())
     assert errors["position_mse_20"] == pytest.approx(np.mean(mse_20))
     assert errors["e_kin_mse"] == pytest.approx(np.mean(e_kin))
+
+
+def test_a_board_without_the_entries_is_no_crash(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It ends with the exit code of a file that cannot be read."""
+    assert main(["--board", str(tmp_path)]) == 3
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert str(tmp_path) in output.err

@@ -551,12 +551,15 @@ def test_tables_and_figures_are_written(plan: Plan) -> None:
 def test_unknown_names_are_answered_with_the_nearest(
     plan: Plan, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A misspelt item, split, size or seed, or no worker, ends with exit code 2."""
+    """A misspelt item, split, size or seed, a seed that is named twice, or no worker,
+    ends with exit code 2.
+    """
     for option, wrong, right in (
         ("--only", "table_54", "table_5_4"),
         ("--split", "cavty", "cavity"),
         ("--size", "midi", "mini"),
         ("--seeds", "a", "0,1"),
+        ("--seeds", "0,0", "0,1"),
     ):
         assert main([option, wrong]) == 2
         assert right in capsys.readouterr().err
@@ -586,11 +589,13 @@ def test_a_table_that_fails_is_named_and_others_are_written(
     plan: Plan, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without the data of another split its tables fail with exit code 4; others are
-    written.
+    written. The remedy makes the data of the size that was asked for.
     """
     code = run_plan(plan, "--no-training", "--only", "table_5_1,table_5_3")
     assert code == 4
-    assert "table_5_1" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "table_5_1" in errors
+    assert f"lagbench generate --split curl-noise --size {SIZE}" in errors
     assert (plan.output / "table_5_3.md").is_file()
 
 

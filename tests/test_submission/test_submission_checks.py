@@ -56,6 +56,14 @@ def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:
     return bench.validate(path)
 
 
+def test_an_error_keeps_the_zero_that_it_got(bench: Bench) -> None:
+    """A diameter of 0 is a value, not a missing one."""
+    issues = IssueCollector()
+    issues.add_exception("dataset", DataError("no size", expected=1, got=0.0))
+    (issue,) = issues.result(bench.valid).errors
+    assert (issue.expected, issue.got) == ("1", "0.0")
+
+
 @pytest.mark.parametrize(("periods", "is_flagged"), [(0.9, False), (-4.0, True)])
 def test_particles_periods_away_from_a_periodic_box_are_flagged(
     bench: Bench, periods: float, is_flagged: bool

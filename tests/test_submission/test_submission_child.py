@@ -40,6 +40,10 @@ def behave(how):
         os._exit(5)
     elif how == "raise":
         raise ValueError("a bug")
+    elif how == "print":
+        print("a warning of a library", flush=True)
+    elif how == "nest":
+        print("[" * 100_000, flush=True)
     elif how:
         os.kill(os.getpid(), getattr(signal, how))
     return how
@@ -81,6 +85,14 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (
             "SIGSEGV",
             "crashed: Segmentation fault",
+        ),
+        (
+            "print",
+            "no JSON",
+        ),
+        (
+            "nest",
+            "no JSON",
         ),
     ],
 )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import socket
 import tracemalloc
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -44,6 +45,7 @@ from lagbench.errors import (
     UsageError,
     WorkFailedError,
 )
+from lagbench.store import fetch
 from lagbench.submission import PredictionsWriter, open_predictions, template, write
 from lagbench.submission.writer import check_predictions_output
 
@@ -177,6 +179,21 @@ def test_predictions_need_no_ending(tmp_path: Path, name: str) -> None:
     check_predictions_output(tmp_path / name, overwrite=False)
 
 
+def test_no_store_is_asked_for_a_recorded_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who predicts elsewhere need not reach the store of the data."""
+    monkeypatch.setenv("LAGBENCH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(fetch, "PAUSE", 0.0)
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))
+        root = f"http://127.0.0.1:{reserved.getsockname()[1]}"
+        writer = PredictionsWriter(
+            tmp_path / "p.nc", split="cavity", size="tiny", method="m", root=root
+        )
+    assert writer.size.measured is not None
+
+
 def test_without_a_recorded_hash_one_must_be_given(
     unmeasured: Registry, tmp_path: Path
 ) -> None:
@@ -224,6 +241,7 @@ def with_nan(values: np.ndarray) -> np.ndarray:
 
 
 FIRST = truth(3)
+ALL = np.stack(list(RIGHT.values()))
 MASKED = np.ma.masked_less(FIRST, 0.5)
 RAGGED = [FIRST[0], FIRST[0, :2]]
 
@@ -242,6 +260,11 @@ WRONG_VALUES: list[tuple[Values, str]] = [
     (with_first(FIRST.astype(str)), "position of scenario 3"),
     (with_first(RAGGED), "position of scenario 3"),
     (with_first(torch.ones(SHAPE, requires_grad=True)), "of scenario 3"),
+    # the same in one array of all scenarios
+    (np.ma.masked_less(ALL, 0.5), "positions"),
+    (ALL.astype(complex), "positions"),
+    ([FIRST, FIRST[:, :2], FIRST], "positions"),
+    (torch.ones(ALL.shape, requires_grad=True), "positions"),
 ]
 
 WRONG_LABELS: list[tuple[Labels, str]] = [

@@ -121,13 +121,27 @@ def _become_command(arguments: Sequence[str], folder: Path, logs: Path) -> None:
         app(args=list(arguments), prog_name="lagbench")
         code = 0
     except SystemExit as error:
-        code = error.code if isinstance(error.code, int) else 0
+        code = _exit_code(error)
     except BaseException:
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        # The command may have closed its streams, but this child ends here.
+        try:
+            for stream in (sys.stdout, sys.stderr):
+                if not stream.closed:
+                    stream.flush()
+        finally:
+            os._exit(code)
+
+
+def _exit_code(error: SystemExit) -> int:
+    """Return the exit code that Python ends with; print the text of an error."""
+    if error.code is None:
+        return 0
+    if isinstance(error.code, int):
+        return error.code & 0xFF
+    sys.stderr.write(f"{error.code}\n")
+    return 1
 
 
 def take_snapshot(folder: Path) -> dict[str, str]:

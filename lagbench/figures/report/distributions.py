@@ -167,8 +167,8 @@ def histogram_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
         thesis="Fig. 5.12",
         body=join([_method_key(subject), _draw_histogram(subject, moment)]),
         caption="Share of the grid nodes per bin of vorticity [1/frame], scenario "
-        f"{scenario}. Black: the truth, whose range sets the bins; the first and the "
-        "last bin hold all that lies beyond.",
+        f"{scenario}. The range of the truth sets the bins; the first and the last bin "
+        "hold all that lies beyond.",
     )
 
 

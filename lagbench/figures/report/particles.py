@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -32,6 +33,7 @@ SHADES = OVERSAMPLING**2  # opacities of a pixel
 
 MOST_ROWS = 24  # of panels on the page; more would make it too heavy
 
+FEWEST_DECIMALS = 2  # of a time in seconds
 
 CAPTION = (
     "All particles by material, truth above predictions, inside the walls of the box."
@@ -75,10 +77,12 @@ def _scenario_figure(
         rows.append((entry.name, panels))
 
     interval = subject.task.size.frame_interval
+    # so many that the times of two frames differ
+    decimals = max(FEWEST_DECIMALS, math.ceil(-math.log10(interval)))
     columns = []
     for moment in moments:
         seconds = moment.frame * interval
-        columns.append(f"{moment.title}\u2002{seconds:.2f} s")
+        columns.append(f"{moment.title}\u2002{seconds:.{decimals}f} s")
     materials = np.unique(moments[0].truth.scenario.material).tolist()
     key = []
     for material in materials:

@@ -51,13 +51,12 @@ def format_title(subject: Subject) -> str:
 
 def draw_head(subject: Subject) -> Markup:
     """Return the top of the page: methods, task and tiles."""
-    size = subject.task.size
     header = subject.entries[0].card.header
     config = subject.task.config
     intro = (
         f"Given {config.input_frames} frames of each of {len(subject.scenarios)} "
         f"{header.subset} scenarios, predict the next {config.horizon}. "
-        f"{subject.title}, {size.particles} particles, data set version "
+        f"{subject.title}, {_count_particles(subject)} particles, data set version "
         f"{header.dataset_version}."
     )
     brand = f"lagbench · score report · {subject.data_name}"
@@ -68,6 +67,17 @@ def draw_head(subject: Subject) -> Markup:
         tag("ul", *_draw_tiles(subject), class_="tiles"),
     ]
     return join(parts)
+
+
+def _count_particles(subject: Subject) -> str:
+    """Return how many particles the scenarios have: a number or a range."""
+    size = subject.task.size
+    counts = {size.particle_count(scenario) for scenario in subject.scenarios}
+    fewest = min(counts)
+    most = max(counts)
+    if fewest == most:
+        return str(most)
+    return f"{fewest} to {most}"
 
 
 def _draw_tiles(subject: Subject) -> list[Markup]:

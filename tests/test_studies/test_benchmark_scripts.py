@@ -1,0 +1,83 @@
+"""The scripts of benchmarks/ end with a message where something is wrong."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from score_bench import ScoreBench, still
+
+from benchmarks.naive_attempts import measured_frames
+from lagbench.data.registry import load
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def run_script(words: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run a script of benchmarks/ as its page says."""
+    name, *options = words.split()
+    command = [sys.executable, f"benchmarks/{name}.py", *options, *map(str, arguments)]
+    return subprocess.run(
+        command,
+        cwd=REPOSITORY,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "flag_calibration --size tiny --splits cavity",
+        "operator_recipes --size tiny --split cavity",
+        "naive_attempts --split fluid",
+    ],
+)
+def test_missing_data_are_named_with_their_remedy(words: str, tmp_path: Path) -> None:
+    """As by every command of the package."""
+    done = run_script(words, "--root", tmp_path)
+    assert done.returncode in {3, 4}
+    assert "Traceback" not in done.stderr
+    assert "lagbench generate" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        ("flag_calibration --splits decaying-vortices", "cavity"),
+        ("flag_calibration --splits fluid-3d", "fluid"),
+        ("naive_attempts --split fluid --attempt shiped", "shipped"),
+        ("operator_recipes --operator gsn --root . --split cavity", "gns"),
+        ("scaling_plan --rows 12", "9"),
+        ("scaling_plan --rows x", "9"),
+    ],
+)
+def test_what_no_script_can_do_is_refused(words: str, right: str) -> None:
+    """Before any data are read."""
+    done = run_script(words)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert right in done.stderr
+
+
+def test_predictions_of_another_data_set_are_refused(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """None of the printed lines would be theirs."""
+    predictions = bench.submit(tmp_path / "still.nc", still)
+    words = "flag_calibration --splits cavity --size tiny --trained"
+    done = run_script(words, predictions, "--root", bench.root)
+    assert done.returncode == 2, done.stderr
+    assert str(predictions) in done.stderr
+
+
+def test_a_scenario_at_rest_is_compared_at_a_predicted_frame() -> None:
+    """A frame that is given has no error."""
+    size = load().size("fluid", "mini")
+    first_predicted = size.task.input_frames
+    assert measured_frames(size, 30, 0) == (first_predicted,)
