@@ -402,7 +402,8 @@ def add_walk_noise(
 
     The noise of velocities is a walk of ``history - 1`` steps of
     ``std / sqrt(history - 1)`` each. That of positions [length] is its sum, 0 in the
-    first frame. The frames after the history move along.
+    first frame. The frames after the history move along. One frame has no velocity, so
+    it has no noise.
 
     Args:
         position: positions [length], shape [particle, frame, axis].
@@ -413,6 +414,8 @@ def add_walk_noise(
     """
     particles, frame_count, dimension = position.shape
     velocity_count = history - 1
+    if velocity_count == 0:
+        return position
     shape = (particles, velocity_count, dimension)
     normal = torch.randn(shape, generator=generator, device=generator.device)
     step_std = std / math.sqrt(velocity_count)

@@ -125,6 +125,7 @@ def _load_entry(point: EntryPoint) -> CatalogueEntry:
         )
     if issubclass(loaded_class, Baseline):
         _check_complete(loaded_class, point)
+        _check_option_names(loaded_class, point)
         recipes = _find_recipes(loaded_class, point.name)
         return CatalogueEntry(name=point.name, model=loaded_class, recipes=recipes)
     if issubclass(loaded_class, Operator):
@@ -156,6 +157,23 @@ def _check_complete(model: type[Baseline], point: EntryPoint) -> None:
             expected=", ".join(REQUIRED),
             got=", ".join(present) or "none",
             fix="add them: docs/extending.md has the contract",
+        )
+
+
+def _check_option_names(model: type[Baseline], point: EntryPoint) -> None:
+    """Refuse a baseline that names options it does not have."""
+    options = model.Options
+    unknown_names = []
+    for name in sorted(options.in_training | options.of_weights):
+        if name not in options.model_fields:
+            unknown_names.append(name)
+    if unknown_names:
+        raise UsageError(
+            f"in_training or of_weights of {point.value} name no option",
+            where=package_of(point),
+            expected=f"names of options: {', '.join(options.model_fields) or 'none'}",
+            got=", ".join(unknown_names),
+            fix="correct these names in the class of the options",
         )
 
 

@@ -22,7 +22,7 @@ import threading
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from lagbench.atomic import atomic_path
+from lagbench.data.box import Box, parse_periodic
 from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.hdf5 import SIGNATURE as HDF5_SIGNATURE
 from lagbench.data.registry import Registry
@@ -114,9 +115,20 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint; it appears whole or not at all.
 
     Raises:
-        UsageError: a file of safetensors cannot hold the state of an optimiser.
+        UsageError: a weight is no tensor of plain numbers, or a file of safetensors
+            would hold the state of an optimiser.
         WorkFailedError: the disk is full, or nobody may write there.
     """
+    for name, tensor in checkpoint.weights.items():
+        if not _has_plain_numbers(tensor):
+            raise UsageError(
+                f"no file of weights can hold {name!r}",
+                where=f"{path}, weights of {checkpoint.baseline}",
+                expected="a dense tensor of real numbers",
+                got=f"{tensor.dtype}, {tensor.layout} on {tensor.device}",
+                fix="store real numbers, as those of torch.view_as_real; or register a "
+                "buffer with persistent=False",
+            )
     facts = asdict(checkpoint.info)
     if not checkpoint.info.periodic:
         # Without the key the bytes of a box with walls are those of older versions.
@@ -140,7 +152,11 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
         return
     weights = {}
     for name, tensor in checkpoint.weights.items():
-        weights[name] = tensor.detach().cpu()
+        value = tensor.detach().cpu()
+        if value.untyped_storage().nbytes() != value.numel() * value.element_size():
+            # torch would store the memory that it is a view of.
+            value = value.clone(memory_format=torch.contiguous_format)
+        weights[name] = value
     content: dict[str, Any] = {
         KEY: FORMAT,
         "about": json.dumps(about, sort_keys=True),
@@ -180,18 +196,41 @@ def load(path: str | Path) -> Checkpoint:
             raise _unreadable(file, f"format {FORMAT}", f"format {content[KEY]!r}")
         about = json.loads(content["about"])
         _LoggedTraining.model_validate(about["training"])
+        optimizer = content.get("optimizer")
+        if optimizer is not None and not isinstance(optimizer, Mapping):
+            raise TypeError("the state of the optimiser is no mapping")
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
-            info=TypeAdapter(DatasetInfo).validate_python(about["facts"]),
+            info=_parse_info(about["facts"]),
             weights=_check_tensors(content["weights"]),
             training=dict(about["training"]),
-            optimizer=content.get("optimizer"),
+            optimizer=optimizer,
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         one_line = " ".join(str(error).split())
         got = f"{type(error).__name__}: {one_line[:200]}"
         raise _unreadable(file, EXPECTED, got) from None
+
+
+def _parse_info(facts: object) -> DatasetInfo:
+    """Return the public figures of a data set, whose box is one.
+
+    Raises:
+        ValueError: a figure does not fit, or the box is none.
+    """
+    info: DatasetInfo = TypeAdapter(DatasetInfo).validate_python(facts)
+    try:
+        Box.from_bounds(info.bounds, parse_periodic(info.periodic, len(info.bounds)))
+    except UsageError as error:
+        raise ValueError(f"{error.what}: {error.got}") from None
+    return info
+
+
+def _has_plain_numbers(tensor: Tensor) -> bool:
+    """Return whether a tensor is dense and holds real numbers."""
+    is_dense = tensor.layout is torch.strided and not tensor.is_meta
+    return is_dense and not tensor.is_quantized and not tensor.is_complex()
 
 
 def _check_tensors(weights: object) -> dict[str, Tensor]:
@@ -205,8 +244,7 @@ def _check_tensors(weights: object) -> dict[str, Tensor]:
     for name, value in weights.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
             raise TypeError(f"weight {name!r} is no tensor")
-        is_dense = value.layout is torch.strided and not value.is_meta
-        if not is_dense or value.is_quantized or value.is_complex():
+        if not _has_plain_numbers(value):
             raise TypeError(f"weight {name!r} is no tensor of plain numbers")
         stated_bytes = value.numel() * value.element_size()
         if stated_bytes > value.untyped_storage().nbytes():
@@ -237,8 +275,10 @@ def _load_content(file: Path) -> dict[str, Any]:
 def _check_archive(file: Path) -> None:
     """Refuse a file that is no archive, is damaged, or unpacks to too much memory."""
     hint = None
-    if (file / "weights.pt").is_file():
-        hint = f"name the file: {file / 'weights.pt'}"
+    # A path that the system refuses is an error of the check below.
+    with suppress(OSError, ValueError):
+        if (file / "weights.pt").is_file():
+            hint = f"name the file: {file / 'weights.pt'}"
     check_regular(file, longest=MOST_BYTES, fix=hint)
     try:
         if not zipfile.is_zipfile(file):

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from lagbench.baselines.operators.operator import Losses, Operator, sum_edges
 from lagbench.errors import UsageError
@@ -202,7 +203,8 @@ class _OneDNNLinear(torch.autograd.Function):
         weight_grad = None
         bias_grad = None
         if needs_x:
-            x_grad = _multiply(grad, weight.t(), None)
+            # By the function itself, so that gradients have gradients too.
+            x_grad = _OneDNNLinear.apply(grad, weight.t(), None)  # type: ignore[no-untyped-call]
         if needs_weight:
             weight_grad = grad.t() @ x
         if needs_bias:
@@ -226,17 +228,17 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
     The shapes are [row, input] and [output, input].
     """
-    if _suits_onednn(x, weight):
+    if _suits_onednn(x, weight, bias):
         product: Tensor = _OneDNNLinear.apply(x, weight, bias)  # type: ignore[no-untyped-call]
         return product
     return nn.functional.linear(x, weight, bias)
 
 
-def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
+def _suits_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
     """Return whether oneDNN can and should multiply x by the weight.
 
-    It can for a non-empty matrix of float32 on a CPU, outside autocast and
-    torch.compile, and should wherever it can: see :class:`_OneDNNLinear`.
+    It can for a non-empty matrix of float32 on a CPU that the weight fits, outside
+    autocast and torch.compile, and should wherever it can: see :class:`_OneDNNLinear`.
     """
     if x.device.type != "cpu" or torch.is_autocast_enabled("cpu"):
         return False
@@ -244,6 +246,13 @@ def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
     is_float32 = x.dtype == weight.dtype == torch.float32
     if not is_matrix or not is_float32:
         return False
+    # torch's own error for other widths is easier to understand.
+    if x.shape[1:] != weight.shape[1:]:
+        return False
+    if bias is not None:
+        is_fit = bias.dtype == torch.float32 and bias.shape == weight.shape[:1]
+        if not is_fit:
+            return False
     if torch.compiler.is_compiling():
         return False
     return hasattr(torch.ops.mkldnn, "_linear_pointwise")
@@ -342,8 +351,9 @@ class Recomputed(torch.autograd.Function):
         return torch.cat(updates)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        """Return the gradients of all tensors."""
+        """Return the gradients of all tensors; they have no gradients themselves."""
         (update_grad,) = grads
         edge_index, edge, sender, receiver, weight, *parameters = ctx.saved_tensors
         edge_grad = torch.empty_like(edge)

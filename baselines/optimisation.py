@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.optim import AdamW
 
-from lagbench.errors import UsageError, WorkFailedError
+from lagbench.errors import UnreadableFileError, UsageError, WorkFailedError
 
 from .baseline import Baseline
 from .recipe import TrainingOptions
@@ -35,6 +35,7 @@ class Optimisation:
 
     Raises:
         UsageError: the model has no parameters.
+        UnreadableFileError: the state of the optimiser is not that of this model.
     """
 
     def __init__(
@@ -71,7 +72,21 @@ class Optimisation:
             fused=True,
         )
         if optimizer_state is not None:
-            self.optimizer.load_state_dict(dict(optimizer_state))
+            self._load_optimizer_state(optimizer_state)
+
+    def _load_optimizer_state(self, state: Mapping[str, Any]) -> None:
+        """Continue with the state that an optimiser of an earlier run had."""
+        try:
+            self.optimizer.load_state_dict(dict(state))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise UnreadableFileError(
+                "the state of the optimiser does not fit the model",
+                where="the checkpoint to go on from",
+                expected=f"the state of AdamW for {type(self.model).__name__}",
+                got=f"{type(error).__name__}: {reason[:200]}",
+                fix="train anew with --fresh, or take an earlier checkpoint",
+            ) from error
 
     @property
     def learning_rate(self) -> float:

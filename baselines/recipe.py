@@ -157,10 +157,10 @@ class TrainingOptions(Settings):
     @field_validator("windows")
     @classmethod
     def _check_subsets(cls, windows: tuple[str, ...]) -> tuple[str, ...]:
-        if {"test", "valid"} & set(windows) or not windows:
+        if {"test", "shift", "valid"} & set(windows) or not windows:
             raise ValueError(
-                "[train] or [train, extra]: never test, and not valid, by which the "
-                "weights are chosen"
+                "[train] or [train, extra]: never test or shift, which are scored, and "
+                "not valid, by which the weights are chosen"
             )
         return windows
 
@@ -478,11 +478,16 @@ def _suggest_variants(
             size_names.append(size_name)
     variants = []
     sizes = []
-    for size_name in size_names:
+    # A split may have a recipe that all splits have too.
+    for size_name in dict.fromkeys(size_names):
         if size_name.startswith(f"{size}-"):
             variants.append(size_name.removeprefix(f"{size}-"))
         if size_name.endswith(f"-{variant}"):
-            sizes.append(size_name.removesuffix(f"-{variant}"))
+            other_size = size_name.removesuffix(f"-{variant}")
+            # Variants may have hyphens: mini-long-short is one of mini, unless there is
+            # a size mini-long.
+            if "-" not in other_size or other_size in size_names:
+                sizes.append(other_size)
 
     has_size = size in size_names
     ways_out = []

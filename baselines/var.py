@@ -231,8 +231,13 @@ class StableVAR(Fitted):
         """Fit mean, drift, directions and response.
 
         Return the share of variance in the directions, and the rows.
+
+        Raises:
+            WorkFailedError: there are no rows, or positions are not finite.
         """
         sequences = [self.states(position) for position in scenarios]
+        for states in sequences:
+            _require_finite(states)
         rows = LaggedRows(sequences, lags=1)
         if not rows.rows:
             raise WorkFailedError(
@@ -342,7 +347,7 @@ def solve(blocks: LaggedRows) -> LeastSquares:
     return solution
 
 
-def _require_finite(values: Matrix) -> None:
+def _require_finite(values: Matrix | Frames) -> None:
     """Refuse sums or solutions of rows with values that are not finite."""
     if np.isfinite(values).all():
         return

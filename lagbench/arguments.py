@@ -459,7 +459,7 @@ def _read_number(text: str, *, whole: bool) -> str:
 
 
 def _round_number(value: object) -> int | None:
-    """Return a number without fraction as a whole number."""
+    """Return a number as a whole one; None where it has a fraction or is infinite."""
     try:
         number = int(value)  # type: ignore[call-overload]
     except (OverflowError, ValueError):

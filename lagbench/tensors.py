@@ -73,9 +73,11 @@ class TensorBox(nn.Module):
             return position
         count = torch.floor((position.detach() - self.start) / self.period)
         wrapped = position - torch.where(count == 0.0, 0.0, count * self.period)
-        # The difference can round up to the upper end, which is the lower one.
+        # The difference can round up to the upper end, which is the lower one, or to
+        # less than the lower end.
         is_at_end = wrapped >= self.start + self.period
-        return torch.where(is_at_end, self.start, wrapped)
+        is_before_start = (count != 0.0) & (wrapped < self.start)
+        return torch.where(is_at_end | is_before_start, self.start, wrapped)
 
     def stop_at_walls(self, position: Tensor, velocity: Tensor) -> Tensor:
         """Return velocities that lead no particle past a wall [length/frame].

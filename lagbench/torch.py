@@ -309,7 +309,7 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
 
     Raises:
         UsageError: frames below 1 or beyond the known forcing, or the model returns no
-            [particle, axis].
+            real [particle, axis] on the device of the given frames.
     """
     # Beyond the known forcing a model would take the last known one.
     longest = max(1, frames)
@@ -325,18 +325,21 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
             fix="give longer windows, cut by batch.part(slice(history))",
         )
     batch = given
-    shape = batch.position[:, -1].shape
     predicted_frames = []
     for _ in range(frames):
         position = step(batch)
-        _check_step_result(position, shape)
+        _check_step_result(position, batch.position[:, -1])
         batch = batch.followed_by(position)
         # A copy: the model may use the memory of its answer again.
         predicted_frames.append(batch.position[:, -1])
     return torch.stack(predicted_frames, dim=1)
 
 
-def _check_step_result(position: object, shape: torch.Size) -> None:
+def _check_step_result(position: object, last_position: Tensor) -> None:
+    """Refuse a result that is no real tensor of the kind of the last positions."""
+    shape = last_position.shape
+    device = last_position.device
+    expected = f"a tensor of shape {list(shape)}: [particle, axis]"
     fix = "return the positions of the next frame only: position[:, -1] + v"
     got = type(position).__name__
     if isinstance(position, np.ndarray):
@@ -344,14 +347,19 @@ def _check_step_result(position: object, shape: torch.Size) -> None:
         fix = "return a tensor: torch.from_numpy(array).to(batch.position)"
     elif isinstance(position, Tensor):
         got = f"a tensor of shape {list(position.shape)}"
-    if not isinstance(position, Tensor) or position.shape != shape:
-        raise UsageError(
-            "a model returned no positions of the next frame",
-            where="roll_out, step",
-            expected=f"a tensor of shape {list(shape)}: [particle, axis]",
-            got=got,
-            fix=fix,
-        )
+        if position.shape == shape:
+            if position.device == device and not position.is_complex():
+                return
+            expected = f"real numbers on the device {device}"
+            got = f"{position.dtype} on {position.device}"
+            fix = "return real numbers where the batch lies: .to(batch.position)"
+    raise UsageError(
+        "a model returned no positions of the next frame",
+        where="roll_out, step",
+        expected=expected,
+        got=got,
+        fix=fix,
+    )
 
 
 def check_history(history: int | None, given_frames: int, *, where: str) -> int:

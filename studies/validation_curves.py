@@ -24,7 +24,7 @@ from lagbench.atomic import write_atomically
 from lagbench.board.entry import Entry, Prediction, Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder, weights_path
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError, UsageError, format_count
 from lagbench.figures.chart import Plot, Spot, close_logarithmic
 from lagbench.figures.html import Markup, words
 from lagbench.figures.tables import markdown
@@ -190,7 +190,8 @@ def draw(data_set: tuple[str, str], curves: Sequence[ValidationCurve]) -> Markup
         )
         spots.append(spot)
     plot.spots(spots)
-    return plot.svg(where, f"{where}: validation errors of {len(curves)} trainings.")
+    trainings = format_count(len(curves), "training")
+    return plot.svg(where, f"{where}: validation errors of {trainings}.")
 
 
 def table(curves: dict[tuple[str, str], list[ValidationCurve]]) -> str:

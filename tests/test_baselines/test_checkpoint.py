@@ -232,6 +232,9 @@ ONE = torch.ones(1)
         ("facts", "particles", -3),
         ("facts", "radius", math.inf),
         ("facts", "statistics", "velocity_std", [math.nan, 1.0]),
+        ("facts", "bounds", [[1.0, 0.0], [0.0, 1.0]]),
+        ("facts", "periodic", ["z"]),
+        {"optimizer": 5},
         {"about": "[" * 10**5},
         {"lagbench_checkpoint": torch.ones(2)},
         {"lagbench_checkpoint": True},
@@ -271,14 +274,36 @@ def test_missing_truncated_files_and_pipes_are_unreadable(tmp_path: Path) -> Non
     whole = (tmp_path / "cut.pt").read_bytes()
     half = len(whole) // 2
     (tmp_path / "cut.pt").write_bytes(whole[:half])
+    longer_than_a_name = "x" * 300
     for name, words in (
         ("none.pt", "no such file"),
         ("cut.pt", None),
         ("pipe.pt", None),
+        (longer_than_a_name, None),
     ):
         with pytest.raises(UnreadableFileError, match=words) as caught:
             load(tmp_path / name)
         assert caught.value.where == str(tmp_path / name)
+
+
+def test_what_is_saved_can_be_loaded_or_is_refused(tmp_path: Path) -> None:
+    """A tensor may be a view of more memory, or of less, than it has numbers."""
+    file = tmp_path / "views.pt"
+    long_row = torch.arange(10**6, dtype=torch.float32)
+    views = {"repeated": ONE.expand(5), "short": long_row[3:6]}
+    save(file, example(weights=views))
+    loaded = load(file)
+    for name, value in views.items():
+        assert torch.equal(loaded.weights[name], value)
+    assert file.stat().st_size < 10**5
+
+    for value in (ONE.to_sparse(), ONE.to(torch.complex64), ONE.to("meta")):
+        for suffix in (".pt", ".safetensors"):
+            path = tmp_path / f"other{suffix}"
+            with pytest.raises(UsageError) as caught:
+                save(path, example(weights={"a": value}))
+            assert caught.value.where.startswith(str(path))
+            assert not path.exists()
 
 
 NO_CALLS = torch.tensor(0)

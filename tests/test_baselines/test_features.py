@@ -292,6 +292,13 @@ def test_the_target_makes_up_for_the_noise() -> None:
     assert_close(acceleration, expected, atol=1e-15, rtol=0)
 
 
+def test_a_single_frame_has_no_noise() -> None:
+    """Noise is on velocities, and one frame has none."""
+    truth = batch(swirl(0, 3)).position
+    disturbed = add_walk_noise(truth, 1, 0.3, generator())
+    assert torch.equal(disturbed, truth)
+
+
 def test_each_window_draws_the_deviation_of_its_noise() -> None:
     """Levels are uniform up to the largest, the same for all particles of a window."""
     windows = two_swirls()

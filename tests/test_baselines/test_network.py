@@ -190,6 +190,61 @@ def test_linear_leaves_other_types_and_shapes_to_torch() -> None:
     assert rounded.dtype == torch.bfloat16
 
 
+def test_gradients_of_linear_have_gradients() -> None:
+    """For y = W x the penalty |W^T W x|^2 has the gradient 2 (W^T W)^2 x."""
+    torch.manual_seed(0)
+    weight = torch.randn(4, 3)
+    x = torch.randn(5, 3, requires_grad=True)
+    energy = linear(x, weight).square().sum() / 2
+    (force,) = torch.autograd.grad(energy, x, create_graph=True)
+    (gradient,) = torch.autograd.grad(force.square().sum(), x)
+    square = weight.double().T @ weight.double()
+    expected = 2.0 * x.detach().double() @ square @ square
+    assert_close(gradient.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_second_gradients_of_an_edge_update_are_right_or_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Layers that are computed again have no second gradients, and say so."""
+    torch.manual_seed(0)
+    layer = EdgeMLP(4, 3).double()
+    inputs = graph(5, 9, node=4, edge=4)
+    edge = inputs.edge.double().requires_grad_()
+    node = inputs.node.double()
+
+    def update(edge: Tensor) -> Tensor:
+        return layer(edge, node, inputs.edge_index).square()
+
+    torch.autograd.gradgradcheck(update, (edge,))
+    monkeypatch.setattr(layers, "LARGEST_KEPT", 0.0)
+    loss = update(edge).sum()
+    (gradient,) = torch.autograd.grad(loss, edge, create_graph=True)
+    with pytest.raises(RuntimeError):
+        gradient.square().sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("x_width", "bias_width", "bias_type"),
+    [
+        (2, 4, torch.float32),
+        (3, 5, torch.float32),
+        (3, 4, torch.float64),
+    ],
+)
+def test_linear_refuses_what_torch_refuses(
+    x_width: int, bias_width: int, bias_type: torch.dtype
+) -> None:
+    x = torch.zeros(5, x_width)
+    weight = torch.zeros(4, 3)
+    bias = torch.zeros(bias_width, dtype=bias_type)
+    with pytest.raises(RuntimeError) as expected:
+        nn.functional.linear(x, weight, bias)
+    with pytest.raises(RuntimeError) as caught:
+        linear(x, weight, bias)
+    assert str(caught.value) == str(expected.value)
+
+
 def test_layer_norm_learns_in_bfloat16() -> None:
     """Its gradients are those of float64 to two digits: long sums do not stall."""
     torch.manual_seed(0)

@@ -361,6 +361,7 @@ def test_more_epochs_than_any_machine_could_train_are_refused(
         ("training.batch=0", "greater than 0"),
         ("training.windows=[test]", "never test"),
         ("training.windows=[train, valid]", "not valid"),
+        ("training.windows=[train, shift]", "shift"),
         ("training.learning_rate=.inf", "finite"),
         ("training.precision=off", "'bf16'"),
         ("training.opening_share=true", "opening_share"),
@@ -446,6 +447,26 @@ def test_no_such_recipe(entry: CatalogueEntry) -> None:
     ):
         with pytest.raises(UsageError, match=words):
             recipe_for(asked, split, size, variant=variant)
+
+
+def test_sizes_with_a_variant_are_named_once_and_exist(tmp_path: Path) -> None:
+    """A variant may have hyphens. A recipe of all splits may repeat one of a split."""
+    with pytest.raises(UsageError) as caught:
+        recipe_for(find("mlp"), "fluid", "mini", variant="100")
+    assert "full-table" not in str(caught.value.fix)
+    with pytest.raises(UsageError) as caught:
+        recipe_for(find("mlp"), "fluid", "mini", variant="table-4.3-100")
+    assert "--size full " in str(caught.value.fix)
+
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        "format: 1\nrecipes: {cavity/full: {}, cavity/mini-a: {}, '*/mini-a': {}, "
+        "cavity/own-size: {}, cavity/own-size-a: {}}\n"
+    )
+    own = CatalogueEntry(name="drift", model=Drift, recipes=path)
+    with pytest.raises(UsageError) as caught:
+        recipe_for(own, "cavity", "full", variant="a")
+    assert "--size mini or own-size " in str(caught.value.fix)
 
 
 def test_a_split_without_a_recipe_gets_an_example_that_works(tmp_path: Path) -> None:
@@ -616,6 +637,23 @@ def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> 
             pytest.raises(UsageError, match=reason),
         ):
             find(name)
+
+
+class Misspelt(Drift):
+    """A baseline whose options of the training have no such name."""
+
+    class Options(Drift.Options):
+        """An option, and another name for it."""
+
+        in_training = frozenset({"strat"})
+
+
+def test_options_of_the_training_exist(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the check, predictions would fail after a whole training."""
+    install(monkeypatch, misspelt=Misspelt)
+    with pytest.raises(UsageError) as caught:
+        find("misspelt")
+    assert "strat" in str(caught.value.got)
 
 
 def test_the_page_of_the_baselines_is_complete() -> None:

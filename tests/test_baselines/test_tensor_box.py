@@ -52,6 +52,32 @@ def test_points_inside_are_those_of_the_box_of_arrays(box: Box) -> None:
     assert_allclose(gap, 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("low", [0.0, 0.1, -0.5, 0.3])
+@pytest.mark.parametrize("length", [0.3, 0.7, 1.0, 6.0])
+def test_wrapped_points_lie_in_the_box_whatever_is_rounded(
+    low: float, length: float
+) -> None:
+    """Points next to whole periods are rounded to either side of an end."""
+    box = Box.from_bounds([(low, low + length), UNIT], [True, False])
+    points = []
+    for periods in range(-4, 5):
+        place = np.float32(low + periods * length)
+        for _ in range(6):
+            place = np.nextafter(place, np.float32(-np.inf))
+        for _ in range(12):
+            points.append([place, -0.25])
+            place = np.nextafter(place, np.float32(np.inf))
+    position = torch.tensor(np.array(points))
+    tensor_box = TensorBox(box)
+    x, y = tensor_box.wrap(position).unbind(dim=1)
+    start = np.float32(low)
+    end = start + np.float32(length)
+    assert bool((x >= start).all())
+    assert bool((x < end).all())
+    # Between walls nothing is wrapped.
+    assert torch.equal(y, position[:, 1])
+
+
 def test_between_walls_the_bits_are_those_of_a_clamp_and_a_difference() -> None:
     box = TensorBox(WALLED)
     start = draw_points(WALLED, 3).float()

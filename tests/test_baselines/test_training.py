@@ -30,7 +30,12 @@ from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.run_folder import RunFolder
 from lagbench.baselines.train import StepBatches, TrainingResult, train
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DataError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.make.generate import GenerationResult
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Progress
@@ -363,6 +368,21 @@ def test_the_learning_rate_is_multiplied_by_the_processes() -> None:
     alone = Optimisation(model, options, steps=5, processes=1)
     three = Optimisation(model, options, steps=5, processes=3)
     assert three.learning_rate == pytest.approx(3 * alone.learning_rate)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {},
+        {"state": {}, "param_groups": []},
+        {"state": {}, "param_groups": [{"params": [0, 1, 2]}]},
+        {"state": 3, "param_groups": [{"params": [0]}]},
+    ],
+)
+def test_the_state_of_another_optimiser_is_refused(state: dict[str, Any]) -> None:
+    model = Drift.build({}, INFO)
+    with pytest.raises(UnreadableFileError):
+        Optimisation(model, TrainingOptions(), steps=5, optimizer_state=state)
 
 
 def test_gradients_are_clipped(run: Run, steps_taken: list[Step]) -> None:

@@ -211,6 +211,17 @@ def test_responses_that_are_not_finite_are_refused(frames: int, value: float) ->
         solve(rows)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("frame", [4, -1])
+def test_positions_that_are_not_finite_are_refused(frame: int, value: float) -> None:
+    """The last frame is only the end of a change."""
+    scenarios = noisy_orbits(2)
+    model = StableVAR.build({"rank": 3}, info_of(scenarios))
+    scenarios[0][frame, 1, 0] = value
+    with pytest.raises(WorkFailedError):
+        model.fit(scenarios)
+
+
 def noisy_orbits(
     scenarios: int,
     *,

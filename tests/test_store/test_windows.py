@@ -1178,6 +1178,25 @@ def test_outputs_that_are_no_positions_are_refused(
     assert str(caught.value.got).startswith(kind)
 
 
+@pytest.mark.parametrize(
+    "change_output",
+    [
+        lambda position: position.to("meta"),
+        lambda position: position + 0j,
+    ],
+    ids=["another device", "complex numbers"],
+)
+def test_positions_are_real_numbers_on_the_device_of_the_batch(
+    two_frames: Batch, change_output: Callable[[Any], Any]
+) -> None:
+    def step(batch: Batch) -> Any:
+        return change_output(last_position(batch))
+
+    with pytest.raises(UsageError) as caught:
+        roll_out(step, two_frames, 2)
+    assert caught.value.where == "roll_out, step"
+
+
 def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:
     with pytest.raises(UsageError):
         roll_out(extrapolate, two_frames, 0)
