@@ -78,6 +78,7 @@ class Optimisation:
         """Continue with the state that an optimiser of an earlier run had."""
         try:
             self.optimizer.load_state_dict(dict(state))
+            self._check_shapes()
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise UnreadableFileError(
@@ -87,6 +88,19 @@ class Optimisation:
                 got=f"{type(error).__name__}: {reason[:200]}",
                 fix="train anew with --fresh, or take an earlier checkpoint",
             ) from error
+
+    def _check_shapes(self) -> None:
+        """Refuse averages of another shape: the optimiser would write beyond them.
+
+        Raises:
+            ValueError: an average does not have the shape of its parameter.
+        """
+        for parameter, values in self.optimizer.state.items():
+            for name, value in values.items():
+                shape = torch.Size() if name == "step" else parameter.shape
+                is_dense = isinstance(value, Tensor) and value.layout is torch.strided
+                if not is_dense or value.shape != shape:
+                    raise ValueError(f"{name} is no tensor of shape {list(shape)}")
 
     @property
     def learning_rate(self) -> float:

@@ -13,10 +13,10 @@ density of the last given frame. The number c says how much denser a place may b
 Where C_i > 0, one iteration moves the particles by
 
     lambda_i = -C_i / (sum_k |grad_k C_i|^2 + epsilon)
-    dx_i = 1 / (c rho_0) sum_j (lambda_i + lambda_j) grad W(x_i - x_j)
+    dx_i = s / (c rho_0) sum_j (lambda_i + lambda_j) grad W(x_i - x_j)
 
-(Eqs. 1, 8, 11 and 12 of that paper). True states hardly reach the limit. So relaxation
-leaves single steps as they are.
+(Eqs. 1, 8, 11 and 12 of that paper, where s is 1). Where some particles of true states
+exceed the limit, relaxation disturbs single steps.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SOFTNESS = 0.1
 """epsilon times the square of the support: it bounds steps where few are near."""
 
 SHARE = 0.5
-"""Share of a movement that is made: neighbours that all move overshoot together."""
+"""The factor s of a movement: with 1, neighbours that all move overshoot together."""
 
 
 class Pairs(NamedTuple):

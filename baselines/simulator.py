@@ -83,7 +83,8 @@ class ParticleState:
     # centre and radius of each window's obstacle [length], shape [window, axis + 1];
     # None where the model does not see it
     obstacle: Tensor | None = None
-    # largest density that relaxation leaves alone [1], shape [window]; None without it
+    # largest density that relaxation leaves alone [1], shape [window]; None before the
+    # first step of a rollout, and without relaxation
     density_limit: Tensor | None = None
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
@@ -437,6 +438,7 @@ class GraphNetwork(Baseline):
                 got=options.free_flight,
                 fix="leave the option out",
             )
+        self._check_relaxation()
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
                 f"{self.method} predicts no links",
@@ -444,6 +446,33 @@ class GraphNetwork(Baseline):
                 expected="null",
                 got=options.link_weight,
                 fix="leave the option out, or train supergat",
+            )
+
+    def _check_relaxation(self) -> None:
+        """Refuse options beside which rollouts cannot be relaxed.
+
+        Raises:
+            UsageError: particles may leave the box, or have a limited number of
+                neighbours.
+        """
+        options = self.options
+        if not options.relaxation:
+            return
+        if not options.clamp:
+            raise UsageError(
+                "relaxation keeps particles in the box",
+                where="model.relaxation",
+                expected="model.clamp=true beside it",
+                got="model.clamp=false",
+                fix="leave one of the two out",
+            )
+        if options.neighbours is not None:
+            raise UsageError(
+                "relaxation needs all neighbours of a particle",
+                where="model.relaxation",
+                expected="model.neighbours=null beside it",
+                got=f"model.neighbours={options.neighbours}",
+                fix="leave one of the two out",
             )
 
     def adapt_weights(
@@ -698,33 +727,31 @@ class GraphNetwork(Baseline):
             next_frame = min(given.frames, known_frames - 1)
             per_second = given.wall_velocity[:, next_frame:]
             walls = per_second * self.info.frame_interval
-        position = given.position[:, -1]
-        density_limit = None
-        if self.relaxation is not None:
-            density_limit = self.relaxation.limit(position, given.sample)
         return ParticleState(
-            position=position,
+            position=given.position[:, -1],
             velocity=last_velocities(given.position, self.options.velocities, self.box),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
             body_force=self.forcing.coming_force(given),
             obstacle=self.forcing.find_obstacle(given),
-            density_limit=density_limit,
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
         following, _ = self.step(state)
-        if self.relaxation is None or following.density_limit is None:
+        if self.relaxation is None:
             return following, following.position
-        position = self.relaxation(
-            following.position, following.sample, following.density_limit
-        )
+        limit = state.density_limit
+        if limit is None:  # the first step of a rollout
+            limit = self.relaxation.limit(state.position, state.sample)
+        position = self.relaxation(following.position, following.sample, limit)
         correction = self.box.displacement(following.position, position)
         velocity = following.velocity.clone()
         velocity[:, -1] += correction
-        following = replace(following, position=position, velocity=velocity)
+        following = replace(
+            following, position=position, velocity=velocity, density_limit=limit
+        )
         return following, position
 
     def step(

@@ -75,9 +75,9 @@ score is better.
   `against_classical` uses them. Other rows may come from other machines.
 - `skill` is 1 - (score of the model) / (score of the best naive baseline).
 - `against_classical` is (score of the model) / (score of the best classical solver that
-  costs no more per frame than the model). If every classical solver costs more, it is
-  the cheapest one, and the cell says so. The brackets contain the 95 % interval. The
-  name of the solver follows. If the whole interval is below 1,
+  costs no more per frame than the model). If every classical solver costs more, the
+  solver is the cheapest one, and the cell says so. The brackets contain the 95 %
+  interval. The name of the solver follows. If the whole interval is below 1,
   [learning pays](glossary.md)."""
 
 HOW_TO_READ = """\

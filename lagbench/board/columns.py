@@ -320,7 +320,8 @@ ENTRY_COLUMNS = (
         key="solver",
         label="classical solver",
         form="text",
-        meaning="The best classical solver that costs no more per frame.",
+        meaning="The best classical solver that costs no more per frame. Where all cost"
+        " more, the cheapest one.",
         read=_read_solver,
     ),
     Column(

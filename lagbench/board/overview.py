@@ -355,13 +355,18 @@ def is_open(ratio: Value) -> bool:
 
 
 def format_comparison(row: BoardRow) -> str:
-    """Return the ratio to a classical solver, as in "0.86× (0.8 to 0.9)"."""
+    """Return the ratio to a classical solver, as in "0.86× (0.8 to 0.9)".
+
+    The sign † says that the solver costs more.
+    """
     ratio = row.against_classical
     if ratio is None:
         return "no solver is as cheap"
+    sign = "†" if row.is_cheapest else ""
     if math.isnan(ratio.low + ratio.high):
-        return _format_ratio(ratio)
-    return f"{_format_ratio(ratio)} ({text(ratio.low, 2)} to {text(ratio.high, 2)})"
+        return f"{_format_ratio(ratio)}{sign}"
+    interval = f"({text(ratio.low, 2)} to {text(ratio.high, 2)})"
+    return f"{_format_ratio(ratio)}{sign} {interval}"
 
 
 def _compare(row: BoardRow, ratio: Value) -> str:
@@ -528,9 +533,9 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
     sentences = []
     if winners:
         sentences.append(
-            f"Learning pays on {_share(len(winners), total)}: there the most accurate "
-            "model has less error than every classical solver of lagbench that costs "
-            "no more per frame."
+            f"Learning pays on {_share(len(winners), total)}: there no classical "
+            "solver of lagbench is as cheap per frame and as accurate as the most "
+            "accurate model."
         )
         sentences += _describe_winners(winners)
     for verdict, statement in OTHER_VERDICTS.items():
@@ -546,8 +551,8 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
         win_count = learned_verdicts.count(LearningVerdict.PAYS)
         open_count = learned_verdicts.count(LearningVerdict.OPEN)
         sentences.append(
-            f"With purely learned models learning pays on {win_count} of "
-            f"{len(learned_verdicts)}; on {open_count} the question is open."
+            f"Purely learned models pay on {win_count} of {len(learned_verdicts)} data "
+            f"sets; on {open_count} the question is open."
         )
     return sentences
 

@@ -142,8 +142,10 @@ FOOT = (
 OVERVIEW_WORDS = (
     "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
     "prediction. “0.9×” is the error beside that of the best classical solver that "
-    "costs no more per frame than the model: below 1, learning pays. So two models of "
-    "one data set may stand beside different solvers. The question is open where the "
+    "costs no more per frame than the model: below 1, learning pays. Where all cost "
+    "more, the cheapest one takes its place, and the sign † stands behind the number. "
+    "So two models of one data set may stand beside different solvers. The question is "
+    "open where the "
     "95 % interval contains 1. The error is the metric that ranks on the data set: "
     "that of vorticity in boxes full of fluid, the distance of particle clouds on free "
     "surfaces. The cost is the processor time of a frame on one core. Size mini is "
@@ -153,10 +155,10 @@ OVERVIEW_WORDS = (
 CELL_WORDS = (
     "A cell has the skill, the rank on this data set, and the error beside that of the "
     "best classical solver that costs no more per frame. Where all cost more, the "
-    "cheapest one takes its place. The last one is missing where the cost is unknown. "
-    "A question mark stands where its 95 % interval contains 1. A rank such as 2–4 "
-    "names the places that a method takes when the test scenarios are drawn again "
-    "(95 %). Ranks count entries only: classical solvers and baselines have none. "
+    "cheapest one takes its place, with the sign †. The last one is missing where the "
+    "cost is unknown. A question mark stands where its 95 % interval contains 1. A "
+    "rank such as 2–4 names the places that a method takes when the test scenarios are "
+    "drawn again (95 %). Ranks count entries only: classical solvers and baselines have none. "
     "Variants of a method are folded behind it, without a rank."
 )
 
@@ -670,6 +672,8 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
     if row.against_classical is not None:
         ratio = f"{text(row.against_classical.mean, 2)}×"
+        if row.is_cheapest:
+            ratio += "†"
         if is_open(row.against_classical):
             ratio += "?"
         remarks.append(ratio)

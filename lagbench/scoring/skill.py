@@ -154,19 +154,19 @@ def compute_against_classical(
         None without a solver, without a scenario that both have, and for a metric of
         which less is not better.
     """
-    if not solvers:
-        return None
+    scored = {}
     affordable = {}
     for name, score in solvers.items():
+        if score.mean > 0.0:
+            scored[name] = score
         if seconds[name] <= seconds_per_frame:
             affordable[name] = score
-    solver: str | None
-    if affordable:
-        solver = best_reference(affordable)
-    else:
-        solver = min(solvers, key=lambda name: seconds[name])
-    if solver is None:
+    if not scored:
         return None
+    solver = best_reference(affordable)
+    costs_more = solver is None
+    if solver is None:
+        solver = min(scored, key=lambda name: (seconds[name], scored[name].mean))
     ratio = _compute_ratio(seeds, solvers[solver])
     if ratio is None:
         return None
@@ -176,7 +176,7 @@ def compute_against_classical(
         value=ratio.value,
         interval=ratio.interval,
         std=ratio.std,
-        solver_costs_more=not affordable,
+        solver_costs_more=costs_more,
     )
 
 

@@ -116,11 +116,11 @@ def fetch_scenarios(
                 scenario = pending[transfer]
                 try:
                     is_resumed = transfer.result()
+                    # Here and not in the threads: HDF5 is not safe in several threads.
+                    _accept_fetched(requests[scenario], count, is_resumed=is_resumed)
                 except NotInStoreError as error:
                     yield scenario, error
                 else:
-                    # Here and not in the threads: HDF5 is not safe in several threads.
-                    _accept_fetched(requests[scenario], count, is_resumed=is_resumed)
                     yield scenario, None
         except DataError:
             stop.set()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,9 @@ from simple_models import batch, network, rolled
 from torch import Tensor
 
 from lagbench.baselines.relaxation import SHARE, SOFTNESS, Relaxation
+from lagbench.baselines.simulator import ParticleState
 from lagbench.data.box import Box
+from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
 RADIUS = 0.06
@@ -105,8 +110,8 @@ def test_squeezed_particles_return_below_the_limit(dimension: int) -> None:
     part = relaxation(iterations=40, dimension=dimension)
     limit = part.limit(resting, sample)
     crowded = squeezed(resting)
-    periodic = densities(crowded.double(), periodic=True)
-    assert periodic.max() > 1.3 * limit
+    density = densities(crowded.double(), periodic=True)
+    assert density.max() > 1.3 * limit
 
     relaxed = part(crowded, sample, limit)
     density = densities(relaxed.double(), periodic=True)
@@ -152,15 +157,61 @@ def test_a_rollout_with_relaxation_does_not_collapse() -> None:
     small = {"awake": True, "latent": 8, "layers": 1, "radius": RADIUS}
     model = network(**small, relaxation=5)
     free = rolled(network(**small), given, 30)
-    held = rolled(model, given, 30)
+    relaxed = rolled(model, given, 30)
     start = densities(torch.tensor(resting), periodic=False).mean()
     densest_free = densities(free[:, -1].double(), periodic=False).max()
-    densest_held = densities(held[:, -1].double(), periodic=False).max()
+    densest_relaxed = densities(relaxed[:, -1].double(), periodic=False).max()
     assert densest_free > 3.0 * start
-    assert densest_held < 1.6 * start
+    assert densest_relaxed < 1.6 * start
 
     state, position = model.advance(model.start(given))
     for _ in range(15):
         previous = position
         state, position = model.advance(state)
     torch.testing.assert_close(state.velocity[:, -1], position - previous)
+
+
+def test_the_velocity_across_a_periodic_end_is_the_shortest_way() -> None:
+    """A heap at the end of a box spreads to both sides."""
+    rng = np.random.default_rng(6)
+    heap = rng.normal(0.0, 0.01, (30, 2)) % 1.0
+    box = {"bounds": ((0.0, 1.0), (0.0, 1.0)), "periodic": ("x", "y")}
+    model = network(changes=box, radius=RADIUS, relaxation=3, densest=1.01)
+    rested = np.concatenate([heap[:1], rng.uniform(0.0, 1.0, (29, 2))])
+    state = model.start(batch(np.stack([rested, rested])))
+    limit = model.relaxation.limit(state.position, state.sample)
+    position = torch.tensor(heap).float()
+    crowded = replace(state, position=position, density_limit=limit)
+    moved, after = model.advance(crowded)
+    way = model.box.displacement(position, after)
+    assert (after[:, 0] < 0.5).any()
+    assert (after[:, 0] > 0.5).any()
+    assert way.abs().max() > 1e-3
+    torch.testing.assert_close(moved.velocity[:, -1], way, atol=1e-6, rtol=0.0)
+
+
+def test_training_sees_relaxed_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The steps of a pushforward are those of a rollout."""
+    counts = []
+    model = network(radius=RADIUS, relaxation=2, pushforward=3)
+    original = model.advance
+
+    def count(state: ParticleState) -> tuple[ParticleState, Tensor]:
+        counts.append(1)
+        return original(state)
+
+    monkeypatch.setattr(model, "advance", count)
+    frames = np.repeat(lattice(6).numpy()[None], model.history + model.future, axis=0)
+    given = batch(frames)
+    for seed in range(6):
+        model(given, torch.Generator().manual_seed(seed))
+    assert len(counts) > 3
+
+
+@pytest.mark.parametrize("options", [{"clamp": False}, {"neighbours": 20}])
+def test_options_that_contradict_relaxation_are_refused(
+    options: dict[str, Any],
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        network(relaxation=2, **options)
+    assert caught.value.where == "model.relaxation"

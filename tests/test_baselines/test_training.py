@@ -385,6 +385,20 @@ def test_the_state_of_another_optimiser_is_refused(state: dict[str, Any]) -> Non
         Optimisation(model, TrainingOptions(), steps=5, optimizer_state=state)
 
 
+def test_averages_of_another_shape_are_refused() -> None:
+    """The optimiser would write beyond their memory."""
+    model = torch.nn.Linear(50, 3)
+    options = TrainingOptions()
+    training = Optimisation(model, options, steps=5)
+    model(torch.ones(1, 50)).sum().backward()
+    training.optimizer.step()
+    state = training.optimizer.state_dict()
+    Optimisation(model, options, steps=5, optimizer_state=state)
+    state["state"][0]["exp_avg"] = torch.zeros(3, 5)
+    with pytest.raises(UnreadableFileError):
+        Optimisation(model, options, steps=5, optimizer_state=state)
+
+
 def test_gradients_are_clipped(run: Run, steps_taken: list[Step]) -> None:
     """A gradient longer than `clip` is scaled to it before the optimiser sees it."""
     run("drift", "steps=2", "validate_every=0")

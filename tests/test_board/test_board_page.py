@@ -444,7 +444,7 @@ def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
     assert "The model is hybrid: a classical solver" in shown
     assert "The model is slower than the simulator" in shown
     assert (
-        "With purely learned models learning pays on 0 of 1; on 1 the question is open"
+        "Purely learned models pay on 0 of 1 data sets; on 1 the question is open"
         in shown
     )
     winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×, slower"
@@ -590,7 +590,7 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     sentences = conclude(tab)
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
-    assert "cavityno solver is as cheapModellearned1.5× (1.2 to 1.9)" in shown
+    assert "cavityno solver is as cheapModellearned1.5×† (1.2 to 1.9)" in shown
     statement = "No classical solver is as cheap as the most accurate model on the only"
     assert statement in shown
     assert "Learning" not in shown
