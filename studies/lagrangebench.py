@@ -72,13 +72,13 @@ FLOWS = (
     ComparedFlow(
         name="decaying vortices",
         split="decaying-vortices",
-        methods=("neuralmpm", "hybrid-projection"),
+        methods=("neuralmpm", "gns", "hybrid-projection"),
         published=_published("2D TGV", ("5.9e-6", "4.9e-7"), ("4.4e-6", "5.0e-7")),
     ),
     ComparedFlow(
         name="reverse Poiseuille",
         split="poiseuille",
-        methods=("neuralmpm", "hybrid-projection"),
+        methods=("neuralmpm", "gns", "hybrid-projection"),
         published=_published("2D RPF", ("4.0e-6", "2.7e-5"), ("3.4e-6", "1.4e-5")),
     ),
     ComparedFlow(

@@ -158,8 +158,8 @@ CELL_WORDS = (
     "cheapest one takes its place, with the sign †. The last one is missing where the "
     "cost is unknown. A question mark stands where its 95 % interval contains 1. A "
     "rank such as 2–4 names the places that a method takes when the test scenarios are "
-    "drawn again (95 %). Ranks count entries only: classical solvers and baselines have none. "
-    "Variants of a method are folded behind it, without a rank."
+    "drawn again (95 %). Ranks count entries only: classical solvers and baselines "
+    "have none. Variants of a method are folded behind it, without a rank."
 )
 
 VERDICT_HEADINGS = (
