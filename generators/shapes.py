@@ -294,7 +294,10 @@ def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
     steps = _ROBERTS[dimension]
     shift = rng.random(steps.shape)
     side = 2.0 * max(reach)
-    _check_share(body.shape, side**dimension)
+    volume = 1.0  # of the square or cube
+    for _ in range(dimension):
+        volume *= side
+    _check_share(body.shape, volume)
     # in blocks: a million particles take no memory beside their own
     block_size = min(4 * count, 1 << 16)
     blocks = [np.empty((0, dimension))]

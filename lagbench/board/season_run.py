@@ -311,7 +311,7 @@ class _SeasonRun:
     def _check_seeds(self, task: ScoredTask, data_set: SeasonDataSet) -> None:
         """Refuse scenarios that were drawn from another seed.
 
-        The caller adds what to do about them.
+        The caller replaces what to do about them.
         """
         words = []
         for start in range(0, 64, 16):
@@ -327,6 +327,7 @@ class _SeasonRun:
                     where=str(path),
                     expected=expected,
                     got=seed,
+                    fix="remove the blind data, then: lagbench generate --season NAME",
                 )
 
     def _score_reference(

@@ -74,6 +74,7 @@ def test_the_help_of_a_group_loads_no_command() -> None:
         "lagbench.addresses",
         "lagbench.cli",
         "lagbench.cli.commands",
+        "lagbench.cli.stderr",
         "lagbench.cli.typed_settings",
         "lagbench.errors",
     }
