@@ -8,6 +8,7 @@ import hashlib
 import os
 import secrets
 import shlex
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -43,8 +44,10 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     When the body raises, the temporary file is removed and the target stays as it was.
 
     Raises:
-        WorkFailedError: the operating system refused.
+        WorkFailedError: the operating system refused, or a device, socket or pipe has
+            the name of the target.
     """
+    _refuse_special(target)
     temporary = temporary_name(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -85,6 +88,23 @@ def checked_path(target: Path, *, option: str) -> Iterator[Path]:
             error.add_note(f"which was to become {target}")
             raise
         write_atomically(target, unchecked.read_bytes(), option=option)
+
+
+def _refuse_special(target: Path) -> None:
+    """Refuse to replace a device, socket or pipe; the superuser's rename would."""
+    try:
+        mode = target.lstat().st_mode
+    except OSError:
+        return  # nothing is there, or the write names the error
+    if stat.S_ISREG(mode) or stat.S_ISLNK(mode) or stat.S_ISDIR(mode):
+        return
+    raise WorkFailedError(
+        "the output is no file",
+        where=str(target),
+        expected="the name of a file",
+        got="a device, socket or pipe",
+        fix="name a file",
+    )
 
 
 def move_together(moves: Sequence[tuple[Path, Path]]) -> None:

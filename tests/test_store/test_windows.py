@@ -1156,6 +1156,19 @@ def test_a_model_may_use_the_memory_of_its_output_again(two_frames: Batch) -> No
     assert torch.equal(path, expected)
 
 
+def error_of_changed_output(
+    given: Batch, change_output: Callable[[Any], Any]
+) -> UsageError:
+    """Return the error of a rollout whose model returns something else."""
+
+    def step(batch: Batch) -> Any:
+        return change_output(last_position(batch))
+
+    with pytest.raises(UsageError) as caught:
+        roll_out(step, given, 2)
+    return caught.value
+
+
 @pytest.mark.parametrize(
     "change_output",
     [
@@ -1169,13 +1182,9 @@ def test_a_model_may_use_the_memory_of_its_output_again(two_frames: Batch) -> No
 def test_outputs_that_are_no_positions_are_refused(
     two_frames: Batch, change_output: Callable[[Any], Any]
 ) -> None:
-    def step(batch: Batch) -> Any:
-        return change_output(last_position(batch))
-
-    with pytest.raises(UsageError) as caught:
-        roll_out(step, two_frames, 2)
+    error = error_of_changed_output(two_frames, change_output)
     kind = "a NumPy array" if change_output is np.asarray else "a tensor"
-    assert str(caught.value.got).startswith(kind)
+    assert str(error.got).startswith(kind)
 
 
 @pytest.mark.parametrize(
@@ -1189,12 +1198,8 @@ def test_outputs_that_are_no_positions_are_refused(
 def test_positions_are_real_numbers_on_the_device_of_the_batch(
     two_frames: Batch, change_output: Callable[[Any], Any]
 ) -> None:
-    def step(batch: Batch) -> Any:
-        return change_output(last_position(batch))
-
-    with pytest.raises(UsageError) as caught:
-        roll_out(step, two_frames, 2)
-    assert caught.value.where == "roll_out, step"
+    error = error_of_changed_output(two_frames, change_output)
+    assert error.where == "roll_out, step"
 
 
 def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:

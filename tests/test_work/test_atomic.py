@@ -50,6 +50,16 @@ def test_an_error_keeps_the_old_file(
     assert list(tmp_path.iterdir()) == [target]
 
 
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    """Nor is a device: a rename by the superuser would take its place."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(WorkFailedError):
+        write_atomically(pipe, b"new")
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     """A usable folder is neither made nor changed. The error for an unusable one names
     its option, before the work and during it.
