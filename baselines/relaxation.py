@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 from lagbench.tensors import TensorBox
 
+from .forcing import outside_obstacle
 from .graph import radius_graph
 
 SUPPORT = 2.0
@@ -83,7 +84,13 @@ class Relaxation(nn.Module):
         return self.densest * sums / size
 
     @torch.no_grad()
-    def forward(self, position: Tensor, sample: Tensor, limit: Tensor) -> Tensor:
+    def forward(
+        self,
+        position: Tensor,
+        sample: Tensor,
+        limit: Tensor,
+        obstacle: Tensor | None = None,
+    ) -> Tensor:
         """Return corrected positions [length], shape [particle, axis].
 
         Neighbours are sought once: the kernel of a particle that enters the support in
@@ -93,6 +100,8 @@ class Relaxation(nn.Module):
             position: positions [length], shape [particle, axis].
             sample: window of each particle, ascending, int64, shape [particle].
             limit: largest density of each window that is left alone, shape [window].
+            obstacle: centre and radius of each particle's obstacle [length], shape
+                [particle, axis + 1]; None without one.
         """
         own_limit = limit[sample]
         sender, receiver = self._find_neighbours(position, sample)
@@ -104,6 +113,8 @@ class Relaxation(nn.Module):
                 break
             movement = _movement(pairs, excess, own_limit)
             position = self.box.inside(position + self.support * movement)
+            if obstacle is not None:
+                position = outside_obstacle(position, obstacle, self.box)
         return position
 
     def _find_neighbours(

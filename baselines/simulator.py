@@ -40,7 +40,7 @@ from .baseline import (
     last_velocities,
 )
 from .deviations import root_mean_square
-from .forcing import ForcingFeatures, skip_frames
+from .forcing import ForcingFeatures, outside_obstacle, skip_frames
 from .free_flight import FreeFlight
 from .graph import (
     NodeFeatures,
@@ -745,7 +745,12 @@ class GraphNetwork(Baseline):
         limit = state.density_limit
         if limit is None:  # the first step of a rollout
             limit = self.relaxation.limit(state.position, state.sample)
-        position = self.relaxation(following.position, following.sample, limit)
+        obstacle = None
+        if following.obstacle is not None:
+            obstacle = following.obstacle[following.sample]
+        position = self.relaxation(
+            following.position, following.sample, limit, obstacle
+        )
         correction = self.box.displacement(following.position, position)
         velocity = following.velocity.clone()
         velocity[:, -1] += correction
@@ -774,6 +779,9 @@ class GraphNetwork(Baseline):
 
         position = state.position + velocity
         inside = self._keep_inside(position)
+        if state.obstacle is not None:
+            own_obstacle = state.obstacle[state.sample]
+            inside = self._keep_outside(inside, own_obstacle)
         correction = self.box.displacement(position, inside)
         velocity = velocity + correction.detach()
         return state.move(inside, velocity), losses
@@ -824,6 +832,21 @@ class GraphNetwork(Baseline):
         clamped = self.box.inside(constant)
         zero = position - constant
         return clamped + zero
+
+    def _keep_outside(self, position: Tensor, obstacle: Tensor) -> Tensor:
+        """Return positions outside the obstacle, with the gradient of those given.
+
+        Args:
+            position: positions [length], shape [particle, axis].
+            obstacle: centre and radius of each particle's obstacle [length], shape
+                [particle, axis + 1].
+        """
+        if not self.options.clamp:
+            return position
+        constant = position.detach()
+        outside = outside_obstacle(constant, obstacle, self.box)
+        zero = position - constant
+        return outside + zero
 
 
 _CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

@@ -24,6 +24,7 @@ from lagbench.baselines.forcing import (
     ForcingFeatures,
     force_at,
     obstacle_features,
+    outside_obstacle,
     skip_frames,
 )
 from lagbench.baselines.graph import edge_features
@@ -186,6 +187,37 @@ def test_the_centre_of_an_obstacle_has_no_direction_and_no_gradient() -> None:
     features[:, 0].sum().backward()
     assert position.grad is not None
     assert position.grad.tolist() == [[0.0, 0.0]]
+
+
+@pytest.mark.parametrize("name", ["channel", "periodic cube"])
+def test_particles_in_an_obstacle_are_put_on_its_surface(name: str) -> None:
+    """Along the radius, also across a periodic end; the others stay to the bit."""
+    box = BOXES[name]
+    tensor_box = TensorBox(box)
+    radius = 0.1
+    centre = torch.full((box.dimension,), 0.5)
+    centre[0] = 0.95
+    rng = np.random.default_rng(2)
+    ray = rng.normal(size=(60, box.dimension))
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    length = rng.uniform(0.01, 0.2, 60)
+    normal = torch.from_numpy(ray).float()
+    distance = torch.from_numpy(length).float()[:, None]
+    position = tensor_box.wrap(centre + distance * normal)
+    obstacle = torch.cat([centre, torch.tensor([radius])]).expand(60, -1)
+
+    moved = outside_obstacle(position, obstacle, tensor_box)
+    is_outside = length > radius
+    assert torch.equal(moved[is_outside], position[is_outside])
+    surface = tensor_box.wrap(centre + radius * normal)
+    assert_close(moved[~is_outside], surface[~is_outside], rtol=0.0, atol=1e-5)
+    assert (moved[~is_outside, 0] < 0.5).any()
+    assert (moved >= 0.0).all()
+    assert (moved < 1.0).all()
+
+    moved = outside_obstacle(centre[None], obstacle[:1], tensor_box)
+    way = tensor_box.displacement(centre, moved[0])
+    assert_close(way.norm(), torch.tensor(radius))
 
 
 def swirl_in(box: Box, frames: int = 7) -> NDArray[np.float64]:

@@ -171,6 +171,29 @@ def test_a_rollout_with_relaxation_does_not_collapse() -> None:
     torch.testing.assert_close(state.velocity[:, -1], position - previous)
 
 
+def test_particles_do_not_enter_an_obstacle() -> None:
+    """They run to the centre, where a disc stands; with and without relaxation."""
+    resting = lattice(15).double().numpy()
+    from_centre = np.linalg.norm(resting - 0.5, axis=1)
+    outside = resting[from_centre > 0.15]
+    speed = 0.02 * (0.5 - outside)
+    disc = torch.tensor([[0.5, 0.5, 0.15]])
+    given = replace(batch(np.stack([outside - speed, outside])), obstacle=disc)
+    for iterations in (0, 5):
+        model = network(
+            awake=True,
+            latent=8,
+            layers=1,
+            radius=RADIUS,
+            relaxation=iterations,
+            obstacle=True,
+        )
+        last = rolled(model, given, 30)[:, -1]
+        assert (last - 0.5).norm(dim=1).min() > 0.15 - 1e-6
+        free = network(awake=True, latent=8, layers=1, radius=RADIUS)
+        assert (rolled(free, given, 30)[:, -1] - 0.5).norm(dim=1).min() < 0.1
+
+
 def test_the_velocity_across_a_periodic_end_is_the_shortest_way() -> None:
     """A heap at the end of a box spreads to both sides."""
     rng = np.random.default_rng(6)
