@@ -31,8 +31,11 @@ from lagbench.tensors import TensorBox
 from .forcing import outside_obstacle
 from .graph import radius_graph
 
-SUPPORT = 2.0
-"""Support of the kernel, in connectivity radii."""
+SUPPORT = {2: 2.0, 3: 1.5}
+"""Support of the kernel in connectivity radii, by the dimension of the box.
+
+Some 30 particles in the plane and 50 in space lie within it.
+"""
 
 SOFTNESS = 0.1
 """epsilon times the square of the support: it bounds steps where few are near."""
@@ -47,6 +50,15 @@ class Pairs(NamedTuple):
     sender: Tensor  # int64, shape [pair]
     receiver: Tensor  # int64, shape [pair]
     way: Tensor  # from sender to receiver, over the support [1], shape [pair, axis]
+
+    def of(self, chosen: Tensor) -> Pairs:
+        """Return the pairs in which at least one particle is chosen.
+
+        Args:
+            chosen: whether a particle is chosen, shape [particle].
+        """
+        either = chosen[self.sender] | chosen[self.receiver]
+        return Pairs(self.sender[either], self.receiver[either], self.way[either])
 
 
 class Relaxation(nn.Module):
@@ -65,7 +77,7 @@ class Relaxation(nn.Module):
     ) -> None:
         super().__init__()
         self.box = box
-        self.support = SUPPORT * radius
+        self.support = SUPPORT[box.box.dimension] * radius
         self.iterations = iterations
         self.densest = densest
 
@@ -111,7 +123,8 @@ class Relaxation(nn.Module):
             excess = (density / own_limit - 1.0).clamp(min=0.0)  # C_i
             if not excess.any():
                 break
-            movement = _movement(pairs, excess, own_limit)
+            crowded = pairs.of(excess > 0.0)
+            movement = _movement(crowded, excess, own_limit)
             position = self.box.inside(position + self.support * movement)
             if obstacle is not None:
                 position = outside_obstacle(position, obstacle, self.box)
@@ -143,7 +156,7 @@ def _movement(pairs: Pairs, excess: Tensor, limit: Tensor) -> Tensor:
     """Return the movement of one iteration over the support, shape [particle, axis].
 
     Args:
-        pairs: pairs of particles.
+        pairs: at least all pairs of particles of which one has an excess.
         excess: C_i of each particle, 0 where there is none, shape [particle].
         limit: largest density that is left alone at each particle, shape [particle].
     """

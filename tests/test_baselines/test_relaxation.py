@@ -18,7 +18,8 @@ from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
 RADIUS = 0.06
-SUPPORT = 2.0 * RADIUS
+RADIUS_3D = 0.12
+SUPPORT = {2: 2.0 * RADIUS, 3: 1.5 * RADIUS_3D}
 DENSEST = 1.2
 
 
@@ -27,8 +28,9 @@ def relaxation(
 ) -> Relaxation:
     """Return a relaxation in a unit box."""
     box = Box.from_bounds([(0.0, 1.0)] * dimension, [periodic] * dimension)
+    radius = RADIUS if dimension == 2 else RADIUS_3D
     return Relaxation(
-        TensorBox(box), radius=RADIUS, iterations=iterations, densest=DENSEST
+        TensorBox(box), radius=radius, iterations=iterations, densest=DENSEST
     )
 
 
@@ -56,7 +58,8 @@ def densities(position: Tensor, *, periodic: bool) -> Tensor:
     way = position[:, None] - position[None, :]
     if periodic:
         way = way - torch.round(way.detach())
-    square_distance = (way / SUPPORT).square().sum(dim=2)
+    support = SUPPORT[position.shape[1]]
+    square_distance = (way / support).square().sum(dim=2)
     kernel = (1.0 - square_distance).clamp(min=0.0) ** 3
     return kernel.sum(dim=1)
 
@@ -66,7 +69,7 @@ def test_the_limit_is_a_multiple_of_the_mean_density() -> None:
     position = torch.tensor([[0.5, 0.5], [0.56, 0.5], [0.5, 0.5]])
     sample = torch.tensor([0, 0, 1])
     limit = relaxation().limit(position, sample)
-    of_pair = 1.0 + (1.0 - (0.06 / SUPPORT) ** 2) ** 3
+    of_pair = 1.0 + (1.0 - (0.06 / SUPPORT[2]) ** 2) ** 3
     expected = DENSEST * torch.tensor([of_pair, 1.0])
     torch.testing.assert_close(limit, expected)
 
@@ -84,14 +87,15 @@ def test_an_iteration_is_that_of_position_based_fluids(
     limit = 1.1 * densities(position, periodic=periodic).detach().min()
 
     excess = (densities(position, periodic=periodic) / limit - 1.0).clamp(min=0.0)
+    support = SUPPORT[dimension]
     expected = torch.zeros_like(position)
     for value in excess:
         if value == 0.0:
             continue
         (gradient,) = torch.autograd.grad(value, position, retain_graph=True)
-        gradient = SUPPORT * gradient  # the unit of length is the support
+        gradient = support * gradient  # the unit of length is the support
         multiplier = -value / (gradient.square().sum() + SOFTNESS)
-        expected += SHARE * SUPPORT * multiplier * gradient
+        expected += SHARE * support * multiplier * gradient
     expected = part.box.inside(position + expected).detach()
 
     start = position.detach()
