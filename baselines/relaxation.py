@@ -81,6 +81,16 @@ class Relaxation(nn.Module):
         self.iterations = iterations
         self.densest = densest
 
+    def density(self, position: Tensor, sample: Tensor) -> Tensor:
+        """Return the density rho_i at each particle [1], shape [particle].
+
+        Args:
+            position: positions [length], shape [particle, axis].
+            sample: window of each particle, ascending, int64, shape [particle].
+        """
+        pairs = self._measure(position, *self._find_neighbours(position, sample))
+        return _density(pairs, len(position))
+
     def limit(self, position: Tensor, sample: Tensor) -> Tensor:
         """Return the largest density that is left alone [1], shape [window].
 
@@ -89,8 +99,7 @@ class Relaxation(nn.Module):
                 [particle, axis].
             sample: window of each particle, ascending, int64, shape [particle].
         """
-        pairs = self._measure(position, *self._find_neighbours(position, sample))
-        density = _density(pairs, len(position))
+        density = self.density(position, sample)
         size = sample.bincount()
         sums = density.new_zeros(len(size)).index_add(0, sample, density)
         return self.densest * sums / size
