@@ -21,7 +21,7 @@ import re
 import threading
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -119,16 +119,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
             would hold the state of an optimiser.
         WorkFailedError: the disk is full, or nobody may write there.
     """
-    for name, tensor in checkpoint.weights.items():
-        if not _has_plain_numbers(tensor):
-            raise UsageError(
-                f"no file of weights can hold {name!r}",
-                where=f"{path}, weights of {checkpoint.baseline}",
-                expected="a dense tensor of real numbers",
-                got=f"{tensor.dtype}, {tensor.layout} on {tensor.device}",
-                fix="store real numbers, as those of torch.view_as_real; or register a "
-                "buffer with persistent=False",
-            )
+    check_weights(checkpoint.weights, where=f"{path}, weights of {checkpoint.baseline}")
     facts = asdict(checkpoint.info)
     if not checkpoint.info.periodic:
         # Without the key the bytes of a box with walls are those of older versions.
@@ -176,6 +167,32 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
                 got=first_line[:200],
                 fix="free disk space, or name a folder that you may write to: --output",
             ) from error
+
+
+def check_weights(weights: Mapping[str, object], *, where: str) -> None:
+    """Refuse weights that no file can hold.
+
+    Args:
+        weights: parameters, buffers and perhaps other values of a model by name.
+        where: place of the weights, for the message.
+
+    Raises:
+        UsageError: a weight is no tensor of plain numbers.
+    """
+    for name, value in weights.items():
+        got = type(value).__name__
+        if isinstance(value, Tensor):
+            if _has_plain_numbers(value):
+                continue
+            got = f"{value.dtype}, {value.layout} on {value.device}"
+        raise UsageError(
+            f"no file of weights can hold {name!r}",
+            where=where,
+            expected="a dense tensor of real numbers",
+            got=got,
+            fix="store real numbers, as those of torch.view_as_real; or register a "
+            "buffer with persistent=False",
+        )
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -425,7 +442,7 @@ def load_weights(
             "weights are not finite",
             where=where,
             expected="finite numbers",
-            got=", ".join(infinite[:3]),
+            got=_list_first(infinite, count=3),
             fix="train anew, or take an earlier checkpoint",
         )
     try:
@@ -439,6 +456,15 @@ def load_weights(
             got=one_line[:300],
             fix="train anew with this version of lagbench",
         ) from None
+
+
+def _list_first(names: Sequence[str], *, count: int) -> str:
+    """Return the first names in one line, and how many more there are."""
+    line = ", ".join(names[:count])
+    more = len(names) - count
+    if more > 0:
+        return f"{line} and {more} more"
+    return line
 
 
 def round_weights(model: nn.Module) -> dict[str, Tensor]:

@@ -24,7 +24,6 @@ __all__ = [
     "coming_force",
     "force_at",
     "obstacle_features",
-    "outside_obstacle",
     "require_force",
     "skip_frames",
 ]
@@ -247,27 +246,3 @@ def obstacle_features(
     divisor = torch.where(length > 0.0, length, 1.0)
     normal = way / divisor
     return torch.cat([distance, nearness * normal], dim=-1)
-
-
-def outside_obstacle(position: Tensor, obstacle: Tensor, box: TensorBox) -> Tensor:
-    """Return positions outside: those in the obstacle are put on its surface.
-
-    A particle moves along the radius. One in the very centre moves along x.
-
-    Args:
-        position: positions [length], shape [..., axis].
-        obstacle: centre and radius of each particle's obstacle [length], shape
-            [..., axis + 1].
-        box: box that holds the particles; along periodic axes the nearest image of the
-            obstacle counts.
-    """
-    centre = obstacle[..., :-1]
-    radius = obstacle[..., -1:]
-    way = box.displacement(centre, position)
-    length = way.norm(dim=-1, keepdim=True)
-    along_x = torch.zeros_like(way)
-    along_x[..., 0] = 1.0
-    divisor = torch.where(length > 0.0, length, 1.0)
-    normal = torch.where(length > 0.0, way / divisor, along_x)
-    on_surface = box.inside(position - way + radius * normal)
-    return torch.where(length < radius, on_surface, position)

@@ -23,6 +23,7 @@ from lagbench.atomic import check_output_file, write_atomically
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.models.output_lock import hold_output
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -153,7 +154,8 @@ def predict(
             that size or with those settings, ``batch`` is below 1, or the output would
             replace predictions without ``overwrite``, or a file of another kind, such
             as the weights.
-        WorkFailedError: out of memory, or the disk is full.
+        WorkFailedError: out of memory, or the disk is full, or another prediction
+            writes the same output.
     """
     _check_batch(batch)
     checkpoint_path = Path(checkpoint)
@@ -199,20 +201,22 @@ def predict(
             parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
-        solver_seconds_per_frame = _write_rollouts(
-            writer, rollouts, info, time_solver=time_solver, progress=progress
-        )
-
-    result = _summarise(
-        rollouts,
-        output=output_path,
-        trained_size=trained.info.size,
-        settings=tuple(settings),
-        method=label,
-        device=hardware_label,
-        solver_seconds_per_frame=solver_seconds_per_frame,
-    )
-    _write_costs(result)
+        with hold_output(output_path):
+            # Another prediction may have written it since the first check.
+            check_outputs(output_path, overwrite=overwrite)
+            solver_seconds_per_frame = _write_rollouts(
+                writer, rollouts, info, time_solver=time_solver, progress=progress
+            )
+            result = _summarise(
+                rollouts,
+                output=output_path,
+                trained_size=trained.info.size,
+                settings=tuple(settings),
+                method=label,
+                device=hardware_label,
+                solver_seconds_per_frame=solver_seconds_per_frame,
+            )
+            _write_costs(result)
     return result
 
 

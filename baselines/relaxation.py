@@ -28,7 +28,6 @@ from torch import Tensor, nn
 
 from lagbench.tensors import TensorBox
 
-from .forcing import outside_obstacle
 from .graph import radius_graph
 
 SUPPORT = {2: 2.0, 3: 1.5}
@@ -136,7 +135,7 @@ class Relaxation(nn.Module):
             movement = _movement(crowded, excess, own_limit)
             position = self.box.inside(position + self.support * movement)
             if obstacle is not None:
-                position = outside_obstacle(position, obstacle, self.box)
+                position = self.box.outside(position, obstacle)
         return position
 
     def _find_neighbours(

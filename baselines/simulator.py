@@ -40,7 +40,7 @@ from .baseline import (
     last_velocities,
 )
 from .deviations import root_mean_square
-from .forcing import ForcingFeatures, outside_obstacle, skip_frames
+from .forcing import ForcingFeatures, skip_frames
 from .free_flight import FreeFlight
 from .graph import (
     NodeFeatures,
@@ -844,7 +844,7 @@ class GraphNetwork(Baseline):
         if not self.options.clamp:
             return position
         constant = position.detach()
-        outside = outside_obstacle(constant, obstacle, self.box)
+        outside = self.box.outside(constant, obstacle)
         zero = position - constant
         return outside + zero
 

@@ -33,7 +33,7 @@ from lagbench.work.progress import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters
 from .catalogue import find
-from .checkpoint import load_weights, round_weights, save
+from .checkpoint import check_weights, load_weights, round_weights, save
 from .dataset_info import find_forcing, read_dataset_info
 from .job import TrainingJob
 from .machine import (
@@ -158,7 +158,8 @@ def train(
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
             or a force forbids; or the folder holds another training, or weights
-            without their checkpoint; weights to start from that do not fit.
+            without their checkpoint; weights to start from that do not fit; a model
+            whose weights no file can hold.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
@@ -221,6 +222,7 @@ def train(
         explain_memory_errors(MEMORY_HINT),
     ):
         model = _build_model(job, entry.model, initial)
+        check_weights(model.state_dict(), where=f"weights of {entry.name}")
         _warn_of_unseen_forcing(model, tier, root_folder)
         return _train_model(job, model)
 

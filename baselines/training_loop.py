@@ -1,6 +1,7 @@
 """The loop of a training: steps, logs, validations, checkpoints, and its early end.
 
-An interrupt lets the running step end and stores the state; a second one stops at once.
+An interrupt, or a terminal that closes, lets the running step end and stores the state;
+a second interrupt stops at once.
 Lightning Fabric starts the processes and connects them.
 """
 
@@ -64,7 +65,12 @@ def uses_bfloat16(job: TrainingJob) -> bool:
 
 
 class Interrupts:
-    """Notes the first interrupt of a user, and lets a second one through."""
+    """Notes the first interrupt of a user, and lets a second one through.
+
+    A terminal that closes interrupts too. It may say so twice, by the shell and by the
+    system, so a second one of these signals changes nothing. Where a user has them
+    ignored, as with nohup, they stay ignored.
+    """
 
     def __init__(self) -> None:
         self.is_set = False
@@ -76,6 +82,9 @@ class Interrupts:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 handlers[number] = signal.signal(number, self._note)
+            hangup = getattr(signal, "SIGHUP", None)  # Windows has none
+            if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
+                handlers[hangup] = signal.signal(hangup, self._note_hangup)
         try:
             yield
         finally:
@@ -85,6 +94,9 @@ class Interrupts:
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.is_set:
             raise KeyboardInterrupt
+        self.is_set = True
+
+    def _note_hangup(self, number: int, frame: FrameType | None) -> None:
         self.is_set = True
 
 

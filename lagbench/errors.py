@@ -114,17 +114,14 @@ class LagbenchError(Exception):
         super().__init__(self._compose())
 
     def _compose(self) -> str:
-        labelled_parts = {
-            "where": self.where,
-            "expected": self.expected,
-            "got": self.got,
-            "fix": self.fix,
-        }
-        lines = [self.what]
-        for label, part in labelled_parts.items():
-            if part is not None:
-                lines.append(f"{label}: {part}")
-        return escape_unprintable(hide_user("\n  ".join(lines)))
+        message = compose_message(
+            self.what,
+            where=self.where,
+            expected=self.expected,
+            got=self.got,
+            fix=self.fix,
+        )
+        return hide_user(message)
 
     def add_note(self, note: str, /) -> None:
         """Add a place to ``where``; our messages do not show Python's own notes."""
@@ -227,6 +224,34 @@ def escape_unprintable(text: str) -> str:
             escaped = character.encode("unicode_escape")
             characters.append(escaped.decode("ascii"))
     return "".join(characters)
+
+
+def escape_line(text: str) -> str:
+    r"""Return a text on one line, with its unprintable characters escaped.
+
+    >>> print(escape_line("a\nb"))
+    a\nb
+    """
+    return escape_unprintable(text).replace("\n", "\\n")
+
+
+def compose_message(
+    what: str, *, where: str | None, expected: object, got: object, fix: str | None
+) -> str:
+    """Return the parts of a message in lines; those that are None are left out.
+
+    A line break in a name or value of a stranger begins no line that looks like a part.
+    """
+    lines = [what]
+    if where is not None:
+        lines.append(f"where: {escape_line(where)}")
+    for label, value in (("expected", expected), ("got", got)):
+        if value is not None:
+            indented = str(value).replace("\n", "\n    ")
+            lines.append(f"{label}: {indented}")
+    if fix is not None:
+        lines.append(f"fix: {fix}")
+    return escape_unprintable("\n  ".join(lines))
 
 
 def _rebuild(

@@ -63,6 +63,28 @@ class TensorBox(nn.Module):
         """
         return self.wrap(position.clamp(self.lower_walls, self.upper_walls))
 
+    def outside(self, position: Tensor, obstacle: Tensor) -> Tensor:
+        """Return positions outside: those in an obstacle are put on its surface.
+
+        A particle moves along the radius. One in the very centre moves along x. Along
+        periodic axes the nearest image of the obstacle counts.
+
+        Args:
+            position: points [length], shape [..., axis].
+            obstacle: centre and radius of each point's obstacle [length], shape
+                [..., axis + 1].
+        """
+        centre = obstacle[..., :-1]
+        radius = obstacle[..., -1:]
+        way = self.displacement(centre, position)
+        length = way.norm(dim=-1, keepdim=True)
+        along_x = torch.zeros_like(way)
+        along_x[..., 0] = 1.0
+        divisor = torch.where(length > 0.0, length, 1.0)
+        normal = torch.where(length > 0.0, way / divisor, along_x)
+        on_surface = self.inside(position - way + radius * normal)
+        return torch.where(length < radius, on_surface, position)
+
     def wrap(self, position: Tensor) -> Tensor:
         """Return positions moved by whole periods into [low, high) of periodic axes.
 

@@ -711,10 +711,10 @@ def _make_row(
 ) -> BoardRow:
     costs = _compare_costs(method, references, verified, solver_time=solver_time)
     against = None
-    is_cheapest = False
+    solver_costs_more = False
     if costs is not None:
         against = _against_classical(method, references, costs)
-        is_cheapest = costs.method < min(costs.solvers.values())
+        solver_costs_more = costs.method < min(costs.solvers.values())
     rank = None
     is_tied = False
     p = math.nan
@@ -736,7 +736,7 @@ def _make_row(
         solver=None if against is None else against.reference,
         values=method.values,
         losses=method.losses,
-        is_cheapest=is_cheapest,
+        solver_costs_more=solver_costs_more,
         seed_means=tuple(seed.mean for seed in method.seeds),
         curves=method.curves,
         energy=method.energy,

@@ -290,6 +290,9 @@ AGAINST_CLASSICAL = Column(
     " takes its place. Empty where the entry states no cost.",
 )
 
+SOLVER_COSTS_MORE = "†"
+"""Behind a ratio to a classical solver that costs more than the model."""
+
 SKILL_ON_SHIFT = Column(
     key="skill_on_shift",
     label="skill on shift",

@@ -28,6 +28,8 @@ LEVELS = 4000
 MISSING = -(2**15)
 """Level that stands for NaN."""
 
+LARGEST_LEVEL = 2**15 - 1
+
 SMALLEST_SHARE = 1e-9
 """A logarithmic range reaches no lower than this share of its top."""
 
@@ -104,8 +106,10 @@ def scale_for(
     )
 
 
-Reference = dict[str, float | bool | str]
-"""What page/data.js reads an array by: its kind, place, shape and scale."""
+Reference = dict[str, float | bool | str | list[int]]
+"""What page/data.js reads an array by: its kind, place, shape and scale, or its numbers
+where 16 bits cannot hold them.
+"""
 
 
 @dataclass
@@ -156,8 +160,11 @@ class ArrayStore:
         return self._store(array, scale, kind)
 
     def add_whole(self, numbers: ArrayLike, *, kind: str) -> Reference:
-        """Add whole numbers, which stay exact: frames or materials."""
-        return self._store(np.asarray(numbers, np.float64), WHOLE_NUMBERS, kind)
+        """Add a row of whole numbers, which stay exact: frames or materials."""
+        array = np.asarray(numbers, np.float64)
+        if np.abs(array).max(initial=0.0) > LARGEST_LEVEL:
+            return {"numbers": array.astype(np.int64).tolist()}
+        return self._store(array, WHOLE_NUMBERS, kind)
 
     def starts(self) -> dict[str, int]:
         """Return the place of the first number of each kind."""

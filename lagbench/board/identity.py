@@ -154,11 +154,14 @@ def _false_zeros(names: Sequence[str], values: Floats) -> list[str]:
 
 
 LOOKALIKES = str.maketrans(
-    "авекмнорстухіјѕԁһӏԛԝгпαβεηικνορτυχζγω01",  # noqa: RUF001 (that is the point)
-    "abekmhopctyxijsdhlqwrnabehlkvoptuxzywol",
+    "авекмнорстухіјѕԁһӏԛԝгпαβεηικμνορτυχζγωıɑɡ01",  # noqa: RUF001 (that is the point)
+    "abekmhopctyxijsdhlqwrnabenlkuvoptuxzywiagol",
 )
 """Letters of other scripts, and digits, beside the Latin letters that they look like.
 """
+
+CAPITALS = str.maketrans("ΗΜΝΥ", "HMNY")  # noqa: RUF001
+"""Greek capitals that look like other Latin letters than their small letters do."""
 
 
 def confusable_key(name: str) -> str:
@@ -167,7 +170,8 @@ def confusable_key(name: str) -> str:
     >>> confusable_key("GN\u0405 1") == confusable_key("gns-l")
     True
     """
-    folded = unicodedata.normalize("NFKD", name).casefold()
+    capitals = unicodedata.normalize("NFKD", name).translate(CAPITALS)
+    folded = capitals.casefold()
     decomposed = unicodedata.normalize("NFKD", folded)
     letters = "".join(letter for letter in decomposed if letter.isalnum())
     return letters.translate(LOOKALIKES).replace("i", "l")

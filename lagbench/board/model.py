@@ -139,7 +139,7 @@ class BoardRow:
     # ranking metric, NaN where undefined, shape [seed, scenario]
     losses: Floats | None = None
     # whether every classical solver costs more per frame; False where a cost is unknown
-    is_cheapest: bool = False
+    solver_costs_more: bool = False
 
     @property
     def id(self) -> str:

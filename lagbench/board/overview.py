@@ -7,15 +7,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from lagbench.data.checksums import round_digits
 from lagbench.figures.html import text
 from lagbench.metrics.significance import rank_ranges
 from lagbench.references.predictor import Kind
 
-from .columns import cost_of
+from .columns import SOLVER_COSTS_MORE, cost_of
 from .model import Board, BoardRow, Floats, ReferenceRow, Tab, Value
 
 LEARNS = (Kind.LEARNED, Kind.HYBRID)
 """Kinds of entries of which the board asks whether learning pays."""
+
+RATIO_DIGITS = 2
+"""Digits of a ratio in sentences and in the tables of a size."""
 
 
 class LearningVerdict(enum.Enum):
@@ -112,27 +116,57 @@ def make_overviews(board: Board) -> tuple[SizeOverview, ...]:
 
 
 def _collect_methods(tabs: Sequence[Tab]) -> list[MethodOverview]:
-    """Return the methods of some tabs with their variants, in no order."""
-    rows_by_method: dict[str, dict[str, BoardRow]] = {}
-    variant_rows: dict[str, dict[str, dict[str, BoardRow]]] = {}
+    """Return the methods of some tabs with their variants, in no order.
+
+    An entry that is a variant on one data set has the line of a variant, also where it
+    stands alone on another.
+    """
+    rows_by_entry: dict[str, dict[str, BoardRow]] = {}
     for tab in tabs:
         for row in tab.rows:
-            if row.variant_of is not None and row.active:
-                variants = variant_rows.setdefault(row.variant_of, {})
-                variants.setdefault(row.id, {})[tab.id] = row
-            elif row.rank is not None:
-                rows_by_method.setdefault(row.id, {})[tab.id] = row
+            is_variant = row.variant_of is not None and row.active
+            if is_variant or row.rank is not None:
+                rows_by_entry.setdefault(row.id, {})[tab.id] = row
+
+    method_of_variant = _find_methods_of_variants(tabs)
+    variants: dict[str, list[MethodOverview]] = {}
+    for variant, method in method_of_variant.items():
+        overview = _make_overview(variant, rows_by_entry[variant], tabs)
+        variants.setdefault(method, []).append(overview)
 
     methods = []
-    for method, rows in rows_by_method.items():
-        variants_of_method = []
-        for variant, rows_of_variant in variant_rows.get(method, {}).items():
-            variants_of_method.append(_make_overview(variant, rows_of_variant, tabs))
-        variants_of_method.sort(key=_order)
+    for method, rows in rows_by_entry.items():
+        if method in method_of_variant:
+            continue
+        variants_of_method = sorted(variants.get(method, []), key=_order)
         methods.append(
             _make_overview(method, rows, tabs, variants=tuple(variants_of_method))
         )
     return methods
+
+
+def _find_methods_of_variants(tabs: Sequence[Tab]) -> dict[str, str]:
+    """Return the method of each entry that is a variant on some data set, by ids.
+
+    No method in the result is a variant itself. Where two entries are variants of each
+    other, each on one data set, the first data set decides.
+    """
+    parents: dict[str, str] = {}
+    for tab in tabs:
+        for row in tab.rows:
+            if row.variant_of is None or not row.active or row.id in parents:
+                continue
+            method = _follow(parents, row.variant_of)
+            if method != row.id:
+                parents[row.id] = method
+    return {variant: _follow(parents, variant) for variant in parents}
+
+
+def _follow(parents: Mapping[str, str], entry: str) -> str:
+    """Return the last one of a chain of entries."""
+    while entry in parents:
+        entry = parents[entry]
+    return entry
 
 
 def _make_overview(
@@ -257,6 +291,13 @@ class Conclusion:
         return 1.0 / cost.speed_up
 
     @property
+    def is_slow(self) -> bool:
+        """Whether a frame of the model costs more, in the digits that are shown."""
+        if self.slowdown is None:
+            return False
+        return round_digits(self.slowdown, RATIO_DIGITS) > 1.0
+
+    @property
     def learned_verdict(self) -> LearningVerdict | None:
         """Whether the most accurate purely learned model beats the solvers that cost no
         more per frame.
@@ -274,7 +315,7 @@ def judge(tab: Tab) -> Conclusion | None:
     """
     models = []
     for row in _models_of(tab):
-        if row.against_classical is not None or row.is_cheapest:
+        if row.against_classical is not None or row.solver_costs_more:
             models.append(row)
     if not models:
         return None
@@ -303,7 +344,9 @@ def _verdict_on(row: BoardRow) -> LearningVerdict:
     ratio = row.against_classical
     if ratio is None:
         return LearningVerdict.NO_SOLVER
-    return verdict_of_interval(ratio.low, ratio.high, solver_costs_more=row.is_cheapest)
+    return verdict_of_interval(
+        ratio.low, ratio.high, solver_costs_more=row.solver_costs_more
+    )
 
 
 def verdict_of_interval(
@@ -362,7 +405,7 @@ def format_comparison(row: BoardRow) -> str:
     ratio = row.against_classical
     if ratio is None:
         return "no solver is as cheap"
-    sign = "†" if row.is_cheapest else ""
+    sign = SOLVER_COSTS_MORE if row.solver_costs_more else ""
     if math.isnan(ratio.low + ratio.high):
         return f"{_format_ratio(ratio)}{sign}"
     interval = f"({text(ratio.low, 2)} to {text(ratio.high, 2)})"
@@ -375,9 +418,24 @@ def _compare(row: BoardRow, ratio: Value) -> str:
     if not math.isnan(ratio.low + ratio.high):
         interval = f" (95\u00a0%: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
     solver = f"{row.solver}, the best classical solver that costs no more per frame"
-    if row.is_cheapest:
+    if row.solver_costs_more:
         solver = f"{row.solver}, the cheapest classical solver, which costs more"
     return f"{_format_ratio(ratio)}{interval} the error of {solver}"
+
+
+def describe_slowdown(slowdown: float) -> str:
+    """Return the time of a model over that of the simulator, and what it means.
+
+    >>> describe_slowdown(2.0), describe_slowdown(0.5), describe_slowdown(1.004)
+    ('2×, slower', '0.50×, faster', '1.0×, as fast')
+    """
+    shown = round_digits(slowdown, RATIO_DIGITS)
+    word = "as fast"
+    if shown > 1.0:
+        word = "slower"
+    elif shown < 1.0:
+        word = "faster"
+    return f"{text(slowdown, RATIO_DIGITS)}×, {word}"
 
 
 def conclude(tab: Tab) -> str:
@@ -398,10 +456,11 @@ def conclude(tab: Tab) -> str:
         sentences = [_state_verdict(conclusion.verdict, data_set, model, row, ratio)]
     if conclusion.verdict is LearningVerdict.PAYS:
         slowdown = conclusion.slowdown
-        if slowdown is not None and slowdown > 1.0:
+        if slowdown is not None and conclusion.is_slow:
+            times = text(slowdown, RATIO_DIGITS)
             sentences.append(
-                f"A frame of the model costs {text(slowdown, 2)} times as much as a "
-                "frame of the simulator that made the data."
+                f"A frame of the model costs {times} times as much as a frame of the "
+                "simulator that made the data."
             )
     else:
         sentences += _name_exception(tab)
@@ -563,8 +622,7 @@ def _describe_winners(winners: Sequence[Conclusion]) -> list[str]:
     slow_count = 0
     for winner in winners:
         hybrid_count += winner.is_hybrid
-        if winner.slowdown is not None and winner.slowdown > 1.0:
-            slow_count += 1
+        slow_count += winner.is_slow
     sentences = []
     if hybrid_count:
         models = _count_models(hybrid_count, len(winners))

@@ -17,8 +17,10 @@ from importlib.resources import files
 from itertools import groupby
 
 from lagbench.addresses import DOCUMENTATION
+from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import DARK, LIGHT, format_variables
 from lagbench.figures.html import (
+    DIGITS,
     Markup,
     clipped,
     escaped,
@@ -31,6 +33,7 @@ from lagbench.figures.html import (
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (
+    SOLVER_COSTS_MORE,
     comparisons_of,
     cost_of,
     format_ranks,
@@ -53,6 +56,7 @@ from .overview import (
     conclude,
     conclusions_of,
     count_data_sets,
+    describe_slowdown,
     find_hero,
     format_comparison,
     is_open,
@@ -516,8 +520,7 @@ def _verdict_row(conclusion: Conclusion) -> Markup:
         model.append(tag("span", f" {conclusion.model}", class_="ci"))
     time = "unknown"
     if conclusion.slowdown is not None:
-        word = "slower" if conclusion.slowdown > 1.0 else "faster"
-        time = f"{text(conclusion.slowdown, 2)}×, {word}"
+        time = describe_slowdown(conclusion.slowdown)
     learned = conclusion.learned
     cells = [
         tag("th", tag("a", tab.size.split, href=f"#{tab.id}"), scope="row"),
@@ -672,8 +675,8 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
     if row.against_classical is not None:
         ratio = f"{text(row.against_classical.mean, 2)}×"
-        if row.is_cheapest:
-            ratio += "†"
+        if row.solver_costs_more:
+            ratio += SOLVER_COSTS_MORE
         if is_open(row.against_classical):
             ratio += "?"
         remarks.append(ratio)
@@ -789,7 +792,7 @@ def _leader_tiles(
             "error of the leader beside the best classical solver that costs no more "
             "per frame"
         )
-        if leader.is_cheapest:
+        if leader.solver_costs_more:
             label = (
                 "error of the leader beside the cheapest classical solver, which costs "
                 "more per frame"
@@ -812,8 +815,11 @@ def _speed_tiles(tab: Tab) -> Iterator[Markup]:
     cost = None if fastest is None else cost_of(fastest)
     if fastest is None or cost is None:
         return
-    comparison = "faster than the simulator"
-    if greatest < 1.0:
+    shown_speed = round_digits(greatest, DIGITS)
+    comparison = "as fast as the simulator"
+    if shown_speed > 1.0:
+        comparison = "faster than the simulator"
+    elif shown_speed < 1.0:
         comparison = "slower than the simulator"
     name = clipped(fastest.entry.name, 40)
     yield _tile(

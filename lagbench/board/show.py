@@ -14,9 +14,11 @@ from lagbench.scoring.card import digits
 
 from .build import COLUMNS, Scope
 from .columns import (
+    AGAINST_CLASSICAL,
     SELF_REPORTED,
     SKILL,
     SKILL_ON_SHIFT,
+    SOLVER_COSTS_MORE,
     TableRow,
     comparisons_of,
     cost_of,
@@ -115,6 +117,8 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
             remarks = _shorten_remarks(table_row, room)
         table_rows.append((*line, remarks))
     legend = list(_legend_of(tab, table_rows, wide=wide))
+    if any(_is_beside_dearer_solver(row) for row in rows):
+        legend.append(f"{SOLVER_COSTS_MORE}: all classical solvers cost more")
     if has_shift and SHIFT not in names:
         legend.append(f"{HEADINGS[SHIFT]}: only with --wide")
     return Table(
@@ -256,7 +260,7 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "skill": skill,
         "against_classical": against_classical,
         "classical_solver": row.solver,
-        "classical_solver_costs_more": row.is_cheapest,
+        "classical_solver_costs_more": row.solver_costs_more,
         "metrics": metrics,
         **_plain_shift(row.on_shift),
     }
@@ -289,12 +293,22 @@ def _format_row(
     for name in names:
         value = metric_value(row, name)
         is_skill = name in (SKILL.key, SHIFT)
-        values.append(_format_value(value, wide=wide, is_skill=is_skill))
+        cell = _format_value(value, wide=wide, is_skill=is_skill)
+        if name == AGAINST_CLASSICAL.key and _is_beside_dearer_solver(row):
+            cell += SOLVER_COSTS_MORE
+        values.append(cell)
     seconds = _format_seconds(row)
     if isinstance(row, ReferenceRow):
         return (NOTHING, row.name, *values, seconds)
     name = row.id if wide else _format_name(tab, row)
     return (_format_rank(row), name, *values, seconds)
+
+
+def _is_beside_dearer_solver(row: TableRow) -> bool:
+    """Tell whether a row is compared with a solver that costs more than the model."""
+    if isinstance(row, ReferenceRow) or row.against_classical is None:
+        return False
+    return row.solver_costs_more
 
 
 def _format_name(tab: Tab, row: BoardRow) -> str:

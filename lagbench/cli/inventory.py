@@ -12,7 +12,7 @@ import typer
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
-from lagbench.errors import LagbenchError, hide_user
+from lagbench.errors import LagbenchError, escape_line, hide_user
 from lagbench.make.inventory import Overview, overview
 
 from .options import JsonFlag, RootOption, accept_split, choose_split, option
@@ -97,7 +97,7 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
         print_json({"root": folder, "sizes": overviews, "references": references})
         return
 
-    print_line(f"{entry.title} ({name} {entry.version}, {entry.licence})")
+    _print_title(name, entry)
     rows = [_format_row(size_overview)[1:] for size_overview in overviews]
     print_table("", COLUMNS[1:], rows, is_narrow=True)
     for line in (*LEGEND, *_describe_times(overviews)):
@@ -106,6 +106,13 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
     print_references(sizes, references)
     print_line(f"all parameters: lagbench info {split}")
     print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
+
+
+def _print_title(name: str, entry: Split) -> None:
+    """Print title, name, version and licence; strangers describe local splits."""
+    title = escape_line(entry.title)
+    licence = escape_line(entry.licence)
+    print_line(f"{title} ({name} {entry.version}, {licence})")
 
 
 def _list_overviews(folder: Path) -> list[Overview]:
@@ -195,7 +202,7 @@ def info_command(
         return
 
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
-    print_line(f"{entry.title} ({name} {entry.version}, {entry.licence})")
+    _print_title(name, entry)
     print_line(f"{description}\n")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))
     for line in _describe_times(overviews):
@@ -237,7 +244,8 @@ def _print_parameters(entry: Split, sizes: Sequence[Size]) -> None:
     rows = []
     for name, parameter in entry.parameters.items():
         values = [size.value(name) for size in sizes]
-        rows.append((name, *values, f"[{parameter.unit}] {parameter.description}"))
+        meaning = escape_line(f"[{parameter.unit}] {parameter.description}")
+        rows.append((escape_line(name), *values, meaning))
     columns = ("name", *entry.sizes, "[unit] meaning")
     print_table("Parameters", columns, rows)
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
+from lagbench.errors import escape_unprintable
 from lagbench.figures.tables import Table
 
 from .stderr import print_on_stderr
@@ -61,7 +62,7 @@ def format_seconds(seconds: float) -> str:
 def print_line(text: str, *, quiet: bool = False) -> None:
     """Print a line on stdout unless the user asked for silence."""
     if not quiet:
-        typer.echo(text)
+        typer.echo(escape_unprintable(text))
 
 
 def print_warning(text: str) -> None:
@@ -92,7 +93,7 @@ def print_result(
         print_json(value)
     elif not quiet:
         for line in lines:
-            typer.echo(line)
+            typer.echo(escape_unprintable(line))
 
 
 def print_errors(result: ValidationResult) -> None:
@@ -184,7 +185,9 @@ def print_table(
     characters at least. Columns of numbers are set flush right. A narrow table
     has two spaces between columns instead of three.
     """
-    cells = [[str(cell) for cell in row] for row in rows]
+    cells = []
+    for row in rows:
+        cells.append([escape_unprintable(str(cell)) for cell in row])
     table = DrawnTable(
         box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0) if is_narrow else (0, 1),
@@ -200,8 +203,8 @@ def print_table(
             justify="right" if is_numeric else "left",
             no_wrap=number < last,
         )
-    for row in cells:
-        table.add_row(*map(Text, row))
+    for texts in cells:
+        table.add_row(*map(Text, texts))
 
     # On a narrow terminal long lines run on to the next: a number cut short would be
     # worse.
@@ -211,7 +214,7 @@ def print_table(
     console = Console(width=width)
     if title:
         # beside the table, not in it: a table wraps its title to its own width
-        console.print(Text(title, style="table.title"))
+        console.print(Text(escape_unprintable(title), style="table.title"))
     console.print(table, "")  # and an empty line
 
 

@@ -308,13 +308,28 @@ def _describe_solver(
     if solver is None:
         return
     ratio = seconds_per_frame / solver.seconds_per_frame
-    comparison = f"the model is {_format_ratio(1 / ratio)} times as fast"
-    if ratio > 1:
-        comparison = f"{_format_ratio(ratio)} times as fast as the model"
     yield (
         f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
-        f"machine: {comparison}"
+        f"machine: {_compare_speeds(ratio)}"
     )
+
+
+def _compare_speeds(ratio: float) -> str:
+    """Return how fast the solver is, from the time of the model over its own.
+
+    >>> for ratio in (4.0, 0.25, 1.04):
+    ...     print(_compare_speeds(ratio))
+    4 times as fast as the model
+    the model is 4 times as fast
+    as fast as the model
+    """
+    slowdown = _format_ratio(ratio)
+    speed_up = _format_ratio(1 / ratio)
+    if "1" in (slowdown, speed_up):
+        return "as fast as the model"
+    if ratio > 1:
+        return f"{slowdown} times as fast as the model"
+    return f"the model is {speed_up} times as fast"
 
 
 def _describe_clock(result: PredictionResult) -> str:

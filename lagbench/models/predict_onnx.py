@@ -15,6 +15,7 @@ from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress
 
 from .onnx_model import LEAST_SECONDS, DeclaredModel, check_onnx, open_onnx
+from .output_lock import hold_output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,8 @@ def predict_onnx(
             a split, there is such an output, or onnx is not installed.
         UnreadableFileError: the model is refused, or cannot be run.
         DataError: the subset is missing.
-        WorkFailedError: the model needs more time or memory than allowed.
+        WorkFailedError: the model needs more time or memory than allowed, or another
+            prediction writes the same output.
     """
     check_predictions_output(Path(output), overwrite=overwrite)
     declared = check_onnx(Path(model))
@@ -110,19 +112,22 @@ def predict_onnx(
         device=f"{processor_name()}, 1 thread",
     )
     seconds = 0.0
-    with writer:
-        for scenario, path in paths.items():
-            rollout = runner.roll_out(path)
-            writer.add(scenario, rollout.position, diverged_at=rollout.diverged_at)
-            seconds += max(rollout.seconds, LEAST_SECONDS)
-            meter.count(1, scenarios=1)
-        seconds_per_frame = seconds / (len(paths) * tier.task.horizon)
-        writer.label(seconds_per_frame=seconds_per_frame)
-        solver_seconds = None
-        if time_solver is not None:
-            solver_seconds = time_solver(tier.split, tier.name)
-        if solver_seconds is not None:
-            writer.label(solver_seconds_per_frame=solver_seconds)
+    with hold_output(Path(output)):
+        # Another prediction may have written it since the first check.
+        check_predictions_output(Path(output), overwrite=overwrite)
+        with writer:
+            for scenario, path in paths.items():
+                rollout = runner.roll_out(path)
+                writer.add(scenario, rollout.position, diverged_at=rollout.diverged_at)
+                seconds += max(rollout.seconds, LEAST_SECONDS)
+                meter.count(1, scenarios=1)
+            seconds_per_frame = seconds / (len(paths) * tier.task.horizon)
+            writer.label(seconds_per_frame=seconds_per_frame)
+            solver_seconds = None
+            if time_solver is not None:
+                solver_seconds = time_solver(tier.split, tier.name)
+            if solver_seconds is not None:
+                writer.label(solver_seconds_per_frame=solver_seconds)
     return OnnxPredictionResult(
         path=Path(output),
         split=tier.split,

@@ -165,7 +165,7 @@ def fetch_archive(
         size: the data set.
         url: folder of the archive.
         requests: files to fetch, by scenario id.
-        report: receives the number of bytes that arrived.
+        report: receives the number of bytes that arrived and were not passed over.
         limit: most bytes of an archive.
         hint: how the user mends a store with wrong data.
     """
@@ -363,10 +363,11 @@ class _Stream:
             hint=self._hint,
         )
         while bytes_before > 0:
-            block = self._receive_block()
+            block = next(self._blocks, b"")
             if not block:
                 return
             self._unread = block[bytes_before:]
+            self._report(len(self._unread))
             bytes_before -= len(block)
 
     def _receive_block(self) -> bytes:

@@ -92,7 +92,8 @@ def fetch_scenarios(
 
     Args:
         requests: files to fetch, by scenario id.
-        report: receives the number of bytes that arrived.
+        report: receives how many more bytes have arrived; negative where bytes that had
+            arrived were thrown away.
         connections: objects that are fetched side by side.
 
     Yields:
@@ -109,15 +110,20 @@ def fetch_scenarios(
 
     with ThreadPoolExecutor(max_workers=connections) as pool:
         pending = {}
+        arrivals = {}
         for scenario, request in requests.items():
-            pending[pool.submit(_fetch, request, count)] = scenario
+            arrivals[scenario] = _Arrival(count)
+            transfer = pool.submit(_fetch, request, arrivals[scenario])
+            pending[transfer] = scenario
         try:
             for transfer in as_completed(pending):
                 scenario = pending[transfer]
                 try:
                     is_resumed = transfer.result()
                     # Here and not in the threads: HDF5 is not safe in several threads.
-                    _accept_fetched(requests[scenario], count, is_resumed=is_resumed)
+                    _accept_fetched(
+                        requests[scenario], arrivals[scenario], is_resumed=is_resumed
+                    )
                 except NotInStoreError as error:
                     yield scenario, error
                 else:
@@ -137,7 +143,36 @@ class _StoppedError(Exception):
     """The transfer of another object has failed."""
 
 
-def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
+class _Arrival:
+    """Counts the bytes of an object that arrive and are kept.
+
+    Those of an earlier call do not count.
+    """
+
+    def __init__(self, report: Callable[[int], None]) -> None:
+        self._report = report
+        self._earlier_bytes: int | None = None  # None before the file was looked at
+        self._counted_bytes = 0
+
+    def reach(self, length: int) -> None:
+        """Report by how many bytes the count changes, now that the file is so long."""
+        if self._earlier_bytes is None:
+            self._earlier_bytes = length
+        self._earlier_bytes = min(self._earlier_bytes, length)
+        byte_count = length - self._earlier_bytes
+        self._report(byte_count - self._counted_bytes)
+        self._counted_bytes = byte_count
+
+
+def _length_of(path: Path) -> int:
+    """Return the length of a file, 0 where there is none [bytes]."""
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def _fetch(request: FetchRequest, arrival: _Arrival) -> bool:
     """Fetch one object under its temporary name, going on after an earlier attempt.
 
     Returns:
@@ -147,7 +182,7 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
     rate = TransferRate(request.url)
 
     def attempt() -> bool:
-        report(0)
+        arrival.reach(_length_of(partial))
         with partial.open("ab") as file:
             offset = file.tell()
             if offset and offset == request.length:
@@ -156,6 +191,8 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
                 if answer.start < offset:
                     file.seek(answer.start)
                     file.truncate()
+                position = answer.start
+                arrival.reach(position)
                 blocks = receive(
                     answer,
                     rate,
@@ -166,7 +203,8 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
                 )
                 for block in blocks:
                     file.write(block)
-                    report(len(block))
+                    position += len(block)
+                    arrival.reach(position)
                 return answer.start > 0
 
     with partial_file_errors(partial):
@@ -174,7 +212,7 @@ def _fetch(request: FetchRequest, report: Callable[[int], None]) -> bool:
 
 
 def _accept_fetched(
-    request: FetchRequest, report: Callable[[int], None], *, is_resumed: bool
+    request: FetchRequest, arrival: _Arrival, *, is_resumed: bool
 ) -> None:
     """Accept a fetched file; fetch it anew where its first part may be another's.
 
@@ -188,7 +226,7 @@ def _accept_fetched(
     except WrongContentError:
         if not is_resumed:
             raise
-        _fetch(request, report)
+        _fetch(request, arrival)
         with partial_file_errors(partial):
             accept(request)
 

@@ -12,6 +12,8 @@ from lagbench.errors import (
     DataError,
     LagbenchError,
     UnreadableFileError,
+    compose_message,
+    escape_line,
     format_count,
 )
 
@@ -85,14 +87,12 @@ class ValidationIssue:
 
     def __str__(self) -> str:
         """Return the issue as lines for people."""
-        return "\n".join(
-            [
-                f"{self.severity} [{self.check}] {self.what}",
-                f"  where: {self.where}",
-                f"  expected: {self.expected}",
-                f"  got: {self.got}",
-                f"  fix: {self.fix}",
-            ]
+        return compose_message(
+            f"{self.severity} [{self.check}] {self.what}",
+            where=self.where,
+            expected=self.expected,
+            got=self.got,
+            fix=self.fix,
         )
 
 
@@ -135,7 +135,8 @@ class ValidationResult:
         warning_count = format_count(len(self.warnings), "warning")
         check_count = format_count(len(self.passed), "check")
         counts = f"{error_count}, {warning_count}, {check_count} passed"
-        lines.append(f"{self.path}: {self.verdict}, {counts}")
+        path = escape_line(str(self.path))
+        lines.append(f"{path}: {self.verdict}, {counts}")
         return "\n".join(lines)
 
     @property
@@ -189,7 +190,8 @@ class ValidationResult:
         if self.valid:
             return
         first = self.errors[0]
-        what = f"{self.path} is {self.verdict}: [{first.check}] {first.what}"
+        path = escape_line(str(self.path))
+        what = f"{path} is {self.verdict}: [{first.check}] {first.what}"
         if len(self.errors) > 1:
             what += f" (and {len(self.errors) - 1} more)"
         raise self._error_class()(

@@ -28,6 +28,7 @@ from lagbench.baselines.checkpoint import (
     Checkpoint,
     check_data,
     load,
+    load_weights,
     restore,
     round_weights,
     save,
@@ -297,7 +298,13 @@ def test_what_is_saved_can_be_loaded_or_is_refused(tmp_path: Path) -> None:
         assert torch.equal(loaded.weights[name], value)
     assert file.stat().st_size < 10**5
 
-    for value in (ONE.to_sparse(), ONE.to(torch.complex64), ONE.to("meta")):
+    others: tuple[Any, ...] = (
+        ONE.to_sparse(),
+        ONE.to(torch.complex64),
+        ONE.to("meta"),
+        {"a": 1},
+    )
+    for value in others:
         for suffix in (".pt", ".safetensors"):
             path = tmp_path / f"other{suffix}"
             with pytest.raises(UsageError) as caught:
@@ -355,6 +362,17 @@ def test_weights_that_do_not_fit_the_model_are_refused(
     install(monkeypatch, drift=Drift)
     with pytest.raises(UnreadableFileError, match=message):
         restore(example(**changes))
+
+
+def test_an_error_tells_how_many_more_weights_are_not_finite() -> None:
+    """It names the first ones alone."""
+    weights = {f"layer_{letter}": math.nan * ONE for letter in "abcdefghijk"}
+    with pytest.raises(UnreadableFileError) as caught:
+        load_weights(torch.nn.Linear(1, 1), weights, where="a.pt")
+    got = str(caught.value.got)
+    shown = sum(name in got for name in weights)
+    assert 0 < shown < len(weights)
+    assert str(len(weights) - shown) in got
 
 
 def test_the_error_for_an_unknown_baseline_names_the_file() -> None:

@@ -24,7 +24,6 @@ from lagbench.baselines.forcing import (
     ForcingFeatures,
     force_at,
     obstacle_features,
-    outside_obstacle,
     skip_frames,
 )
 from lagbench.baselines.graph import edge_features
@@ -206,7 +205,7 @@ def test_particles_in_an_obstacle_are_put_on_its_surface(name: str) -> None:
     position = tensor_box.wrap(centre + distance * normal)
     obstacle = torch.cat([centre, torch.tensor([radius])]).expand(60, -1)
 
-    moved = outside_obstacle(position, obstacle, tensor_box)
+    moved = tensor_box.outside(position, obstacle)
     is_outside = length > radius
     assert torch.equal(moved[is_outside], position[is_outside])
     surface = tensor_box.wrap(centre + radius * normal)
@@ -215,7 +214,7 @@ def test_particles_in_an_obstacle_are_put_on_its_surface(name: str) -> None:
     assert (moved >= 0.0).all()
     assert (moved < 1.0).all()
 
-    moved = outside_obstacle(centre[None], obstacle[:1], tensor_box)
+    moved = tensor_box.outside(centre[None], obstacle[:1])
     way = tensor_box.displacement(centre, moved[0])
     assert_close(way.norm(), torch.tensor(radius))
 

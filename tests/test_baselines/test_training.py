@@ -58,6 +58,7 @@ def run(
         monkeypatch,
         drift=Drift,
         wrong=Wrong,
+        unstorable=Unstorable,
         fitted=FittedDrift,
     )
 
@@ -96,14 +97,77 @@ def test_a_loss_that_nothing_is_learned_from(
     assert caught.value.where == "Wrong.forward"
 
 
-def interrupt_at(step: int) -> Callable[[Progress], None]:
-    """Return a listener that presses Ctrl-C after a step."""
+class Unstorable(Drift):
+    """A Drift with a value among its weights that no file can hold."""
+
+    value: Any = None
+
+    def get_extra_state(self) -> Any:
+        """Return the value, which torch puts among the weights."""
+        return self.value
+
+    def set_extra_state(self, state: Any) -> None:
+        """Ignore the value."""
+
+
+@pytest.mark.parametrize(
+    "value", [torch.eye(2).to_sparse(), torch.zeros(2).to(torch.complex64), {"a": 1}]
+)
+def test_weights_that_no_file_can_hold_are_refused_before_the_first_step(
+    run: Run, monkeypatch: pytest.MonkeyPatch, value: Any
+) -> None:
+    """No time is lost, and an earlier training in the folder stays."""
+    earlier = run("drift", "steps=2", "validate_every=0")
+    content = earlier.checkpoint.read_bytes()
+    stages: list[str] = []
+    monkeypatch.setattr(Unstorable, "value", value)
+    with pytest.raises(UsageError) as caught:
+        run(
+            "unstorable",
+            "steps=2",
+            fresh=True,
+            progress=lambda news: stages.append(news.stage),
+        )
+    assert "unstorable" in str(caught.value.where)
+    assert not stages
+    assert earlier.checkpoint.read_bytes() == content
+
+
+def interrupt_at(
+    step: int, number: int = signal.SIGINT, *, times: int = 1
+) -> Callable[[Progress], None]:
+    """Return a listener that presses Ctrl-C, or sends a signal, after a step."""
 
     def listen(news: Progress) -> None:
         if news.stage != "predicting" and news.done == step:
-            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(times):
+                os.kill(os.getpid(), number)
 
     return listen
+
+
+def test_a_terminal_that_closes_interrupts_a_training(run: Run, tmp_path: Path) -> None:
+    """The shell and the system both tell it; the state of the step is stored."""
+    settings = ("steps=4", "validate_every=0")
+    hang_up = interrupt_at(2, signal.SIGHUP, times=2)
+    with pytest.raises(KeyboardInterrupt):
+        run("drift", *settings, progress=hang_up)
+    log = read_training_log(tmp_path / "run")
+    assert log["state"] == "interrupted"
+    assert log["step"] == 2
+    assert run("drift", *settings).first_step == 2
+
+
+def test_a_closing_terminal_that_a_user_ignores_stops_no_training(run: Run) -> None:
+    """As nohup has it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        hang_up = interrupt_at(2, signal.SIGHUP)
+        result = run("drift", "steps=4", "validate_every=0", progress=hang_up)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.state == "finished"
 
 
 @dataclass

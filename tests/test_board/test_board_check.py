@@ -698,6 +698,10 @@ def test_predictions_without_a_length_are_found(own: BoardBench) -> None:
         ("Caf\u00e9", "Cafe"),
         ("\uff27\uff2e\uff33", "GNS"),
         ("\u0391\u0392", "AB"),
+        ("G\u039dS", "GNS"),
+        ("\u039cLP", "MLP"),
+        ("\u03a5x\u0397", "YxH"),
+        ("g\u0131ns\u0251\u0261", "ginsag"),
     ],
 )
 def test_names_that_look_alike(one: str, other: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 
@@ -98,6 +99,18 @@ def test_whole_numbers_are_exact_and_stand_once() -> None:
     assert first == second
     assert len(store.to_bytes()) == length
     restored = restore(store, first)
+    assert restored[:, 0].tolist() == frames
+
+
+@pytest.mark.parametrize("last", [32_767, 32_768, 65_536, 10_000_000])
+def test_the_frames_of_a_long_rollout_are_exact(last: int) -> None:
+    """Greater numbers than 16 bits hold do not wrap around."""
+    store = ArrayStore()
+    frames = [7, last - 1, last]
+    store.add_whole([1, 2, 3], kind="a")
+    reference = store.add_whole(frames, kind="a")
+    assert json.loads(json.dumps(reference)) == reference
+    restored = restore(store, reference)
     assert restored[:, 0].tolist() == frames
 
 

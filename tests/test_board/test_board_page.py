@@ -32,8 +32,14 @@ from lagbench.board.entry import (
     Weights,
 )
 from lagbench.board.model import Board, BoardRow, Tab
-from lagbench.board.overview import conclude, find_hero, make_overviews
+from lagbench.board.overview import (
+    SizeOverview,
+    conclude,
+    find_hero,
+    make_overviews,
+)
 from lagbench.board.page import render, same_page
+from lagbench.board.show import tables
 from lagbench.board.table_view import MOST_REASONS, Cell, make_table
 from lagbench.references.predictor import Kind
 
@@ -255,6 +261,78 @@ def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
     assert "on 1 of 2" in overview_text
 
 
+def overview_of(
+    board: Board, entries_by_split: Mapping[str, Mapping[str, str | None]]
+) -> SizeOverview:
+    """Return the overview of some data sets.
+
+    Args:
+        board: gives the rows.
+        entries_by_split: method of which each entry is a variant; None for a method.
+    """
+    tabs = []
+    for split, entries in entries_by_split.items():
+        tab = make_board(((split, "mini"),)).tabs[0]
+        rows = []
+        for number, (entry, method) in enumerate(entries.items()):
+            rank = None if method else number + 1
+            rows.append(row_of(board, entry, entry, rank=rank, variant_of=method))
+        tabs.append(replace(tab, rows=tuple(rows)))
+    (overview,) = make_overviews(replace(board, tabs=tuple(tabs)))
+    return overview
+
+
+def lines_of(overview: SizeOverview) -> dict[str, list[str]]:
+    """Return the data sets of each line by id; the line of a variant is indented."""
+    lines = {}
+    for method in overview.methods:
+        lines[method.method] = list(method.rows)
+        for variant in method.variants:
+            lines[f"  {variant.method}"] = list(variant.rows)
+    return lines
+
+
+def test_a_variant_that_stands_alone_elsewhere_has_one_line(board: Board) -> None:
+    """The line holds both data sets, and has no place: a variant has none."""
+    overview = overview_of(
+        board,
+        {
+            "cavity": {"gns": None, "gns-spread": "gns"},
+            "fluid": {"gns-spread": None, "mlp": None},
+        },
+    )
+    assert lines_of(overview) == {
+        "gns": ["cavity-mini"],
+        "  gns-spread": ["cavity-mini", "fluid-mini"],
+        "mlp": ["fluid-mini"],
+    }
+
+
+def test_no_line_is_lost_where_methods_are_variants_too(board: Board) -> None:
+    """A variant of a variant stands below the method; two variants of each other have a
+    line each.
+    """
+    chain = overview_of(
+        board,
+        {
+            "cavity": {"gns-x": None, "gns-x-y": "gns-x"},
+            "fluid": {"gns": None, "gns-x": "gns"},
+        },
+    )
+    assert lines_of(chain) == {
+        "gns": ["fluid-mini"],
+        "  gns-x": ["cavity-mini", "fluid-mini"],
+        "  gns-x-y": ["cavity-mini"],
+    }
+    circle = overview_of(
+        board, {"cavity": {"a": None, "b": "a"}, "fluid": {"b": None, "a": "b"}}
+    )
+    assert lines_of(circle) == {
+        "a": ["cavity-mini", "fluid-mini"],
+        "  b": ["cavity-mini", "fluid-mini"],
+    }
+
+
 def text_of_overview(page: str) -> str:
     """Return the text of the section of all data sets."""
     sections = read_html(page).named("section")
@@ -449,6 +527,12 @@ def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
     )
     winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×, slower"
     assert f"cavityyes{winner_cells}Net0.90× (0.80 to 1.1)" in shown
+
+    cost = EntryCost(seconds_per_frame=1.0, device="a", solver_seconds_per_frame=0.99)
+    shown = text_of_overview(
+        page_of(board, first_tab(board, with_entry(winner, cost=cost)))
+    )
+    assert "slower" not in shown
     paragraphs = read_html(page_of(board, tab)).named("p")
     ledes = [one for one in paragraphs if one.attributes.get("class") == "lede"]
     assert "Learning pays on the only data set" in ledes[1].text
@@ -585,7 +669,7 @@ def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
 def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> None:
     """The cheapest solver has less error here, but costs more."""
     row = compared(board, "Model", error=1.0, ratio=DEAR)
-    row = replace(row, is_cheapest=True)
+    row = replace(row, solver_costs_more=True)
     tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
     sentences = conclude(tab)
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
@@ -600,10 +684,26 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     assert re.search("Model equals .*twin.*greater .*finer and fine", sentences)
 
 
+def test_the_table_of_a_terminal_marks_dearer_solvers(board: Board) -> None:
+    """The sign stands behind the ratio, and is explained above the table."""
+    row = compared(board, "Model", error=1.0, ratio=GOOD)
+    for solver_costs_more in (True, False):
+        marked_row = replace(row, solver_costs_more=solver_costs_more)
+        tab = first_tab(board, marked_row)
+        for wide in (True, False):
+            (table,) = tables(replace(board, tabs=(tab,)), wide=wide)
+            column = table.columns.index("÷class.")
+            cells = {line[1]: line[column] for line in table.rows}
+            assert cells["model"].endswith("†") is solver_costs_more
+            assert ("†" in table.title) is solver_costs_more
+            for reference in tab.references:
+                assert cells[reference.name] == "-"
+
+
 def test_a_model_cheaper_than_all_solvers_can_beat_the_cheapest(board: Board) -> None:
     """It has less error at less cost, so learning pays."""
     row = compared(board, "Model", error=1.0, ratio=GOOD)
-    row = replace(row, is_cheapest=True)
+    row = replace(row, solver_costs_more=True)
     sentences = conclude(first_tab(board, row))
     assert sentences.startswith("Learning pays on cavity")
     assert "of projection, the cheapest classical solver, which costs" in sentences
@@ -614,12 +714,13 @@ def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
 ) -> None:
     """The simulator made the data: nobody would save time."""
     row = compared(board, "Model", error=1.0, ratio=GOOD)
-    for speed_up, is_told in ((0.5, True), (2.0, False)):
+    for speed_up, is_told in ((0.5, True), (2.0, False), (0.99, False)):
         cost = EntryCost(
             seconds_per_frame=1.0, device="a", solver_seconds_per_frame=speed_up
         )
         sentences = conclude(first_tab(board, with_entry(row, cost=cost)))
         assert ("2 times" in sentences) is is_told
+        assert ("times as much" in sentences) is is_told
 
 
 def test_slow_solvers_are_marked(board: Board) -> None:

@@ -146,6 +146,37 @@ def test_list_shows_a_local_split_by_its_folder(run: Run, tmp_path: Path) -> Non
     assert "'cavity'" in result.stderr
 
 
+def test_what_strangers_say_of_a_split_commands_no_terminal(
+    run: Run, tmp_path: Path
+) -> None:
+    """Title, description, licence and parameters: no escape codes, and no line breaks
+    that would begin a line of their own.
+    """
+    runs = np.stack(straight_runs(3))
+    np.save(tmp_path / "runs.npy", runs)
+    own = lagbench.adopt(
+        tmp_path / "runs.npy",
+        output=tmp_path / "own",
+        radius=0.1,
+        frame_interval=0.25,
+    )
+    path = own.folder / "split.yaml"
+    description = yaml.safe_load(path.read_text())
+    words = "\x1b]0;red\x07\x1b[2J\nfake: all is well"
+    split = description["splits"]["own"]
+    for key in ("title", "description", "licence"):
+        split[key] = words
+    split["parameters"]["density"]["description"] = words
+    path.write_text(yaml.safe_dump(description))
+    for command in ("info", "list"):
+        result = run(command, own.folder)
+        assert result.exit_code == 0
+        assert not re.search("[\x00-\x09\x0b-\x1f]", result.stdout)
+        assert "fake: all is well" in result.stdout
+        lines = [line.strip() for line in result.stdout.splitlines()]
+        assert not any(line.startswith("fake") for line in lines)
+
+
 def test_info_shows_parameters_with_units_and_the_local_data(
     run: Run, generated: GenerationResult
 ) -> None:

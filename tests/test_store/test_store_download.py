@@ -24,6 +24,7 @@ from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import fetch, objects
+from lagbench.work.progress import Progress
 
 FIRST = "train/0000.nc"
 LIST = "manifest.json"
@@ -235,6 +236,41 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
     if fault == "drops":
         third = (here / "own/full/v1" / FIRST).stat().st_size // 3
         assert ranges == [None, f"bytes={third}-", f"bytes={2 * third}-"]
+
+
+@pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once"])
+def test_bytes_that_are_thrown_away_are_no_progress(
+    server: Mirror, here: Path, fault: str
+) -> None:
+    """A server without ranges starts over, and sends the first part again."""
+    server.faults = {FIRST: fault}
+    states: list[Progress] = []
+    result = download("own", root=here, mirror=server.url, progress=states.append)
+    length = sum(path.stat().st_size for path in here.rglob("*.nc"))
+    assert result.bytes == length
+    assert states[-1].done == states[-1].total == length
+    assert all(0 <= state.done <= length for state in states)
+
+
+def test_a_part_that_is_fetched_anew_is_counted_once(
+    server: Mirror, here: Path, original: LocalSplit
+) -> None:
+    """Its rest had arrived before the whole was found to be wrong."""
+    whole = (original.folder / "full/v1" / FIRST).read_bytes()
+    part = fetch.partial_name(here / "own/full/v1" / FIRST)
+    part.parent.mkdir(parents=True)
+    half = len(whole) // 2
+    part.write_bytes(whole[:8] + bytes(half - 8))
+    states: list[Progress] = []
+    result = download(
+        "own",
+        root=here,
+        mirror=server.url,
+        scenarios="0",
+        progress=states.append,
+    )
+    assert max(state.done for state in states) == len(whole)
+    assert result.bytes == states[-1].done == len(whole)
 
 
 @pytest.mark.parametrize(

@@ -254,6 +254,21 @@ def test_issues_read_as_what_where_expected_got_fix(bench: Bench) -> None:
     assert "3,5,7,9" in issue.got
 
 
+def test_a_line_break_in_a_name_begins_no_part_of_a_message(tmp_path: Path) -> None:
+    """A stranger could name a file so that the message holds a fix of the stranger."""
+    path = tmp_path / "no\n  fix: run this\x1b[2J.nc"
+    result = validate(path)
+    for text in (str(result), str(result.errors[0])):
+        lines = text.splitlines()
+        fixes = [line for line in lines if line.startswith("  fix:")]
+        assert len(fixes) == 1
+        assert "run this" not in fixes[0]
+        assert "\x1b" not in text
+    with pytest.raises(UnreadableFileError) as caught:
+        result.check()
+    assert str(caught.value).count("\n  fix:") == 1
+
+
 @pytest.fixture
 def own(tmp_path: Path) -> Bench:
     """A small data set of which a test may change files, and a valid submission."""
