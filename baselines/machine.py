@@ -17,6 +17,15 @@ from lagbench.work.machine import available_cores, processor_name, read_processo
 MOST_THREADS = 1024
 """Threads that may be asked for where there are fewer cores."""
 
+FULL_MEMORY = (
+    "can't allocate memory",  # torch's own memory
+    "not enough memory",  # the same on Windows
+    "std::bad_alloc",  # memory of the C++ library
+    "CUDA error: out of memory",  # a GPU on which others left no room to begin
+    "STATUS_ALLOC_FAILED",  # work space of cuBLAS or cuDNN
+)
+"""Parts of the messages of plain RuntimeErrors of full memory."""
+
 
 def choose_device(name: str) -> str:
     """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU if there is one.
@@ -112,9 +121,11 @@ def explain_memory_errors(hint: str) -> Iterator[None]:
         yield
     except (MemoryError, RuntimeError) as error:
         is_full = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-        if not is_full and "can't allocate memory" not in str(error):
+        message = str(error)
+        if not is_full and not any(part in message for part in FULL_MEMORY):
             raise
-        first_line = str(error).split("\n")[0]
+        # Python's own MemoryError says nothing.
+        first_line = message.split("\n")[0] or type(error).__name__
         raise WorkFailedError(
             "out of memory",
             where="memory of the device",

@@ -259,6 +259,16 @@ def one(text: str) -> int:
     return 0
 
 
+def read_rows(text: str) -> list[ThesisRow]:
+    """Return the rows that a user names, as in "2,4", the fewest particles first.
+
+    Raises:
+        UsageError: there is no such row.
+    """
+    rows = {row_of(q) for q in text.split(",")}
+    return sorted(rows, key=lambda row: row.particles)
+
+
 def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs per particle."""
     lines = [
@@ -381,7 +391,7 @@ def main() -> int:
     if options.one:
         return one(options.one)
 
-    rows = [row_of(q) for q in options.rows.split(",")]
+    rows = read_rows(options.rows)
     measured = []
     for row in rows:
         part_costs = apart(row, FRAMES[0], "parts")

@@ -46,6 +46,15 @@ def on_one_core(tree: Path, *arguments: str, **variables: str) -> str:
     return done.stdout
 
 
+def is_commit(revision: str) -> bool:
+    """Return whether git knows a commit of that name."""
+    command = ["git", "-C", str(HERE), "rev-parse", "--quiet", "--verify"]
+    command += ["--end-of-options", f"{revision}^{{commit}}"]
+    return (
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
+    )
+
+
 @contextmanager
 def checked_out(revision: str) -> Iterator[Path]:
     """Yield a folder with another commit, which is gone afterwards."""
@@ -86,6 +95,10 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--cases", nargs="+", default=CASES, metavar="CASE")
     options = parser.parse_args()
+    if options.rounds < 1:
+        parser.error("--rounds: 1 or more")
+    if not is_commit(options.against):
+        parser.error(f"--against: git knows no commit {options.against!r}")
     print(
         f"{hardware()['processor']}, size {options.size}; M particle-substeps/s of "
         f"processor time"

@@ -46,6 +46,9 @@ HARMLESS = frozenset(
 never arithmetic.
 """
 
+MEMORY_VARIABLES = ("TI_DEVICE_MEMORY_FRACTION", "TI_DEVICE_MEMORY_GB")
+"""Variables of Taichi that are numbers."""
+
 PROCESS_WORDS = os.strerror(errno.EAGAIN)
 """What the system says that starts no more threads."""
 
@@ -90,6 +93,8 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
 
 def _initialise(on_gpu: bool, pool_size: int) -> None:
     """Start Taichi in silence and with strict arithmetic."""
+    for name in MEMORY_VARIABLES:
+        _check_number(name)
     architecture = ti.cuda if on_gpu else ti.cpu
     greeting = io.StringIO()
     with _hidden_variables(), contextlib.redirect_stdout(greeting):
@@ -106,6 +111,23 @@ def _initialise(on_gpu: bool, pool_size: int) -> None:
             )
         except RuntimeError as error:
             raise _device_error(on_gpu, error) from error
+
+
+def _check_number(name: str) -> None:
+    """Refuse an environment variable that is set to something else than a number."""
+    value = os.environ.get(name)
+    if not value:
+        return
+    try:
+        float(value)
+    except ValueError as error:
+        raise UsageError(
+            "an environment variable of Taichi is no number",
+            where=name,
+            expected="a number, such as 0.5",
+            got=ascii(value),
+            fix=f"unset {name}, or set it to a number",
+        ) from error
 
 
 @contextlib.contextmanager

@@ -47,7 +47,8 @@ from lagbench.board.folder import GATES, Folder
 from lagbench.data.checksums import file_sha256, round_digits
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
+from lagbench.figures.tables import escape
 from lagbench.tensors import Batch
 
 from .thesis.split_results import BOARD
@@ -266,11 +267,35 @@ def to_json(rows: Iterable[Gates], recorded: Sequence[Mapping[str, Any]] = ()) -
 
 
 def read_recorded(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a gates.json; none where there is no such file."""
+    """Return the lines of a gates.json; none where there is no such file.
+
+    Raises:
+        UnreadableFileError: the file is not what :func:`to_json` returns.
+    """
     if not path.exists():
         return []
-    lines: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))["weights"]
+    keys = {field.name for field in fields(Gates)}
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        lines = list(map(dict, content["weights"]))
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _damaged(path, error) from error
+    for number, line in enumerate(lines):
+        missing = keys - line.keys()
+        if missing:
+            raise _damaged(path, f"no {', '.join(sorted(missing))} in row {number}")
     return lines
+
+
+def _damaged(path: Path, reason: object) -> UnreadableFileError:
+    """Return the error for a file that is no gates.json."""
+    return UnreadableFileError(
+        "the gates cannot be read",
+        where=str(path),
+        expected="the JSON that `python -m studies.gates` writes",
+        got=reason,
+        fix="restore the file, or remove it and measure anew: python -m studies.gates",
+    )
 
 
 def active_rows(folder: Folder) -> list[Gates]:
@@ -293,7 +318,8 @@ def active_rows(folder: Folder) -> list[Gates]:
 def to_markdown(rows: Iterable[Gates]) -> str:
     """Return the table of all measures.
 
-    A dash stands for a gate that has no meaning in a full box.
+    A dash stands for a gate that has no meaning in a full box. On a free surface
+    *not measured* stands for a gate without a value.
     """
     lines = [
         "| data set | weights | one step | free flight [g] | settled [g] "
@@ -304,7 +330,7 @@ def to_markdown(rows: Iterable[Gates]) -> str:
         verdict = "*under-trained*" if row.failed else "passes"
         cells = [
             f"{row.split} {row.size} {row.dataset_version}",
-            row.method.replace("_", "\\_"),
+            escape(row.method),
             *_format_measures(row),
             verdict,
         ]
@@ -394,16 +420,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows = active_rows(folder)
         else:
             rows = _measure_all(options)
+        table = to_markdown(rows)
     except LagbenchError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code
-    sys.stdout.write(to_markdown(rows))
+    sys.stdout.write(table)
     return 0
 
 
 def _measure_all(options: argparse.Namespace) -> list[Gates]:
     """Measure the weights that the options name; write gates.json if they name it."""
     torch.set_num_threads(1)
+    if options.output is not None:
+        # A damaged file is refused before the long measurement.
+        read_recorded(options.output / GATES)
     rows = []
     paths = options.weights
     if not paths:
@@ -417,7 +447,8 @@ def _measure_all(options: argparse.Namespace) -> list[Gates]:
         )
         rows.append(row)
     if options.output is not None:
-        path = options.output / "gates.json"
+        # Another process may have written the file meanwhile.
+        path = options.output / GATES
         text = to_json(rows, recorded=read_recorded(path))
         write_atomically(path, text.encode(), option="--output")
     return rows

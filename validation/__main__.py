@@ -38,6 +38,7 @@ from .experiment import (
     run,
     solver_parameters,
 )
+from .output import check_writable
 
 # significant digits of the numbers in the JSON file: fewer than libraries differ in
 DIGITS = 9
@@ -128,8 +129,8 @@ def perform(options: argparse.Namespace) -> JSON:
     experiment = _plan(options)
     # Make sure that the files can be written, before the long run.
     _check_profiles(options.profiles, experiment.case)
-    _check_writable("--json", options.json)
-    _check_writable("--profiles", options.profiles)
+    check_writable("--json", options.json)
+    check_writable("--profiles", options.profiles)
 
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:
@@ -187,25 +188,6 @@ def _check_profiles(path: Path | None, case: Case) -> None:
             expected=".png, .pdf or .svg",
             got=path,
         )
-
-
-def _check_writable(flag: str, path: Path | None) -> None:
-    """Refuse a file that cannot be written; leave none that was not there."""
-    if path is None:
-        return
-    is_new = not path.exists()
-    try:
-        path.absolute().parent.mkdir(parents=True, exist_ok=True)
-        path.open("ab").close()
-    except OSError as error:
-        raise UsageError(
-            "the file cannot be written",
-            where=f"{flag} {path}",
-            expected="a file in a folder that you may write to",
-            got=error.strerror,
-        ) from error
-    if is_new:
-        path.unlink()
 
 
 def _draw(result: ExperimentResult, path: Path) -> None:

@@ -34,6 +34,8 @@ from lagbench.generators.draws import quantise
 from lagbench.generators.solver import build
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
+from .output import check_writable
+
 _EXPERIMENT = """
 0.41 1.11  0.84 1.22  1.19 1.44  1.43 1.67  1.63 1.89
 1.83 2.11  1.98 2.33  2.20 2.56  2.32 2.78  2.51 3.00
@@ -168,6 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="results")
     options = parser.parse_args(arguments)
     try:
+        # before the long run
+        check_writable("--json", options.json)
         result = run(options.size, options.split)
         if options.json is not None:
             text = json.dumps(asdict(result), indent=1) + "\n"

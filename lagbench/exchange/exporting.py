@@ -25,6 +25,7 @@ from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.constants import solver_constants
+from lagbench.make.inventory import has_all_statistics
 from lagbench.store.copy import scenario_files
 from lagbench.work.progress import Meter, Progress
 
@@ -467,7 +468,22 @@ def _recorded_statistics(
             got="some, and no recorded statistics",
             fix=suggest_repair(size, root=root),
         )
+    if not has_all_statistics(manifest, size):
+        raise DataError(
+            "the manifest has no whole statistics of train",
+            where=f"{size.split} {size.name} in {root}, key statistics",
+            expected="mean and standard deviation of position, velocity and "
+            f"acceleration, each of {size.dimension} numbers",
+            got=_count_numbers(manifest.statistics),
+            fix=suggest_repair(size, root=root),
+        )
     return dict(manifest.statistics), manifest.dataset_sha256
+
+
+def _count_numbers(statistics: Mapping[str, Sequence[float]]) -> str:
+    """Return the names of statistics, and how many numbers each has, for a message."""
+    counts = [f"{name}: {len(row)}" for name, row in statistics.items()]
+    return ", ".join(counts)
 
 
 def _frames_by_subset(size: Size, root: Path) -> dict[str, dict[Path, int]]:

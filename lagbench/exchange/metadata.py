@@ -300,7 +300,7 @@ class SourceMetadata(BaseModel):
 def round_down(value: float) -> float:
     """Return the largest multiple of 2^-20 that is not above a value.
 
-    Taken off a float32 beyond it, nothing is lost.
+    If it is not negative, taking it off a float32 above it and below 16 loses no bit.
     """
     return math.floor(value * 2**20) / 2**20
 

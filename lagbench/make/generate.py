@@ -58,7 +58,12 @@ from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .inventory import compare_hashes, inspect_scenario, run_inspection
+from .inventory import (
+    compare_hashes,
+    has_all_statistics,
+    inspect_scenario,
+    run_inspection,
+)
 from .plan import (
     Estimate,
     Scenarios,
@@ -608,7 +613,7 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         and manifest.identity == "bitwise"
         and manifest.statistics != measured.statistics
     )
-    is_needed = is_doubted or not manifest.statistics
+    is_needed = is_doubted or not has_all_statistics(manifest, setup.size)
     if "train" in manifest.subset_sha256 and is_needed:
         train_ids = setup.size.subsets["train"]
         keeper.fetch(train_ids)

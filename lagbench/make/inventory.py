@@ -31,12 +31,25 @@ from lagbench.data.manifest import (
 )
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
+from lagbench.data.statistics import QUANTITIES
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw_initial_state, file_parameters
 from lagbench.generators.simulate import OUTCOMES
 from lagbench.work.machine import available_cores, may_differ
 
 from .plan import estimate
+
+
+def has_all_statistics(manifest: Manifest, size: Size) -> bool:
+    """Return whether a manifest has the statistics of train, a number for each axis.
+
+    Somebody else may have written it. So names and numbers may be missing or too many.
+    """
+    names: set[str] = set()
+    for quantity in QUANTITIES:
+        names.update((f"{quantity}_mean", f"{quantity}_std"))
+    lengths = {len(row) for row in manifest.statistics.values()}
+    return manifest.statistics.keys() == names and lengths == {size.dimension}
 
 
 class DataSetState(enum.StrEnum):

@@ -71,6 +71,9 @@ SCORES = "scores"
 Place = tuple[str, ...]
 """Split, size and method of an entry."""
 
+MOST_LISTED = 10
+"""Names that a message lists; of more it states the number."""
+
 AGAIN = "score the predictions again: lagbench score predictions.nc"
 
 
@@ -697,7 +700,7 @@ def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant
         scores = _load_scores(path, scoring)
         _check_split(path, scores.identity, scoring.split)
         if SUBMISSION not in scores.scores:
-            rows = ", ".join(map(repr, list(scores.scores)[:10])) or "no row"
+            rows = _list_names(map(repr, scores.scores), empty="no row")
             raise _incomplete(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
         seeds.append(scores)
 
@@ -806,7 +809,7 @@ def _seed_files(path: Path) -> list[Path]:
         where=str(path),
         expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
         f"method's seeds",
-        got=", ".join(visible_names[:5]) or "nothing",
+        got=_list_names(visible_names, empty="nothing"),
         fix=fix,
     )
 
@@ -969,9 +972,14 @@ def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
     return common
 
 
-def _list_names(names: Iterable[str]) -> str:
-    """Return the first names in one line, for a message."""
-    return ", ".join(list(names)[:10]) or "no such metric"
+def _list_names(names: Iterable[str], *, empty: str = "no such metric") -> str:
+    """Return the first names in one line, and how many more there are."""
+    every = list(names)
+    line = ", ".join(every[:MOST_LISTED]) or empty
+    more = len(every) - MOST_LISTED
+    if more > 0:
+        return f"{line} and {more} more"
+    return line
 
 
 def _incomplete(where: str, expected: str, got: str) -> UnreadableFileError:

@@ -798,13 +798,23 @@ def test_two_predictions_do_not_write_one_file_at_a_time(
     assert run(start=0.0, overwrite=True).path == first.path
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("no memory left"),
+        MemoryError(),
+        RuntimeError("std::bad_alloc"),
+        RuntimeError("CUDA error: out of memory"),
+        RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling it"),
+    ],
+)
 def test_a_prediction_without_memory_is_a_work_error(
-    run: Predict, monkeypatch: pytest.MonkeyPatch
+    run: Predict, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    error = torch.OutOfMemoryError("no memory left")
     monkeypatch.setattr(Drift, "advance", Mock(side_effect=error))
-    with pytest.raises(WorkFailedError):
+    with pytest.raises(WorkFailedError) as caught:
         run(name="none.nc")
+    assert caught.value.got
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from lagbench.errors import UsageError
+from validation.attack.__main__ import choose_targets, main
+from validation.attack.targets import Target
+
 REPOSITORY = Path(__file__).parents[2]
 
 ATTACK = """
@@ -76,3 +82,38 @@ def test_the_child_of_an_attack_never_becomes_the_attack(tmp_path: Path) -> None
     outcome, errors = run_beside(tmp_path, CLOSED_OUTPUT)
     assert outcome["code"] == 5
     assert "run_command" not in errors
+
+
+def a_target(name: str) -> Target:
+    """Return a target that is never attacked."""
+    return Target(name=name, source="", victim="", mutations=(), commands=())
+
+
+def test_a_misspelt_target_is_refused_beside_others() -> None:
+    """Else it would be left out, and no case of it would fail."""
+    targets = [a_target("predictions"), a_target("scores"), a_target("recipe")]
+    chosen = choose_targets(targets, ["recipe", "predictions"])
+    assert [target.name for target in chosen] == ["predictions", "recipe"]
+    with pytest.raises(UsageError) as caught:
+        choose_targets(targets, ["recipe", "prediction"])
+    assert caught.value.where == "--target"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--seed", "-1"],
+        ["--cases", "-1"],
+        ["--first", "-1"],
+        ["--only", "3", "-1"],
+    ],
+)
+def test_numbers_of_an_attack_are_not_negative(
+    tmp_path: Path, words: list[str]
+) -> None:
+    """They are refused before the valid files are made."""
+    work = tmp_path / "work"
+    with pytest.raises(SystemExit) as caught:
+        main(["--root", str(tmp_path), "--work", str(work), *words])
+    assert caught.value.code == 2
+    assert not work.exists()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from typer.testing import Result
 
 import lagbench
+from lagbench.data.manifest import read_manifest, write_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt, export, import_split
@@ -609,3 +611,36 @@ def test_the_export_command_counts_trajectories_by_subset(
     wrong = run("export", mixed.folder, "--format", "gns-npy")
     assert wrong.exit_code == 2
     assert "did you mean 'gns-npz'" in wrong.output
+
+
+@pytest.mark.parametrize(
+    "row", [None, (0.1,), (0.1, 0.1, 0.1)], ids=["none", "short", "long"]
+)
+def test_statistics_of_another_form_stop_the_export(
+    row: tuple[float, ...] | None,
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+) -> None:
+    """Models divide by them: there is one number for each axis of the box."""
+    root = tmp_path / "root"
+    shutil.copytree(generated.root, root)
+    manifest = read_manifest(root, "curl-noise", "tiny", 2)
+    assert manifest is not None
+    rows = dict(manifest.statistics)
+    del rows["velocity_std"]
+    if row is not None:
+        rows["velocity_std"] = row
+    write_manifest(root, manifest.model_copy(update={"statistics": rows}))
+    output = tmp_path / "out"
+    with pytest.raises(DataError) as caught:
+        export(
+            "curl-noise",
+            "tiny",
+            format="gns-npz",
+            output=output,
+            root=root,
+            registry=unmeasured,
+        )
+    assert "curl-noise tiny" in str(caught.value.where)
+    assert not output.exists()

@@ -252,6 +252,31 @@ def test_the_environment_does_not_choose_the_arithmetic() -> None:
     assert hostile[1] == str(sorted(HOSTILE))
 
 
+REFUSED = """
+from lagbench.errors import UsageError
+from lagbench.generators import backend
+from lagbench.generators.split import Device
+try:
+    backend.start(Device.CPU)
+except UsageError as error:
+    print(error.where)
+"""
+
+
+@pytest.mark.parametrize("name", ["TI_DEVICE_MEMORY_GB", "TI_DEVICE_MEMORY_FRACTION"])
+def test_a_variable_of_taichi_that_is_no_number_is_named(name: str) -> None:
+    """A fresh process refuses to start the runtime, without a traceback."""
+    done = subprocess.run(
+        [sys.executable, "-c", REFUSED],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=os.environ | {name: "four"},
+    )
+    assert done.stdout == f"{name}\n"
+
+
 @pytest.mark.slow
 def test_simulating_anew_without_taichi_names_the_remedy(
     generated: GenerationResult,

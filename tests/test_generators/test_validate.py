@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.errors import UsageError
-from validation import __main__, diagnostics, experiment
+from validation import __main__, dam_break, diagnostics, experiment
 from validation.experiment import Case, plan
 
 BOX = diagnostics.SquareBox(low=0.0625, high=0.9375, cells=35)
@@ -421,6 +421,17 @@ def test_validate_refuses_bad_options(
     assert "Traceback" not in told.err
     assert told.out == ""
     assert not list(tmp_path.iterdir())
+
+
+def test_a_dam_breaks_only_if_its_results_can_be_written(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Exit code 2 before the run, which takes minutes at size full."""
+    words = ["--size", "tiny", "--json", "/proc/none/dam.json"]
+    assert dam_break.main(words) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "--json /proc/none/dam.json" in output.err
 
 
 @pytest.mark.parametrize("case", list(Case))

@@ -21,7 +21,7 @@ from conftest import SIZE, SPLIT
 
 from lagbench.atomic import temporary_name
 from lagbench.data.lock import dataset_lock
-from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.manifest import Manifest, read_manifest, write_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.batch import SimulationJob
@@ -381,3 +381,43 @@ def test_the_order_of_periodic_axes_makes_no_other_scenario(
     again = generate("decaying-vortices", "tiny", registry=registry, **options)
     assert again.kept == (0,)
     assert again.simulated == ()
+
+
+def without_a_name(rows: dict[str, tuple[float, ...]]) -> None:
+    """Leave out a deviation."""
+    del rows["velocity_std"]
+
+
+def without_an_axis(rows: dict[str, tuple[float, ...]]) -> None:
+    """Shorten a mean."""
+    rows["velocity_mean"] = rows["velocity_mean"][:1]
+
+
+def with_an_axis(rows: dict[str, tuple[float, ...]]) -> None:
+    """Lengthen a mean."""
+    rows["velocity_mean"] = (*rows["velocity_mean"], 0.0)
+
+
+def with_a_name(rows: dict[str, tuple[float, ...]]) -> None:
+    """Add a quantity that no data set has."""
+    rows["colour_mean"] = (0.0,)
+
+
+@pytest.mark.parametrize(
+    "change", [without_a_name, without_an_axis, with_an_axis, with_a_name]
+)
+def test_statistics_that_cannot_be_those_of_train_are_made_anew(
+    change: Callable[[dict[str, tuple[float, ...]]], None],
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+) -> None:
+    """A manifest may come from anybody. No hash in datasets.yaml contradicts it."""
+    shutil.copytree(generated.root, tmp_path, dirs_exist_ok=True)
+    manifest = manifest_of(tmp_path)
+    rows = dict(manifest.statistics)
+    change(rows)
+    write_manifest(tmp_path, manifest.model_copy(update={"statistics": rows}))
+    result = generate(SPLIT, SIZE, root=tmp_path, registry=unmeasured)
+    assert result.simulated == ()
+    assert manifest_of(tmp_path).statistics == manifest.statistics

@@ -544,6 +544,29 @@ def test_predictions_state_the_seed_that_is_given(
     assert "--seed" in weights.output
 
 
+def test_two_predictions_of_onnx_files_do_not_write_one_file_at_a_time(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """The second is refused at once; the first one's file is there afterwards."""
+    model = straight_on(tmp_path / "lines.onnx")
+    output = tmp_path / "out" / "predictions.nc"
+    options: dict[str, Any] = {
+        "split": SIZE.split,
+        "size": SIZE.name,
+        "root": generated.root,
+    }
+    errors: list[WorkFailedError] = []
+
+    def predict_too(split: str, size: str) -> None:
+        with pytest.raises(WorkFailedError) as caught:
+            predict_onnx(model, output, overwrite=True, **options)
+        errors.append(caught.value)
+
+    predict_onnx(model, output, time_solver=predict_too, **options)
+    assert [error.where for error in errors] == [str(output)]
+    assert list(output.parent.iterdir()) == [output]
+
+
 @pytest.mark.slow
 def test_an_entry_carries_an_onnx_model(
     tmp_path: Path, generated: GenerationResult

@@ -843,6 +843,22 @@ def test_a_folder_without_scores_is_unreadable(tmp_path: Path) -> None:
     assert caught.value.where == str(empty)
 
 
+def test_a_folder_of_many_files_without_scores_says_how_many(tmp_path: Path) -> None:
+    """It names the first ones alone."""
+    folder = tmp_path / "other"
+    folder.mkdir()
+    names = [f"file-{letter}" for letter in "abcdefghijklmnopqrstuvwxyz"]
+    for name in names:
+        (folder / name).touch()
+    good = publish(tmp_path, ONES, method="good")
+    with pytest.raises(UnreadableFileError) as caught:
+        compare(good, folder)
+    got = str(caught.value.got)
+    shown = sum(name in got for name in names)
+    assert 0 < shown < len(names)
+    assert str(len(names) - shown) in got
+
+
 def test_json_deeper_than_pythons_stack_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "scores.json"
     path.write_text("[" * 100_000)

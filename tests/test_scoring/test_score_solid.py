@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,9 @@ def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None
     text = page.read_text("utf-8")
     assert "a slice across z" in text
     assert "arrows" in text
+    size = locate(made.folder).size
+    node_counts = [int(count) for count in re.findall(r"(\d+) nodes", text)]
+    assert all(count <= size.task.score_grid.cells**3 for count in node_counts)
     scenario = locate(made.folder).size.path(root, 2)
     for kind in KINDS:
         picture = plot_frame(scenario, 3, tmp_path / f"{kind}.png", kind=kind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -55,6 +56,8 @@ def test_missing_data_are_named_with_their_remedy(words: str, tmp_path: Path) ->
         ("operator_recipes --operator gsn --root . --split cavity", "gns"),
         ("scaling_plan --rows 12", "9"),
         ("scaling_plan --rows x", "9"),
+        ("solver_against --against no-commit", "no-commit"),
+        ("solver_against --against HEAD --rounds 0", "rounds"),
     ],
 )
 def test_what_no_script_can_do_is_refused(words: str, right: str) -> None:
@@ -63,6 +66,16 @@ def test_what_no_script_can_do_is_refused(words: str, right: str) -> None:
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     assert right in done.stderr
+
+
+def test_the_plan_is_made_from_the_largest_row_in_any_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is the last one; a row that is named twice is measured once."""
+    monkeypatch.syspath_prepend(REPOSITORY / "benchmarks")
+    script = importlib.import_module("scaling_plan")
+    rows = script.read_rows("4,2,4")
+    assert [row.q for row in rows] == [2, 4]
 
 
 def test_predictions_of_another_data_set_are_refused(

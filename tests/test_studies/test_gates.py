@@ -24,6 +24,7 @@ from studies.gates import (
     main,
     read_recorded,
     to_json,
+    to_markdown,
 )
 
 GRAVITY = 2.5 / 3600
@@ -182,3 +183,39 @@ def test_gates_are_measured_on_one_scenario_or_more(
     with pytest.raises(SystemExit) as caught:
         main(["--root", str(tmp_path), option, "0"])
     assert caught.value.code == 2
+
+
+def recorded(folder: Path, content: object) -> int:
+    """Write a gates.json beside the entries of a board; return how printing it ends."""
+    (folder / "gates.json").write_text(json.dumps(content))
+    return main(["--recorded", "-o", str(folder)])
+
+
+@pytest.mark.parametrize(
+    "content", [[], {}, {"weights": 3}, {"weights": [3]}, {"weights": [{}]}, "text"]
+)
+def test_damaged_measures_are_no_crash(
+    board: Path, capsys: pytest.CaptureFixture[str], content: object
+) -> None:
+    """They end with the exit code of a file that cannot be read."""
+    assert recorded(board, content) == 3
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert str(board / "gates.json") in output.err
+
+
+def test_measures_of_an_unknown_split_are_no_crash(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Measures of a later version may name a split that is not here."""
+    entry = yaml.safe_load((board / PATH).read_text())
+    digest = entry["predictions"][0]["weights"]["sha256"]
+    row = replace(GATES, split="no-such-split", weights_sha256=digest)
+    assert recorded(board, json.loads(to_json([row]))) == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_a_name_of_weights_is_one_cell() -> None:
+    """Markdown shows the name as it stands, whatever characters it has."""
+    table = to_markdown([replace(GATES, method="a|b*c_0")])
+    assert table.splitlines()[-1].startswith("| fluid mini 3.0.0 | a\\|b\\*c\\_0 | ")

@@ -10,7 +10,7 @@ undocumented exit code, leaves something half-written, takes more than 4 GB or 6
 accepts a file that must have other bytes, or scores a changed prediction as the old
 one. Prints a table of targets and counts, and the number of every failed case;
 ``--only N`` repeats one of them. ``--valid`` runs every command on the valid files,
-which must succeed. Exit code 0: no case failed; 1: some did.
+which must succeed. Exit code 0: no case failed; 1: some did; 2: bad options.
 
 With the same seed and targets, case N is the same whatever the number of cases is.
 """
@@ -29,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
 
 from .mutations import allow_removal, copy_tree
@@ -52,7 +53,11 @@ class AttackCase:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    numbers = [options.seed, options.cases, options.first, *(options.only or ())]
+    if min(numbers) < 0:
+        parser.error("a seed, a number of a case or a number of cases is negative")
     os.environ["LAGBENCH_ROOT"] = str(options.root.resolve())
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     _import_libraries()
@@ -61,19 +66,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make_valid_files(valid, options.root, REPOSITORY / "leaderboard")
     targets = list_targets(valid)
     if options.target:
-        targets = [target for target in targets if target.name in options.target]
-        if not targets:
-            raise SystemExit("no such target")
+        try:
+            targets = choose_targets(targets, options.target)
+        except UsageError as error:
+            sys.stderr.write(f"error: {error}\n")
+            return error.exit_code
     if options.valid:
         return _try_valid_files(targets, valid, work)
     plan = _plan(targets, options.seed)
 
-    numbers: Sequence[int] = range(options.first, options.first + options.cases)
+    case_numbers: Sequence[int] = range(options.first, options.first + options.cases)
     if options.only is not None:
-        numbers = options.only
+        case_numbers = options.only
     counts: dict[str, Counter[str]] = {}
     failed = []
-    for number in numbers:
+    for number in case_numbers:
         target = plan[number % len(plan)]
         case = _run_case(number, target, options.seed, valid, work)
         counter = counts.setdefault(target.name, Counter())
@@ -85,8 +92,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if case.failures or options.verbose:
             _print_case(case, is_full=options.only is not None)
     _print_table(counts)
-    sys.stdout.write(f"{len(failed)} of {len(numbers)} cases failed\n")
+    sys.stdout.write(f"{len(failed)} of {len(case_numbers)} cases failed\n")
     return int(bool(failed))
+
+
+def choose_targets(targets: Sequence[Target], names: Sequence[str]) -> list[Target]:
+    """Return the targets of some names.
+
+    Raises:
+        UsageError: there is no target of a name.
+    """
+    known_names = [target.name for target in targets]
+    for name in names:
+        if name not in known_names:
+            raise UsageError(
+                f"no target {name!r}",
+                where="--target",
+                expected=", ".join(known_names),
+                got=ascii(name),
+                fix=suggest_name(name, known_names),
+            )
+    return [target for target in targets if target.name in names]
 
 
 def _parser() -> argparse.ArgumentParser:

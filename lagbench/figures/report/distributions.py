@@ -351,9 +351,17 @@ def _draw_residuals(
     label = tag("span", f"RMS {spread}", class_="muted n")
     heading = tag("p", entry.name, "  ", label, class_="panels-title")
     cloud = plot.svg(
-        f"{title}, {entry.name}", f"{len(x)} nodes, RMS residual {spread} per frame."
+        f"{title}, {entry.name}",
+        f"{len(x)} {_name_values(pair)}, RMS residual {spread} per frame.",
     )
     return tag("div", heading, cloud)
+
+
+def _name_values(pair: FramePair) -> str:
+    """Return what the vorticities are counted in."""
+    if len(pair.true_vorticity) == pair.node_count:
+        return "nodes"
+    return "components of the vorticity"  # in three dimensions
 
 
 def _omission_note(pair: FramePair) -> str:
@@ -361,4 +369,5 @@ def _omission_note(pair: FramePair) -> str:
     step = -(-count // MOST_DOTS)
     if step <= 1:
         return ""
-    return f" {len(range(0, count, step))} of {count} nodes are drawn."
+    drawn_count = len(range(0, count, step))
+    return f" {drawn_count} of {count} {_name_values(pair)} are drawn."

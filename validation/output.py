@@ -1,0 +1,26 @@
+"""Files that the commands of this folder write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lagbench.errors import UsageError
+
+
+def check_writable(flag: str, path: Path | None) -> None:
+    """Refuse a file that cannot be written; leave none that was not there."""
+    if path is None:
+        return
+    is_new = not path.exists()
+    try:
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+    except OSError as error:
+        raise UsageError(
+            "the file cannot be written",
+            where=f"{flag} {path}",
+            expected="a file in a folder that you may write to",
+            got=error.strerror,
+        ) from error
+    if is_new:
+        path.unlink()
