@@ -50,9 +50,8 @@ def is_commit(revision: str) -> bool:
     """Return whether git knows a commit of that name."""
     command = ["git", "-C", str(HERE), "rev-parse", "--quiet", "--verify"]
     command += ["--end-of-options", f"{revision}^{{commit}}"]
-    return (
-        subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
-    )
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+    return done.returncode == 0
 
 
 @contextmanager
