@@ -7,7 +7,7 @@ from lagbench.metrics import Direction, FramePair, Metric, enough_nodes
 
 
 def mean_enstrophy(vorticity: NDArray[np.float64]) -> float:
-    """Return ``Z = mean(omega^2) / 2`` over the compared nodes [1/frame^2]."""
+    """Return ``Z = mean(omega^2) / 2`` over the counted nodes [1/frame^2]."""
     return float(np.mean(vorticity**2) / 2)
 
 

@@ -9,8 +9,8 @@ from lagbench.baselines.operators.operator import Losses, Operator
 class Sage(Operator):
     """Mean over the neighbours (Hamilton et al. 2017).
 
-    SAGEConv takes no edge features. They still reach it: the input ``node`` contains
-    the sum of the messages to each particle.
+    SAGEConv takes no edge features. But the input ``node`` contains the sum of the
+    messages to each particle, and the messages depend on the edge features.
     """
 
     method = "GNS + SAGEConv"
