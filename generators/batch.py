@@ -46,6 +46,9 @@ KEPT_PARTICLES = 1 << 17
 # of a whole number in an attribute of a file, its sign left out
 MOST_BITS = 63
 
+# of the name of a drawn parameter: netCDF takes 256 bytes, a character has at most 4
+LONGEST_NAME = 64
+
 # drawn parameters that files call by their CF-like long name
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 
@@ -77,6 +80,9 @@ def start_frame(size: Size, scenario: int) -> int:
 
     The split says it from the head of the scenario's random stream, without a draw of
     the whole scenario. A split without a function ``start_frame`` records at once.
+
+    Raises:
+        UsageError: the split says a negative number.
     """
     state_start_frame = getattr(split_module(size), "start_frame", None)
     if state_start_frame is None:
@@ -84,7 +90,16 @@ def start_frame(size: Size, scenario: int) -> int:
 
     rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     with blamed_on_parameters(size, f"drawing the first frame of scenario {scenario}"):
-        return int(state_start_frame(size, scenario, rng))
+        first_frame = int(state_start_frame(size, scenario, rng))
+    if first_frame < 0:
+        raise UsageError(
+            "a split starts a scenario before its first substep",
+            where=f"{size.generator}.start_frame, scenario {scenario}",
+            expected="0 or more frames before frame 0",
+            got=first_frame,
+            fix="let start_frame return how many frames are simulated before frame 0",
+        )
+    return first_frame
 
 
 def substep_count(size: Size, scenario: int) -> int:
@@ -176,11 +191,11 @@ def _check_values(state: InitialState, where: str) -> None:
     """
     for name in ("area", "viscosity", "friction"):
         value = getattr(state, name)
-        if not _is_finite_number(value):
+        if not _is_finite_number(value) or value < 0.0:
             raise UsageError(
-                f"the {name} of an initial state is no number",
+                f"the {name} of an initial state is impossible",
                 where=where,
-                expected="a finite number",
+                expected="a finite number, 0 or more",
                 got=_describe_value(value),
                 fix=f"give InitialState a number as {name}: docs/extending.md",
             )
@@ -196,19 +211,48 @@ def _check_values(state: InitialState, where: str) -> None:
             fix=fix,
         )
     for name, value in parameters.items():
-        is_text = isinstance(value, str) and value != ""
-        is_storable = is_text or _is_finite_number(value)
+        if not _can_be_name(name):
+            raise UsageError(
+                "a parameter of an initial state has an impossible name",
+                where=where,
+                expected="an identifier of at most "
+                f"{LONGEST_NAME} characters, other than start_frame",
+                got=_describe_value(name),
+                fix="rename the parameter",
+            )
+        is_storable = _is_storable_text(value) or _is_finite_number(value)
         if isinstance(value, int) and value.bit_length() > MOST_BITS:
             is_storable = False
-        if not isinstance(name, str) or not is_storable:
+        if not is_storable:
             raise UsageError(
                 "a parameter of an initial state cannot be stored",
                 where=f"{where}, parameter {name!r}",
                 expected="a finite number (a whole one of 63 bits at most), or a text "
-                "that is not empty",
+                "that is not empty and has no NUL and no lone surrogate",
                 got=_describe_value(value),
                 fix=fix,
             )
+
+
+def _can_be_name(name: object) -> bool:
+    """Return whether a drawn parameter can have this name in a file.
+
+    The file's own ``start_frame`` is that of the initial state.
+    """
+    if not isinstance(name, str) or not name.isidentifier():
+        return False
+    return len(name) <= LONGEST_NAME and name != "start_frame"
+
+
+def _is_storable_text(value: object) -> bool:
+    """Return whether a value is a text that a file can hold."""
+    if not isinstance(value, str) or value == "" or "\0" in value:
+        return False
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _is_finite_number(value: object) -> bool:
@@ -272,20 +316,14 @@ class ScenarioBatch:
         self.job = job  # what to simulate
         # the scenarios before their first substep, in the order of the job
         self.states = [_RECENT.draw(size, scenario) for scenario in job.scenarios]
-        # extremes that each scenario has gone through so far
-        unseen = Health(
-            finite=True,
-            max_speed=0.0,
-            jacobian_min=np.inf,
-            jacobian_max=-np.inf,
-        )
-        self.extremes = [unseen] * scenario_count
         self.solver = _solver(solver_constants(size), job.device, scenario_count)
         self._is_free_surface = isinstance(
             self.solver.parameters, FreeSurfaceParameters
         )
         with self._scenario_names():
             self.solver.load(self.states)
+        # extremes that each scenario has gone through so far
+        self.extremes = self.solver.health()
 
         self._report = report
         # recorded frames of each scenario
@@ -303,8 +341,10 @@ class ScenarioBatch:
         interval = self.job.size.substeps_per_frame
         schedule: list[tuple[int, int, int]] = []
         for index, state in enumerate(self.states):
-            for frame in range(self._frames[index]):
-                substep = (state.start_frame + frame) * interval
+            frame_count = self._frames[index]
+            for frame in range(frame_count):
+                simulated_frames = state.start_frame + frame
+                substep = simulated_frames * interval
                 schedule.append((substep, index, frame))
         schedule.sort()
 

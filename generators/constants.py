@@ -29,6 +29,7 @@ from .full_box_parameters import FullBoxParameters
 from .shapes import Region
 from .split import (
     ClosedBoxParameters,
+    FreeSurface3DParameters,
     FreeSurfaceParameters,
     SolverParameters,
     SplitGenerator,
@@ -100,6 +101,14 @@ LIMITS = {
 finite numbers.
 """
 
+
+SOLVER_PARAMETERS = (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    FreeSurface3DParameters,
+    FullBoxParameters,
+)
+"""Types of constants; each has a solver of its own."""
 
 PARAMETER_ERRORS = (TypeError, ValueError, ArithmeticError, LookupError)
 """What a split of ours raises over parameters that it cannot use."""
@@ -198,7 +207,8 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
         ) from error
     except (LagbenchError, MemoryError):
         raise
-    except Exception as error:  # a stranger's module may raise anything
+    # A stranger's module may raise anything, or end the program.
+    except (Exception, SystemExit) as error:
         place = find_place_in_extension(error, size.generator)
         if place is not None:
             raise WorkFailedError(
@@ -293,7 +303,8 @@ def split_module(size: Size) -> SplitGenerator:
         module = importlib.import_module(size.generator)
     except MemoryError:
         raise
-    except Exception as error:  # a stranger's module may raise anything
+    # A stranger's module may raise anything, or end the program.
+    except (Exception, SystemExit) as error:
         raise UsageError(
             f"the generator of split {size.split!r} cannot be imported",
             where=size.generator,
@@ -319,7 +330,19 @@ def solver_constants(size: Size) -> SolverParameters:
 
     Raises:
         UnreadableFileError: a parameter of the size in datasets.yaml is impossible.
+        UsageError: the generator returns something else than constants of a solver.
     """
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):
-        return module.solver_parameters(size)
+        parameters = module.solver_parameters(size)
+    if type(parameters) not in SOLVER_PARAMETERS:
+        type_names = [known_type.__name__ for known_type in SOLVER_PARAMETERS]
+        raise UsageError(
+            "a split returned no constants of a solver",
+            where=f"{size.generator}.solver_parameters",
+            expected=f"an object of one of these types: {', '.join(type_names)}",
+            got=type(parameters).__name__,
+            fix="return constants(FreeSurfaceParameters, size), or those of another "
+            "solver: docs/extending.md",
+        )
+    return parameters

@@ -80,10 +80,15 @@ def ring_potential(
     x = coordinate(offset[:, 0], 0, 3)
     y = coordinate(offset[:, 1], 1, 3)
     z = coordinate(offset[:, 2], 2, 3)
-    square = x * x + y * y + z * z
-    square_share = square.scale(-1.0 / (radius * radius))
-    left = square_share.shift(1.0)
-    inside = left.only_where(left.value > 0.0)
+    x_square = x * x
+    y_square = y * y
+    z_square = z * z
+    square = x_square + y_square + z_square
+    radius_square = radius * radius
+    minus_q = square.scale(-1.0 / radius_square)
+    remainder = minus_q.shift(1.0)  # 1 - q
+    is_inside = remainder.value > 0.0
+    inside = remainder.only_where(is_inside)
     square_inside = inside * inside
     strength = square_inside * square_inside
     # the cross product of the normal and the way from the centre
@@ -91,20 +96,29 @@ def ring_potential(
     crossed_x = z.scale(n_y) + y.scale(-n_z)
     crossed_y = x.scale(n_z) + z.scale(-n_x)
     crossed_z = y.scale(n_x) + x.scale(-n_y)
-    return strength * crossed_x, strength * crossed_y, strength * crossed_z
+    potential_x = strength * crossed_x
+    potential_y = strength * crossed_y
+    potential_z = strength * crossed_z
+    return potential_x, potential_y, potential_z
 
 
 def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
-    """Draw the rings of a scenario."""
-    potential = [constant(0.0, len(position), 3) for _ in range(3)]
+    """Draw the rings of a scenario; their potentials add up."""
+    point_count = len(position)
+    total_x = constant(0.0, point_count, 3)
+    total_y = constant(0.0, point_count, 3)
+    total_z = constant(0.0, point_count, 3)
     for _ in range(size.value("ring_count")):
         centre = rng.random((3,))
         normal = draw_direction(rng, 3)
         radius = draw_between(rng, size, "ring_radius")
-        ring = ring_potential(position, centre=centre, normal=normal, radius=radius)
-        for axis in range(3):
-            potential[axis] = potential[axis] + ring[axis]
-    return curl(potential)
+        ring_x, ring_y, ring_z = ring_potential(
+            position, centre=centre, normal=normal, radius=radius
+        )
+        total_x = total_x + ring_x
+        total_y = total_y + ring_y
+        total_z = total_z + ring_z
+    return curl([total_x, total_y, total_z])
 
 
 def draw_noise(rng: RandomSource, position: Array, frequency: int) -> Flow:

@@ -355,6 +355,25 @@ class Driver(ABC, Generic[Parameters]):
                 )
 
 
+def check_undriven(index: int, state: InitialState) -> None:
+    """Refuse what acts in full boxes of :class:`.FullBox` only.
+
+    Raises:
+        UsageError: the state has a body force, an obstacle or a stream.
+    """
+    for name in ("body_force", "obstacle", "stream"):
+        value = getattr(state, name)
+        if value is not None:
+            raise UsageError(
+                f"this solver knows no {name}",
+                where=f"scenario {index}, {name}",
+                expected="None",
+                got=type(value).__name__,
+                fix="return FullBoxParameters from solver_parameters, or leave it out "
+                "of the initial state: docs/extending.md",
+            )
+
+
 def check_program(
     program: object, row: tuple[int, ...], *, where: str, has_one_row: bool = False
 ) -> None:

@@ -79,13 +79,15 @@ def _draw_shape(rng: RandomSource, family: str, area: float, size: Size) -> Shap
 
 def _draw_blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
     """Draw discs that all reach a common point, so that the body is one piece."""
-    reach = interval(size, "blob_offset")
+    least_distance, greatest_distance = interval(size, "blob_offset")
     centres = []
     for _ in range(size.value("blob_count")):
-        distance = uniform(rng, *reach)
+        distance = uniform(rng, least_distance, greatest_distance)
         x, y = direction(rng)
-        centres.append((distance * x, distance * y))
-    return Blobs.of_area(area, np.array(centres), cells=size.value("blob_cells"))
+        centre = (distance * x, distance * y)
+        centres.append(centre)
+    cells = size.value("blob_cells")
+    return Blobs.of_area(area, np.array(centres), cells=cells)
 
 
 def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array:
@@ -101,28 +103,38 @@ def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> 
     blob_count = size.value("blob_count")
     blob_velocities = normal(rng, size.value("blob_speed"), (blob_count, 2))
     softening = size.value("blob_softening")
+    softening_square = softening * softening
+    from_body_centre = position - body.centre
+    particle_count = len(position)
     total = np.zeros_like(position)
-    weights = np.zeros((len(position), 1))
+    weights = np.zeros((particle_count, 1))
     for centre, velocity in zip(body.shape.centres, blob_velocities, strict=True):
-        way = position - body.centre - np.array(centre)
-        x, y = way.T
-        square_distance = x * x + y * y + softening * softening
-        weight = 1.0 / square_distance
-        weight = weight[:, None]  # shape [particle, 1]
+        from_blob_centre = from_body_centre - np.array(centre)
+        x, y = from_blob_centre.T
+        square_distance = x * x + y * y
+        softened = square_distance + softening_square
+        inverse = 1.0 / softened
+        weight = inverse[:, None]  # shape [particle, 1]
         total = total + weight * velocity
         weights = weights + weight
+    mean_velocity = total / weights
     noise = normal(rng, size.value("particle_speed"), position.shape)
-    return total / weights + noise
+    return mean_velocity + noise
 
 
 def _start_region(size: Size, start: str) -> Region:
     """Return where a body may lie: its family's region, within the walls' margin."""
     (left, right), (bottom, top) = ranges(size, start)
     low, high = free_surface_walls(size)
-    least = low + size.value("margin")
-    most = high - size.value("margin")
-    horizontal = (max(left, least), min(right, most))
-    vertical = (max(bottom, least), min(top, most))
+    margin = size.value("margin")
+    least = low + margin
+    most = high - margin
+    inner_left = max(left, least)
+    inner_right = min(right, most)
+    inner_bottom = max(bottom, least)
+    inner_top = min(top, most)
+    horizontal = (inner_left, inner_right)
+    vertical = (inner_bottom, inner_top)
     return horizontal, vertical
 
 
@@ -137,8 +149,10 @@ def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
     x = low + half_width
     if number // 2 % 2 == 1:
         x = high - half_width
-    body = body_at(shape, x, low + half_height)
-    position = np.clip(sample_points(rng, body, size.particles), low, high)
+    y = low + half_height
+    body = body_at(shape, x, y)
+    sampled = sample_points(rng, body, size.particles)
+    position = np.clip(sampled, low, high)
     return _liquid_at(
         size,
         body,
@@ -164,14 +178,16 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     start = _START[family]
     area = draw_between(rng, size, area_range)
     shape = _draw_shape(rng, family, area, size)
-    body = place(rng, shape, _start_region(size, start))
+    region = _start_region(size, start)
+    body = place(rng, shape, region)
 
     horizontal_speeds, vertical_speeds = ranges(size, f"{start}_velocity")
     velocity_x = uniform(rng, *horizontal_speeds)
     velocity_y = uniform(rng, *vertical_speeds)
     position = sample_points(rng, body, size.particles)
     splash = _draw_splash(rng, body, position, size)
-    velocity = quantise(np.array([velocity_x, velocity_y]) + splash)
+    body_velocity = np.array([velocity_x, velocity_y])
+    velocity = quantise(body_velocity + splash)
     return _liquid_at(
         size,
         body,

@@ -79,7 +79,8 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
     reach_x, reach_y, reach_z = solid.reach
     lowest = max(lowest, least + reach_y)
     across = (least, most)
-    check_room(solid, [across, (lowest - reach_y, most), across])
+    upright = (lowest - reach_y, most)
+    check_room(solid, [across, upright, across])
     x = uniform(rng, least + reach_x, most - reach_x)
     y = uniform(rng, lowest, most - reach_y)
     z = uniform(rng, least + reach_z, most - reach_z)
@@ -96,6 +97,13 @@ def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
     return _state(rng, size, "falling-ball", [body])
 
 
+def _draw_sign(rng: RandomSource) -> float:
+    """Draw 1 or -1, each equally likely."""
+    if choice(rng, 2) == 1:
+        return -1.0
+    return 1.0
+
+
 def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
     width = draw_between(rng, size, "block_side")
     height = draw_between(rng, size, "block_side")
@@ -104,9 +112,9 @@ def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
     centre = _draw_place(rng, size, block, 0.0)
     u, v, w = _draw_vector(rng, size, "throw_velocity")
     # towards either end of both horizontal axes
-    sign_x = 1.0 - 2.0 * choice(rng, 2)
-    sign_z = 1.0 - 2.0 * choice(rng, 2)
-    velocity = (sign_x * u, v, sign_z * w)
+    velocity_x = _draw_sign(rng) * u
+    velocity_z = _draw_sign(rng) * w
+    velocity = (velocity_x, v, velocity_z)
     body = _LiquidBody(block, centre, velocity)
     return _state(rng, size, "thrown-block", [body])
 
@@ -115,9 +123,10 @@ def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     low, high = free_surface_walls(size)
     width = draw_between(rng, size, "column_width")
     height = draw_between(rng, size, "column_height")
-    start = low + 0.5 * width
+    half_width = 0.5 * width
+    start = low + half_width
     if choice(rng, 2) == 1:
-        start = high - 0.5 * width
+        start = high - half_width
     y = low + 0.5 * height
     middle = 0.5 * (low + high)
     side = high - low

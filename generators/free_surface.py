@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .driver import Driver, stack
+from .driver import Driver, check_undriven, stack
 from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
 from .solver import Health, Singles
@@ -77,6 +77,10 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
     def _set_deformation(self, gradients: Singles) -> None:
         """Fill the field of F, shape [scenario, particle, axis, axis]."""
 
+    def _check_state(self, index: int, state: InitialState) -> None:
+        super()._check_state(index, state)
+        check_undriven(index, state)
+
     def _start(self, states: Sequence[InitialState]) -> None:
         shape = (self.scenarios, self.parameters.particles)
         kernels = self._kernels
@@ -84,9 +88,8 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         self._material = stack(states, "material").astype(np.int32)
         kernels.sort_by_material(self._material)
         matter_shape = (*shape, 4)
-        matter = np.zeros(matter_shape, np.float32)
+        matter = np.ones(matter_shape, np.float32)
         matter[:, :, 0] = self._material
-        matter[:, :, 1:] = 1.0
         kernels.matter.from_numpy(matter)
         identity = np.eye(self.dimension, dtype=np.float32)
         gradient_shape = (*shape, *identity.shape)

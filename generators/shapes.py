@@ -165,11 +165,15 @@ class Blobs:
         """
         low = offsets.min(axis=0) - 1.0
         high = offsets.max(axis=0) + 1.0
-        centres = offsets - 0.5 * (low + high)
+        middle_of_box = 0.5 * (low + high)
+        centres = offsets - middle_of_box
         width, height = high - low
         # middles of the cells from the centre, as shares of the box
-        middle = (np.arange(cells) + 0.5) / cells - 0.5
-        x, y = np.meshgrid(middle * width, middle * height)
+        middle_in_cells = np.arange(cells) + 0.5
+        middle = middle_in_cells / cells - 0.5
+        cell_x = middle * width
+        cell_y = middle * height
+        x, y = np.meshgrid(cell_x, cell_y)
         cell_count = cells * cells
         is_covered = np.zeros((cells, cells), dtype=np.bool_)
         for centre_x, centre_y in centres:

@@ -39,7 +39,7 @@ from .batch import (
     SimulationPace,
     file_parameters,
 )
-from .constants import split_module
+from .constants import solver_constants
 from .draws import QUANTUM, entropy, seed_text
 from .full_box_parameters import FullBoxParameters
 from .solver import Health, Singles
@@ -91,7 +91,9 @@ class SimulatedScenario:
 
 
 def _particle_mass(size: Size, state: InitialState) -> float:
-    return float(size.value("density")) * state.area / size.particles
+    density = float(size.value("density"))
+    mass = density * state.area  # of all particles
+    return mass / size.particles
 
 
 def scenario_writer(
@@ -105,7 +107,7 @@ def scenario_writer(
     first_frame = state.start_frame
     frames = range(first_frame, first_frame + frame_count)
     wall_velocity = None
-    if _has_driving_walls(split_module(size).solver_parameters(size)):
+    if _has_driving_walls(solver_constants(size)):
         # of each wall towards each recorded frame [length/s], shape [frame, wall, axis]
         wall_velocity = np.stack([state.walls_towards(frame) for frame in frames])
 
@@ -269,9 +271,13 @@ def _diagnose(
 def draw_perturbation(size: Size, scenario: int) -> Singles:
     """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
-    words = entropy(size.split, size.name, size.major, scenario, size.draw_seed)
-    seed = np.random.SeedSequence((*words, 1))
-    rng = np.random.Generator(np.random.PCG64(seed))
+    scenario_words = entropy(
+        size.split, size.name, size.major, scenario, size.draw_seed
+    )
+    words = (*scenario_words, 1)
+    seed = np.random.SeedSequence(words)
+    bits = np.random.PCG64(seed)
+    rng = np.random.Generator(bits)
     shape = (size.particles, size.box.dimension)
     draws = rng.random(shape)
     is_negative = draws < 0.5
@@ -297,7 +303,8 @@ def measure_predictability(
         frame_counts.append(frames_ahead)
     batch = ScenarioBatch(job, report, frames=frame_counts)
     # displacements of the batch [length], shape [scenario, particle, axis]
-    shape = (len(frame_counts), size.particles, size.box.dimension)
+    scenario_count = len(frame_counts)
+    shape = (scenario_count, size.particles, size.box.dimension)
     offsets = np.zeros(shape, dtype=np.float32)
     limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
@@ -309,7 +316,8 @@ def measure_predictability(
         for index, frame in batch.recordings():
             if frame == input_frames - 1:
                 offsets[:] = 0.0
-                offsets[index] = draw_perturbation(size, job.scenarios[index])
+                scenario = job.scenarios[index]
+                offsets[index] = draw_perturbation(size, scenario)
                 batch.displace(offsets)
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
@@ -326,5 +334,7 @@ def _root_mean_square_error(position: Singles, truth: Singles, box: Box) -> floa
     exact_truth = truth.astype(np.float64)
     exact_position = position.astype(np.float64)
     error = box.displacement(exact_truth, exact_position)
-    squares = (error * error).ravel().tolist()
-    return math.sqrt(math.fsum(squares) / error.size)
+    squares = error * error
+    square_sum = math.fsum(squares.ravel().tolist())
+    mean_square = square_sum / error.size
+    return math.sqrt(mean_square)

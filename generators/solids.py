@@ -47,7 +47,8 @@ class Ball:
     def measure(self) -> float:
         """Four thirds of pi times the radius cubed."""
         r = self.radius
-        return 4.0 / 3.0 * math.pi * r * r * r
+        unit_volume = 4.0 / 3.0 * math.pi
+        return unit_volume * r * r * r
 
     @property
     def reach(self) -> tuple[float, float, float]:

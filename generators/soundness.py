@@ -113,8 +113,9 @@ class SoundnessRecorder:
         frame_max = float(mach.max())
         self._mach_max = max(self._mach_max, frame_max)
         self._mach_counts += _count_bins(mach)
-        liquid_jacobian = ratio[self._is_liquid].astype(np.float64)
-        self._jacobian_counts += _count_bins(liquid_jacobian)
+        liquid_jacobian = ratio[self._is_liquid]
+        exact_jacobian = liquid_jacobian.astype(np.float64)
+        self._jacobian_counts += _count_bins(exact_jacobian)
 
     def summary(self, least: Singles, greatest: Singles) -> FreeSurfaceSoundness:
         """Return what the frames and substeps so far have shown.
@@ -149,16 +150,24 @@ class SoundnessRecorder:
         """Return how many particles reached a numerical bound at any substep."""
         p = self._parameters
         # Exponents xi (1 - Jp) are compared, because exp may overflow.
-        largest_exponent = p.snow_hardening * (1.0 - least.astype(np.float64))
-        smallest_exponent = p.snow_hardening * (1.0 - greatest.astype(np.float64))
-        is_hard = largest_exponent >= math.log(p.snow_hardening_max)
-        is_soft = smallest_exponent <= math.log(p.snow_hardening_min)
-        is_dense = least <= np.float32(p.snow_jp_min)
-        is_compressed = least <= np.float32(p.jacobian_min)
+        exact_least = least.astype(np.float64)
+        exact_greatest = greatest.astype(np.float64)
+        largest_exponent = p.snow_hardening * (1.0 - exact_least)
+        smallest_exponent = p.snow_hardening * (1.0 - exact_greatest)
+        hardest_exponent = math.log(p.snow_hardening_max)
+        softest_exponent = math.log(p.snow_hardening_min)
+        is_hard = largest_exponent >= hardest_exponent
+        is_soft = smallest_exponent <= softest_exponent
+        jp_min = np.float32(p.snow_jp_min)
+        is_dense = least <= jp_min
+        is_at_snow_bound = is_dense | is_hard | is_soft
+        is_clamped_snow = self._is_snow & is_at_snow_bound
 
+        jacobian_min = np.float32(p.jacobian_min)
+        is_compressed = least <= jacobian_min
         is_clamped_liquid = self._is_liquid & is_compressed
-        is_clamped_snow = self._is_snow & (is_dense | is_hard | is_soft)
-        return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
+        is_clamped = is_clamped_liquid | is_clamped_snow
+        return int(np.count_nonzero(is_clamped))
 
 
 def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -160,7 +160,8 @@ class InitialState:
     # there are six walls and three axes.
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
     # acceleration of layers of equal height along y [length/s^2], lowest first, a
-    # program of shape [frame, layer, axis] whose rows act as those of the walls
+    # program of shape [frame, layer, axis] whose rows act as those of the walls; in a
+    # full box whose parameters count its layers
     body_force: NDArray[np.float64] | None = None
     # a disc or ball that never moves, in a full box whose parameters count its
     # particles

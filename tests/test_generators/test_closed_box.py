@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.generators.draws import quantise
+from lagbench.generators.obstacle import Obstacle
 from lagbench.generators.split import ClosedBoxParameters, Device, InitialState
 
 # Each module of kernels takes seconds to compile.
@@ -375,6 +376,28 @@ def test_states_outside_the_bounds_are_refused() -> None:
         with pytest.raises(UsageError) as caught:
             loaded(constants, [moving])
         assert str(caught.value.where).startswith("scenario 0, wall_velocity")
+
+
+@pytest.mark.parametrize(
+    "driving",
+    [
+        {"body_force": np.ones((1, 1, 2))},
+        {"stream": np.ones(2)},
+        {
+            "obstacle": Obstacle(
+                centre=(0.5, 0.5), radius=0.1, position=np.zeros((0, 2))
+            )
+        },
+    ],
+    ids=["force", "stream", "obstacle"],
+)
+def test_what_the_solver_has_not_is_refused(driving: dict[str, Any]) -> None:
+    """The file would state a force that never acted."""
+    state = dataclasses.replace(scenario(NO_SLIP, seed=9), **driving)
+    with pytest.raises(UsageError) as caught:
+        loaded(NO_SLIP, [state])
+    (name,) = driving
+    assert caught.value.where == f"scenario 0, {name}"
 
 
 @pytest.mark.parametrize(

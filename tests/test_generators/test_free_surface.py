@@ -287,6 +287,11 @@ def test_states_that_do_not_fit_are_refused() -> None:
     for state in (nowhere, fast):
         with pytest.raises(WorkFailedError):
             solver.load([state])
+    body_force = np.ones((1, 1, 2))
+    forced = dataclasses.replace(good, body_force=body_force)
+    with pytest.raises(UsageError) as caught:
+        solver.load([forced])
+    assert caught.value.where == "scenario 0, body_force"
 
 
 def test_courant_numbers_by_hand() -> None:

@@ -5,19 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenario_draws import changed
 from typer.testing import Result
 
 from lagbench.data.registry import Registry, Size, load
+from lagbench.data.scenario import read_scenario
 from lagbench.errors import (
     LagbenchError,
     UnreadableFileError,
     UsageError,
     WorkFailedError,
 )
-from lagbench.generators.batch import draw_initial_state
+from lagbench.generators.batch import (
+    SimulationJob,
+    draw_initial_state,
+    start_frame,
+)
 from lagbench.generators.constants import solver_constants, split_module
+from lagbench.generators.simulate import simulate
 from lagbench.make.generate import GenerationResult
 
 Install = Callable[..., Path]
@@ -143,6 +150,81 @@ def test_a_module_that_fails_at_import_names_file_and_line(
 
 
 @pytest.mark.parametrize(
+    "change",
+    [
+        "{}",
+        "None",
+        'type("Own", (FreeSurfaceParameters,), {})(**vars(constants('
+        "FreeSurfaceParameters, size)))",
+    ],
+    ids=["a mapping", "None", "a subclass"],
+)
+def test_constants_of_no_solver_are_refused(change: str, package: Install) -> None:
+    """The type of the constants chooses the solver."""
+    size, _ = own_size(package, CONSTANTS, change)
+    with pytest.raises(UsageError) as caught:
+        solver_constants(size)
+    assert caught.value.where == "mine.solver_parameters"
+
+
+def test_a_module_that_ends_the_program_is_refused(package: Install) -> None:
+    """Else a command would end without a word and without data."""
+    size, module_file = own_size(package, "GAP = 0.01", "raise SystemExit(0)")
+    with pytest.raises(UsageError) as caught:
+        split_module(size)
+    assert line_of(module_file, "raise SystemExit(0)") in str(caught.value.got)
+
+
+@pytest.mark.parametrize(
+    ("old", "use"),
+    [(WIDTH, draw_initial_state), (CONSTANTS, lambda size, _: solver_constants(size))],
+    ids=["initial_state", "solver_parameters"],
+)
+def test_a_function_that_ends_the_program_is_refused(
+    old: str, use: Callable[[Size, int], object], package: Install
+) -> None:
+    change = "exit(0)"
+    size, module_file = own_size(package, old, change)
+    with pytest.raises(WorkFailedError) as caught:
+        use(size, 3)
+    assert caught.value.where == line_of(module_file, change)
+
+
+def test_a_start_before_the_first_substep_is_refused(package: Install) -> None:
+    """Its first frames would all show the same state."""
+    both = (
+        "def start_frame(size, scenario, rng):\n    return -5\n\n\ndef initial_state("
+    )
+    size, module_file = own_size(package, "def initial_state(", both)
+    text = module_file.read_text()
+    area = "area=width * height"
+    module_file.write_text(text.replace(area, f"{area}, start_frame=-5"))
+    for use in (start_frame, draw_initial_state):
+        with pytest.raises(UsageError) as caught:
+            use(size, 3)
+        assert str(caught.value.where).startswith("mine.start_frame")
+
+
+@pytest.mark.slow
+def test_a_scenario_of_one_frame_is_its_initial_state(
+    package: Install, tmp_path: Path
+) -> None:
+    """No substep is simulated, but the facts of the file are numbers."""
+    size, _ = own_size(package, SOURCE, SOURCE)
+    short = size.model_copy(update={"frames": {1: (0,), 62: (1, 2, 3, 4)}})
+    job = SimulationJob(size=short, scenarios=(0,), root=tmp_path)
+    simulate(job, lambda _: None)
+    with read_scenario(short.path(tmp_path, 0)) as file:
+        position = file.read("position", 0)
+        facts = file.header.facts
+    drawn_position = draw_initial_state(short, 0).position
+    np.testing.assert_array_equal(position, drawn_position.astype(np.float32))
+    assert facts["max_speed"] == 0.0
+    assert facts["jacobian_min"] == 1.0
+    assert facts["jacobian_max"] == 1.0
+
+
+@pytest.mark.parametrize(
     ("old", "new"),
     [
         ("area=width * height", "area=None"),
@@ -158,7 +240,14 @@ def test_a_module_that_fails_at_import_names_file_and_line(
         (HEIGHT, '"height": 10**5000'),
         ("area=width * height", "area=10**400"),
         ("area=width * height", "area=True"),
+        ("area=width * height", "area=1.0, friction=-0.1"),
+        ("area=width * height", "area=1.0, viscosity=-0.1"),
         (HEIGHT, "3: height"),
+        (HEIGHT, r'"height": "a\0b"'),
+        (HEIGHT, r'"height": "\udc80"'),
+        (HEIGHT, '"the height": height'),
+        (HEIGHT, '300 * "h": height'),
+        (HEIGHT, '"start_frame": 7'),
         ('parameters={"width": width, "height": height}', "parameters=[1.0]"),
     ],
 )
