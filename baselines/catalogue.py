@@ -137,7 +137,7 @@ def _load_entry(point: EntryPoint) -> CatalogueEntry:
         where=package_of(point),
         expected="a subclass of Baseline or Operator",
         got=", ".join(base.__name__ for base in loaded_class.__bases__),
-        fix="derive it from lagbench.baselines.baseline.Baseline: docs/extending.md",
+        fix="derive it from lagbench.baselines.baseline.Baseline: docs/baselines.md",
     )
 
 
@@ -156,7 +156,7 @@ def _check_complete(model: type[Baseline], point: EntryPoint) -> None:
             where=package_of(point),
             expected=", ".join(REQUIRED),
             got=", ".join(present) or "none",
-            fix="add them: docs/extending.md has the contract",
+            fix="add them: docs/baselines.md has the contract",
         )
 
 

@@ -290,7 +290,10 @@ AGAINST_CLASSICAL = Column(
     " takes its place. Empty where the entry states no cost.",
 )
 
-SOLVER_COSTS_MORE = "†"
+HAS_GAPS = "†"
+"""Behind a mean: some frames have no value."""
+
+SOLVER_COSTS_MORE = "‡"
 """Behind a ratio to a classical solver that costs more than the model."""
 
 SKILL_ON_SHIFT = Column(

@@ -400,7 +400,7 @@ def is_open(ratio: Value) -> bool:
 def format_comparison(row: BoardRow) -> str:
     """Return the ratio to a classical solver, as in "0.86× (0.8 to 0.9)".
 
-    The sign † says that the solver costs more.
+    The sign ‡ says that the solver costs more.
     """
     ratio = row.against_classical
     if ratio is None:

@@ -33,6 +33,7 @@ from lagbench.figures.html import (
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (
+    HAS_GAPS,
     SOLVER_COSTS_MORE,
     comparisons_of,
     cost_of,
@@ -147,7 +148,8 @@ OVERVIEW_WORDS = (
     "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
     "prediction. “0.9×” is the error beside that of the best classical solver that "
     "costs no more per frame than the model: below 1, learning pays. Where all cost "
-    "more, the cheapest one takes its place, and the sign † stands behind the number. "
+    f"more, the cheapest one takes its place, and the sign {SOLVER_COSTS_MORE} stands "
+    "behind the number. "
     "So two models of one data set may stand beside different solvers. The question is "
     "open where the "
     "95 % interval contains 1. The error is the metric that ranks on the data set: "
@@ -159,8 +161,9 @@ OVERVIEW_WORDS = (
 CELL_WORDS = (
     "A cell has the skill, the rank on this data set, and the error beside that of the "
     "best classical solver that costs no more per frame. Where all cost more, the "
-    "cheapest one takes its place, with the sign †. The last one is missing where the "
-    "cost is unknown. A question mark stands where its 95 % interval contains 1. A "
+    f"cheapest one takes its place, with the sign {SOLVER_COSTS_MORE}. The last one is "
+    "missing where the cost is unknown. A question mark stands where its 95 % interval "
+    "contains 1. A "
     "rank such as 2–4 names the places that a method takes when the test scenarios are "
     "drawn again (95 %). Ranks count entries only: classical solvers and baselines "
     "have none. Variants of a method are folded behind it, without a rank."
@@ -924,7 +927,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "Mean over test scenarios and seeds; below it the 95 % interval, of both "
         "resampled together. ↓ lower, ↑ higher, ◎ closer to the perfect value is "
         "better; bold is best, reference predictors included, and the bluer a cell, "
-        "the nearer to it. † some frames have no value. – not measured or undefined."
+        f"the nearer to it. {HAS_GAPS} some frames have no value. – not measured or "
+        "undefined."
     )
     yield escaped(
         "Budget, parameters and hardware are self-reported: submitters state them and "
@@ -934,6 +938,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "times. Those of the shaded rows are of another run. A speed-up below 1× means "
         "slower than the simulator."
     )
+    if any(row.solver_costs_more for row in tab.rows):
+        yield escaped(f"{SOLVER_COSTS_MORE} every classical solver costs more.")
     if any(row.failed_gates for row in tab.rows):
         yield _explain(*UNDER_TRAINED)
     if any(row.diverged for row in tab.rows):

@@ -153,8 +153,8 @@ def fold_button(method: str, count: int) -> Markup:
 
 def _draw_cell(cell: Cell) -> Markup:
     parts: list[object] = [cell.text]
-    if cell.has_gaps and cell.is_known:
-        parts.append(tag("sup", "†"))
+    if cell.sign:
+        parts.append(tag("sup", cell.sign))
     if cell.interval is not None:
         parts.append(interval(cell.interval))
     return tag(

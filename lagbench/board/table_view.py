@@ -14,7 +14,10 @@ from lagbench.figures.html import text
 from lagbench.metrics.metric import Direction, Metric
 
 from .columns import (
+    AGAINST_CLASSICAL,
+    HAS_GAPS,
     SKILL,
+    SOLVER_COSTS_MORE,
     Column,
     TableRow,
     columns_of,
@@ -91,7 +94,7 @@ class Cell:
     text: str
     note: str  # interval, spread and gaps in words
     interval: tuple[float, float] | None  # 95 %, where the column ranks
-    has_gaps: bool  # whether some frames have no value
+    sign: str  # behind the text: HAS_GAPS, SOLVER_COSTS_MORE or ""
     classes: tuple[str, ...]  # classes of its colours
 
     @property
@@ -258,9 +261,21 @@ def _make_cell(
         text=format_value(value, column.form),
         note=_note_on(row, column, metric),
         interval=interval,
-        has_gaps=metric is not None and metric.undefined > 0,
+        sign=_sign_of(row, column, metric),
         classes=classes,
     )
+
+
+def _sign_of(row: TableRow, column: Column, metric: Value | None) -> str:
+    """Return the sign behind a number, which the text below the table explains."""
+    if metric is None or math.isnan(metric.mean):
+        return ""
+    if metric.undefined:
+        return HAS_GAPS
+    is_comparison = column is AGAINST_CLASSICAL
+    if is_comparison and isinstance(row, BoardRow) and row.solver_costs_more:
+        return SOLVER_COSTS_MORE
+    return ""
 
 
 def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
@@ -269,6 +284,8 @@ def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
     if metric is None:
         return ""
     notes = []
+    if _sign_of(row, column, metric) == SOLVER_COSTS_MORE:
+        notes.append("the classical solver costs more")
     if not math.isnan(metric.low + metric.high):
         notes.append(f"95 %: {text(metric.low)} … {text(metric.high)}")
     if not math.isnan(metric.std):

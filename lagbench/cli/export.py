@@ -86,12 +86,13 @@ def export_command(
 def _describe(result: ExportResult) -> list[str]:
     lines = [f"{result.split} {result.size} as {result.format} in {result.folder}"]
     for subset, count in result.trajectories.items():
-        frame_count = result.frames[subset]
         trajectories = format_count(count, "trajectory")
-        lines.append(f"  {subset:<6}{trajectories}, {frame_count} frames")
+        frames = format_count(result.frames[subset], "frame")
+        lines.append(f"  {subset:<6}{trajectories}, {frames}")
     if result.left_out:
+        left_out = format_count(result.left_out, "frame")
         lines.append(
-            f"  {result.left_out} frames left out: "
+            f"  {left_out} left out: "
             "readers of this format need trajectories of equal lengths"
         )
     lines.append(f"  {format_bytes(result.bytes)}")

@@ -268,7 +268,9 @@ def _describe_budget(result: TrainingResult) -> str:
     windows = ""
     if result.windows_seen:
         windows = f"{result.windows_seen:,} windows, "
-    epochs = "1 epoch" if result.epochs == 1 else f"{result.epochs:.3g} epochs"
+    epochs = f"{_format_number(result.epochs)} epochs"
+    if result.epochs == 1:
+        epochs = "1 epoch"
     validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     return (
         f"{windows}{epochs}; "
@@ -276,6 +278,17 @@ def _describe_budget(result: TrainingResult) -> str:
         f"{result.device}, {format_count(result.threads, 'thread')}; "
         f"{_describe_track(result)}"
     )
+
+
+def _format_number(value: float) -> str:
+    """Return a number with three digits, and all digits before the point.
+
+    >>> _format_number(1.21124), _format_number(1234.4)
+    ('1.21', '1,234')
+    """
+    if value < 999.5:
+        return f"{value:.3g}"
+    return f"{value:,.0f}"
 
 
 def _describe_track(result: TrainingResult) -> str:

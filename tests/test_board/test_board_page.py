@@ -674,7 +674,7 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     sentences = conclude(tab)
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
-    assert "cavityno solver is as cheapModellearned1.5×† (1.2 to 1.9)" in shown
+    assert "cavityno solver is as cheapModellearned1.5×‡ (1.2 to 1.9)" in shown
     statement = "No classical solver is as cheap as the most accurate model on the only"
     assert statement in shown
     assert "Learning" not in shown
@@ -682,6 +682,16 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
     sentences = conclude(tab)
     assert re.search("Model equals .*twin.*greater .*finer and fine", sentences)
+
+
+def test_the_table_of_a_data_set_marks_dearer_solvers(board: Board) -> None:
+    """The sign stands behind the ratio, and the text below the table explains it."""
+    row = compared(board, "Model", error=1.0, ratio=GOOD)
+    for solver_costs_more in (True, False):
+        marked_row = replace(row, solver_costs_more=solver_costs_more)
+        page = read_html(with_rows(board, marked_row))
+        signs = [sign.text for sign in page.named("sup")]
+        assert ("‡" in signs) is solver_costs_more
 
 
 def test_the_table_of_a_terminal_marks_dearer_solvers(board: Board) -> None:
@@ -694,8 +704,8 @@ def test_the_table_of_a_terminal_marks_dearer_solvers(board: Board) -> None:
             (table,) = tables(replace(board, tabs=(tab,)), wide=wide)
             column = table.columns.index("÷class.")
             cells = {line[1]: line[column] for line in table.rows}
-            assert cells["model"].endswith("†") is solver_costs_more
-            assert ("†" in table.title) is solver_costs_more
+            assert cells["model"].endswith("‡") is solver_costs_more
+            assert ("‡" in table.title) is solver_costs_more
             for reference in tab.references:
                 assert cells[reference.name] == "-"
 
