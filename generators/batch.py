@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from lagbench.data.registry import Size
+from lagbench.data.writer import LONGEST_NAME, can_name_parameter
 from lagbench.errors import (
     LagbenchError,
     UsageError,
@@ -45,9 +46,6 @@ KEPT_PARTICLES = 1 << 17
 
 # of a whole number in an attribute of a file, its sign left out
 MOST_BITS = 63
-
-# of the name of a drawn parameter: netCDF takes 256 bytes, a character has at most 4
-LONGEST_NAME = 64
 
 # drawn parameters that files call by their CF-like long name
 _FILE_NAMES = {"reynolds": "reynolds_number"}
@@ -215,8 +213,8 @@ def _check_values(state: InitialState, where: str) -> None:
             raise UsageError(
                 "a parameter of an initial state has an impossible name",
                 where=where,
-                expected="an identifier of at most "
-                f"{LONGEST_NAME} characters, other than start_frame",
+                expected=f"an identifier of at most {LONGEST_NAME} bytes, composed "
+                "(NFC), which names no attribute of the file",
                 got=_describe_value(name),
                 fix="rename the parameter",
             )
@@ -239,9 +237,9 @@ def _can_be_name(name: object) -> bool:
 
     The file's own ``start_frame`` is that of the initial state.
     """
-    if not isinstance(name, str) or not name.isidentifier():
+    if not isinstance(name, str) or name == "start_frame":
         return False
-    return len(name) <= LONGEST_NAME and name != "start_frame"
+    return can_name_parameter(name)
 
 
 def _is_storable_text(value: object) -> bool:

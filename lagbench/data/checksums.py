@@ -145,7 +145,11 @@ class VariableHasher:
         self._sha.update(canonical_json(header) + b"\n")
 
     def update(self, values: ArrayLike) -> None:
-        """Add the next values."""
+        """Add the next values.
+
+        Raises:
+            DataError: they have another type, or are more than the shape holds.
+        """
         array = np.asarray(values)
         if dtype_name(array.dtype) != self.dtype:
             raise self._error("values have another type", self.dtype, array.dtype)

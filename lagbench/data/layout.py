@@ -87,11 +87,23 @@ def working_copy_of(url: str) -> Path:
 
 
 def cache_folder(part: str) -> Path:
-    """Return a folder of the user's cache, or the folder of ``LAGBENCH_CACHE``."""
+    """Return a folder of the user's cache, or the folder of ``LAGBENCH_CACHE``.
+
+    Args:
+        part: name of the folder in the user's cache. The folder of ``LAGBENCH_CACHE``
+            holds all parts together.
+
+    Raises:
+        UsageError: ``LAGBENCH_CACHE`` begins with the home folder of an unknown user,
+            or it is not set and the user has no home folder.
+    """
     folder = os.environ.get(CACHE_VARIABLE)
     if folder:
         return expand_path(folder, CACHE_VARIABLE)
-    return platformdirs.user_cache_path("lagbench", appauthor=False) / part
+    try:
+        return platformdirs.user_cache_path("lagbench", appauthor=False) / part
+    except RuntimeError as error:
+        raise no_home_error(CACHE_VARIABLE) from error
 
 
 MANIFEST_NAME = "manifest.json"
@@ -243,6 +255,21 @@ def expand_path(path: str | Path, where: str) -> Path:
             got=ascii(str(path)),
             fix="write the whole path",
         ) from error
+
+
+def no_home_error(where: str) -> UsageError:
+    """Return the error for a user without a home folder, as in some containers.
+
+    Args:
+        where: the option or variable that names another folder.
+    """
+    return UsageError(
+        "you have no home folder",
+        where=where,
+        expected="a folder, or a home folder in which lagbench has one",
+        got="neither HOME nor a home folder of your user",
+        fix=f"set HOME, or name a folder: {where}",
+    )
 
 
 def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:

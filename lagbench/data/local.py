@@ -38,6 +38,7 @@ from .layout import (
     as_url,
     dataset_folder,
     expand_path,
+    no_home_error,
     quote_root,
     url_of,
     working_copy_of,
@@ -80,12 +81,16 @@ def resolve_root(root: str | Path | None = None) -> Path:
             :mod:`.layout`.
 
     Raises:
-        UsageError: no file system can have a folder of that name.
+        UsageError: no file system can have a folder of that name, or none is named and
+            the user has no home folder.
         WorkFailedError: the working copy of a URL cannot be made.
     """
     named_root = _named_root(root)
     if named_root is None:
-        return platformdirs.user_data_path("lagbench", appauthor=False)
+        try:
+            return platformdirs.user_data_path("lagbench", appauthor=False)
+        except RuntimeError as error:
+            raise no_home_error(_ROOT_OPTION) from error
     url = as_url(named_root)
     if url is not None:
         return _make_working_copy(url)

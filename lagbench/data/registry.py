@@ -391,7 +391,11 @@ class Size(BaseModel):
         return tuple(sorted(scenarios))
 
     def subset_of(self, scenario: int) -> str:
-        """Return the subset that a scenario belongs to."""
+        """Return the subset that a scenario belongs to.
+
+        Raises:
+            UsageError: no subset has the scenario.
+        """
         texts = []
         for subset, ids in self.subsets.items():
             if scenario in ids:

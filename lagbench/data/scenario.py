@@ -439,7 +439,7 @@ def _read_header(
         split=_require_text(file, "split"),
         size=_require_text(file, "size"),
         version=version,
-        scenario=int(_require_attribute(file, "scenario")),
+        scenario=_require_integer(file, "scenario"),
         subset=_require_text(file, "subset"),
     )
     parameters = {}
@@ -464,6 +464,13 @@ def _require_attribute(file: h5py.File, name: str) -> Any:  # noqa: ANN401 (text
     if value is None:
         raise DataError(f"the attribute {name!r} is missing")
     return value
+
+
+def _require_integer(file: h5py.File, name: str) -> int:
+    value = np.asarray(_require_attribute(file, name))
+    if value.size != 1 or value.dtype.kind not in "iu":
+        raise DataError(f"the attribute {name!r} is no integer")
+    return int(value.item())
 
 
 def _require_text(file: h5py.File, name: str) -> str:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import errno
 import itertools
 import json
+import re
 import shutil
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
@@ -32,6 +34,7 @@ from lagbench.errors import (
 from . import MATERIALS
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
+from .field_errors import describe_value
 from .layout import ScenarioKey
 from .variables import MAX_VALUES_PER_FRAME, expected_attributes, open_netcdf
 
@@ -40,6 +43,9 @@ FORMAT = 1
 
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable [bytes]; frames are written once, in order."""
+
+MOST_LETTERS = 80
+"""Letters of a wrong name in a message."""
 
 PARTICLES_PER_CHUNK = 1 << 17
 """Most particles in a chunk: 1 MiB, the default chunk cache of HDF5.
@@ -68,6 +74,29 @@ _RESERVED = {
     "periodic",
 }
 """Attributes of the file that no parameter may be named like."""
+
+_KEPT_BY_NETCDF = {
+    "CLASS",
+    "DIMENSION_LIST",
+    "NAME",
+    "REFERENCE_LIST",
+    "_ARRAY_DIMENSIONS",
+    "_Codecs",
+    "_Format",
+    "_IsNetcdf4",
+    "_NCProperties",
+    "_Netcdf4Coordinates",
+    "_Netcdf4Dimid",
+    "_SuperblockVersion",
+    "_nc3_strict",
+}
+"""Attributes that netCDF and HDF5 keep for themselves."""
+
+LONGEST_NAME = 256
+"""Longest name of an attribute in netCDF [bytes]."""
+
+_SURROGATES = re.compile("[\ud800-\udfff]")
+"""Halves of characters, which no UTF-8 has."""
 
 
 class ScenarioWriter:
@@ -385,22 +414,52 @@ def _check_parameters(
     """Return parameters as plain values; refuse reserved names and other values."""
     plain_values: dict[str, object] = {}
     for name, value in parameters.items():
-        if name in _RESERVED or not name.isidentifier():
+        if not can_name_parameter(name):
+            reserved = ", ".join(sorted(_RESERVED | _KEPT_BY_NETCDF))
             raise DataError(
-                f"a parameter cannot be named {name!r}",
+                f"a parameter cannot be named {name[:MOST_LETTERS]!a}",
                 where=str(path),
-                expected=f"an identifier other than {', '.join(sorted(_RESERVED))}",
+                expected=f"an identifier of at most {LONGEST_NAME} bytes, composed "
+                f"(NFC), other than {reserved}",
+                got=f"{len(name)} characters",
+                fix="rename the parameter",
             )
-        plain_value = to_plain(value)
-        if plain_value == "" or not isinstance(plain_value, (int, float, str)):
+        plain_value: object = None
+        with suppress(DataError, UnicodeDecodeError):
+            plain_value = to_plain(value)
+        if not _is_storable(plain_value):
             raise DataError(
                 f"the parameter {name!r} cannot be stored",
                 where=str(path),
-                expected="a finite number or a string that is not empty",
-                got=repr(value),
+                expected="a finite number, a whole one of 64 bits at most, or a text "
+                "that is not empty and has no NUL and no half of a character",
+                got=describe_value(value),
+                fix="give such a value, or leave the parameter out",
             )
         plain_values[name] = plain_value
     return plain_values
+
+
+def can_name_parameter(name: str) -> bool:
+    """Tell whether a drawn parameter can have this name in a scenario file.
+
+    Names of the file's own attributes are taken. netCDF keeps some names for itself. It
+    composes characters (NFC), so another form would not come back.
+    """
+    if name in _RESERVED or name in _KEPT_BY_NETCDF:
+        return False
+    if not name.isidentifier() or not unicodedata.is_normalized("NFC", name):
+        return False
+    return len(name.encode("utf-8")) <= LONGEST_NAME
+
+
+def _is_storable(plain_value: object) -> bool:
+    """Tell whether a plain value can be an attribute."""
+    if isinstance(plain_value, int):
+        return -(2**63) <= plain_value < 2**64
+    if isinstance(plain_value, str):
+        return plain_value != "" and _SURROGATES.search(plain_value) is None
+    return isinstance(plain_value, float)
 
 
 @contextmanager

@@ -38,6 +38,9 @@ LEVEL = 0.95
 RESAMPLES = 10_000
 """Resamples of scenarios and of seeds."""
 
+DRAWN_TOGETHER = 1 << 18
+"""Elements of resamples that are drawn at once."""
+
 FEWEST_FOR_INTERVAL = 4
 """Fewest scenarios with an interval: Student's quantile of three doubles its width."""
 
@@ -196,14 +199,21 @@ def _resampled_shares(count: int, stream: int) -> Floats:
     """
     # Generator.random is the one distribution whose stream NumPy keeps across versions
     generator = np.random.Generator(np.random.PCG64(stream))
-    uniform = generator.random((RESAMPLES, count))
-    element = np.floor(uniform * count).astype(np.intp)
+    shares = np.empty((RESAMPLES, count))
+    # In blocks they are the draws of one call. Of many scenarios one call would take
+    # several times the memory of the result.
+    block_length = max(1, DRAWN_TOGETHER // count)
+    for start in range(0, RESAMPLES, block_length):
+        block = shares[start : start + block_length]
+        uniform = generator.random(block.shape)
+        element = np.floor(uniform * count).astype(np.intp)
 
-    # one flat bin per (resample, element)
-    first_bin = count * np.arange(RESAMPLES)[:, None]
-    bins = (element + first_bin).ravel()
-    counts = np.bincount(bins, minlength=RESAMPLES * count)
-    return counts.reshape(RESAMPLES, count) / count
+        # one flat bin per (resample, element)
+        first_bin = count * np.arange(len(block))[:, None]
+        bins = (element + first_bin).ravel()
+        counts = np.bincount(bins, minlength=block.size)
+        block[:] = counts.reshape(block.shape) / count
+    return shares
 
 
 @dataclass(frozen=True, eq=False)

@@ -153,7 +153,11 @@ follow each analog.
 
 
 def divide_evenly(distances: Floats, particle_count: int) -> list[NDArray[np.intp]]:
-    """Return the followers of each analog: all have as many."""
+    """Return the followers of each analog, which the particles take in turn.
+
+    So the numbers of followers differ by one at most. With fewer particles than analogs
+    the last analogs have none.
+    """
     analog_count = len(distances)
     followers = []
     for number in range(analog_count):

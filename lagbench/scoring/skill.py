@@ -280,16 +280,26 @@ def _compute_ratio(seeds: Sequence[Score], reference: Score) -> ScoreRatio | Non
 
     scale = float(np.mean(base))
     ratio = float(np.mean(mean_over_seeds(method))) / scale
-    if ratio > 0.0:
-        relative = method / ratio - base
-    else:
-        relative = method  # zeros, and certain
+    relative = _relative_to(base, method, ratio)
     low, high = bootstrap_interval(relative / scale)
     return ScoreRatio(
         value=ratio,
         interval=(ratio * math.exp(low), ratio * math.exp(high)),
         std=_std_over_seeds(method, scale),
     )
+
+
+def _relative_to(base: Floats, method: Floats, ratio: float) -> Floats:
+    """Return ``method / ratio - base``; of a perfect method zeros, which are certain.
+
+    Args:
+        base: scores of the reference, shape [scenario].
+        method: scores of the method, shape [..., scenario].
+        ratio: ratio of their means [1].
+    """
+    if ratio > 0.0:
+        return method / ratio - base
+    return method
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,7 +350,7 @@ def skill_gap(
         has_both = has_base & has_method
         base = base[has_both]
         method = method[has_both]
-        if not base.any() or not method.any():
+        if not base.any():
             raise ChecksFailedError(
                 "there is no scenario that both have",
                 where=seeds[0].metric.name,
@@ -350,8 +360,7 @@ def skill_gap(
             )
         base_mean = float(np.mean(base))
         ratio = float(np.mean(method)) / base_mean
-        relative = (method / ratio - base) / base_mean
-        resampling = resample(relative)
+        resampling = resample(_relative_to(base, method, ratio) / base_mean)
         if len(base) < FEWEST_FOR_INTERVAL or resampling is None:
             degrees.append(math.nan)
             deviations.append(np.zeros(1))

@@ -498,7 +498,8 @@ def _require_scheme(url: str) -> str:
         return scheme
     fix = STORE_HINT
     if not mark and os.path.isdir(url):
-        fix = f"a folder has an address, too: {Path(url).resolve().as_uri()}"
+        # Local file systems of fsspec decode no %20.
+        fix = f"a folder has an address, too: file://{Path(url).resolve()}"
     raise UsageError(
         "no such kind of address",
         where=_short_address(url),

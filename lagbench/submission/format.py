@@ -260,7 +260,11 @@ def is_integer_valid(name: str, value: int) -> bool:
 
 
 def require_valid_attribute(name: str, value: object) -> None:
-    """Refuse a value that an attribute may not have, before it is written."""
+    """Refuse a value that an attribute may not have, before it is written.
+
+    Raises:
+        UsageError: it is such a value.
+    """
     if not is_attribute_valid(name, value):
         raise UsageError(
             f"the label {name!r} does not fit",

@@ -245,6 +245,15 @@ def test_changed_attributes_are_found(
     assert_refused(path, "attributes differ", "attributes")
 
 
+@pytest.mark.parametrize("number", [3.7, "3", np.nan, [3, 3]])
+def test_an_id_that_is_no_integer_is_refused(written: Written, number: object) -> None:
+    """Other readers would read another id than ours."""
+    path, _ = written
+    with netCDF4.Dataset(path, "r+") as file:
+        file.setncattr("scenario", number)
+    assert_refused(path)
+
+
 @pytest.mark.parametrize(
     ("variable", "name", "value"),
     [
@@ -685,12 +694,62 @@ def test_parameters_that_would_hide_an_attribute_are_refused(
 
 
 @pytest.mark.parametrize(
+    "name",
+    [
+        "CLASS",
+        "NAME",
+        "DIMENSION_LIST",
+        "REFERENCE_LIST",
+        "_ARRAY_DIMENSIONS",
+        "_Codecs",
+        "_Format",
+        "_IsNetcdf4",
+        "_NCProperties",
+        "_Netcdf4Coordinates",
+        "_Netcdf4Dimid",
+        "_SuperblockVersion",
+        "_nc3_strict",
+        "a" * 257,
+        "\u00e9" * 129,
+        "n\u0303",
+    ],
+)
+def test_names_that_netcdf_keeps_or_changes_are_refused(
+    tmp_path: Path, name: str
+) -> None:
+    """The last one is an n and a tilde. NetCDF would store one character for both."""
+    with pytest.raises(DataError) as caught:
+        write_scenario(tmp_path, KEY, parameters={name: 1})
+    assert str(caught.value.where).endswith("0003.nc")
+    with open_writer(tmp_path / "last.nc") as file:
+        file.append(FRAME, FRAME)
+        file.append(FRAME, FRAME)
+        with pytest.raises(DataError):
+            file.state(**{name: 1})
+
+
+@pytest.mark.parametrize("name", ["a" * 256, "\u00e9" * 128, "_depth"])
+def test_a_long_name_of_a_parameter_survives_the_file(
+    tmp_path: Path, name: str
+) -> None:
+    path, content = write_scenario(tmp_path, KEY, parameters={name: 1})
+    with read_scenario(path) as file:
+        assert file.header.parameters[name] == 1
+    assert check_scenario(path) == content
+    assert independent_hash.content_hash(path) == content
+
+
+@pytest.mark.parametrize(
     "value",
     [
         "",
         [1],
         {"a": 1},
         np.array([1, 2]),
+        2**64,
+        -(2**63) - 1,
+        pytest.param(10**5000, id="an integer that Python does not print"),
+        pytest.param("\ud800", id="half of a character"),
     ],
 )
 def test_parameters_that_netcdf_would_change_are_refused(

@@ -75,6 +75,27 @@ def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None
     assert "--root" in str(caught.value.where)
 
 
+def test_a_user_without_a_home_folder_names_the_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such is a user of a container who is in no list of users."""
+
+    def refuse(number: int) -> None:
+        raise KeyError(number)
+
+    monkeypatch.setattr("pwd.getpwuid", refuse)
+    for name in ("HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "LAGBENCH_ROOT"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("LAGBENCH_CACHE", raising=False)
+    with pytest.raises(UsageError) as caught:
+        resolve_root()
+    assert "LAGBENCH_ROOT" in str(caught.value.where)
+    with pytest.raises(UsageError) as caught:
+        resolve_root("s3://bucket/data")
+    assert caught.value.where == "LAGBENCH_CACHE"
+    assert resolve_root(tmp_path) == tmp_path
+
+
 def test_an_empty_option_is_not_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -248,6 +248,9 @@ def test_a_scenario_of_one_frame_is_its_initial_state(
         (HEIGHT, '"the height": height'),
         (HEIGHT, '300 * "h": height'),
         (HEIGHT, '"start_frame": 7'),
+        (HEIGHT, '"seed": 7'),
+        (HEIGHT, '"CLASS": 7'),
+        (HEIGHT, r'"n\u0303": 7'),
         ('parameters={"width": width, "height": height}', "parameters=[1.0]"),
     ],
 )

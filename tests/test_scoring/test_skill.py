@@ -590,6 +590,20 @@ def test_a_gap_of_skills_is_the_difference_of_their_ratios() -> None:
     assert gap.interval == pytest.approx((-0.3, -0.3))
 
 
+def test_a_gap_to_a_perfect_prediction_is_that_of_the_other_skill() -> None:
+    """Errors of 0 are values: a perfect prediction has the skill 1."""
+    base = [1.0, 2.0, 3.0, 4.0]
+    half = scored([0.5, 1.0, 1.5, 2.0])
+    perfect = scored([0.0] * 4, first=1000)
+    gap = skill_gap([half], scored(base), [perfect], scored(base, first=1000))
+    assert (gap.first, gap.second) == pytest.approx((0.5, 1.0))
+    assert gap.interval == pytest.approx((-0.5, -0.5))
+    gap = skill_gap(
+        [perfect], scored(base, first=1000), [perfect], scored(base, first=1000)
+    )
+    assert (gap.value, gap.interval) == (0.0, (0.0, 0.0))
+
+
 def test_the_interval_of_a_gap_holds_the_truth() -> None:
     """Of draws whose expected ratios are known, 95 % of the intervals hold the gap."""
     draw = np.random.default_rng(5)

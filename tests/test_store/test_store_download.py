@@ -467,14 +467,20 @@ def test_an_invalid_address_is_refused_even_where_no_file_is_missing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["store", "my store", "100%", "a#b", "caf\u00e9"])
 def test_the_message_shows_the_address_of_a_folder(
-    here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The address is that of a store: its objects are those of the folder."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "store").mkdir()
+    data = tmp_path / name / "data"
+    data.mkdir(parents=True)
+    (data / "manifest.json").write_bytes(b"{}")
     with pytest.raises(UsageError) as caught:
-        download("own", root=here, mirror="store")
-    assert (tmp_path / "store").as_uri() in str(caught.value)
+        download("own", root=here, mirror=name)
+    address = f"file://{tmp_path / name}"
+    assert address in str(caught.value.fix)
+    assert objects.Objects(address, "data").sizes() == {"manifest.json": 2}
 
 
 def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
