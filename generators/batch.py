@@ -20,8 +20,14 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from lagbench.data.field_errors import describe_value
 from lagbench.data.registry import Size
-from lagbench.data.writer import LONGEST_NAME, can_name_parameter
+from lagbench.data.writer import (
+    POSSIBLE_NAME,
+    STORABLE_VALUE,
+    as_attribute,
+    find_name_fault,
+)
 from lagbench.errors import (
     LagbenchError,
     UsageError,
@@ -43,9 +49,6 @@ STRIDE = 4_000_000
 # particles of the initial states that a process keeps, 65 bytes each: a perturbed run
 # starts from the state of a scenario that was simulated some tasks before
 KEPT_PARTICLES = 1 << 17
-
-# of a whole number in an attribute of a file, its sign left out
-MOST_BITS = 63
 
 # drawn parameters that files call by their CF-like long name
 _FILE_NAMES = {"reynolds": "reynolds_number"}
@@ -187,15 +190,16 @@ def _check_values(state: InitialState, where: str) -> None:
 
     The solver checks the arrays.
     """
-    for name in ("area", "viscosity", "friction"):
+    # The solver bounds the area.
+    for name, least in (("area", -math.inf), ("viscosity", 0.0), ("friction", 0.0)):
         value = getattr(state, name)
-        if not _is_finite_number(value) or value < 0.0:
+        if not _is_finite_number(value) or value < least:
             raise UsageError(
                 f"the {name} of an initial state is impossible",
                 where=where,
                 expected="a finite number, 0 or more",
-                got=_describe_value(value),
-                fix=f"give InitialState a number as {name}: docs/extending.md",
+                got=describe_value(value),
+                fix=f"give InitialState such a number as {name}: docs/extending.md",
             )
 
     parameters: object = state.parameters
@@ -209,48 +213,36 @@ def _check_values(state: InitialState, where: str) -> None:
             fix=fix,
         )
     for name, value in parameters.items():
-        if not _can_be_name(name):
+        fault = _find_name_fault(name)
+        if fault is not None:
             raise UsageError(
-                "a parameter of an initial state has an impossible name",
+                f"a parameter of an initial state is named {describe_value(name)}",
                 where=where,
-                expected=f"an identifier of at most {LONGEST_NAME} bytes, composed "
-                "(NFC), which names no attribute of the file",
-                got=_describe_value(name),
+                expected=POSSIBLE_NAME,
+                got=fault,
                 fix="rename the parameter",
             )
-        is_storable = _is_storable_text(value) or _is_finite_number(value)
-        if isinstance(value, int) and value.bit_length() > MOST_BITS:
-            is_storable = False
-        if not is_storable:
+        is_truth = isinstance(value, bool | np.bool_)
+        if is_truth or as_attribute(value) is None:
             raise UsageError(
                 "a parameter of an initial state cannot be stored",
                 where=f"{where}, parameter {name!r}",
-                expected="a finite number (a whole one of 63 bits at most), or a text "
-                "that is not empty and has no NUL and no lone surrogate",
-                got=_describe_value(value),
+                expected=STORABLE_VALUE,
+                got=describe_value(value),
                 fix=fix,
             )
 
 
-def _can_be_name(name: object) -> bool:
-    """Return whether a drawn parameter can have this name in a file.
+def _find_name_fault(name: object) -> str | None:
+    """Return why no drawn parameter can have a name; None if one can.
 
     The file's own ``start_frame`` is that of the initial state.
     """
-    if not isinstance(name, str) or name == "start_frame":
-        return False
-    return can_name_parameter(name)
-
-
-def _is_storable_text(value: object) -> bool:
-    """Return whether a value is a text that a file can hold."""
-    if not isinstance(value, str) or value == "" or "\0" in value:
-        return False
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    if not isinstance(name, str):
+        return "no text"
+    if name == "start_frame":
+        return "the name of an attribute that each file has"
+    return find_name_fault(name)
 
 
 def _is_finite_number(value: object) -> bool:
@@ -261,13 +253,6 @@ def _is_finite_number(value: object) -> bool:
         return math.isfinite(value)
     except OverflowError:
         return False
-
-
-def _describe_value(value: object) -> str:
-    """Return a value for a message; Python prints no thousands of digits."""
-    if isinstance(value, int) and value.bit_length() > MOST_BITS:
-        return f"a whole number of {value.bit_length()} bits"
-    return repr(value)[:80]
 
 
 def _relocate(error: LagbenchError, where: str) -> LagbenchError:

@@ -111,7 +111,10 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         return values.reshape(self.scenarios, width, width, 2)
 
     def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
+        """Return what each scenario went through during the last advance.
+
+        Before the first one these are the extremes of the loaded state.
+        """
         # largest abs(v_x), abs(v_y), J and -J of any particle, shape [scenario, 4]
         particle_extremes = self._read(self._kernels.extremes)
         extremes = particle_extremes.max(axis=1)

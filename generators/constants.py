@@ -27,9 +27,9 @@ from lagbench.errors import (
 from .draws import RandomSource, uniform
 from .full_box_parameters import FullBoxParameters
 from .shapes import Region
+from .solver import IMPLEMENTATIONS
 from .split import (
     ClosedBoxParameters,
-    FreeSurface3DParameters,
     FreeSurfaceParameters,
     SolverParameters,
     SplitGenerator,
@@ -101,14 +101,6 @@ LIMITS = {
 finite numbers.
 """
 
-
-SOLVER_PARAMETERS = (
-    ClosedBoxParameters,
-    FreeSurfaceParameters,
-    FreeSurface3DParameters,
-    FullBoxParameters,
-)
-"""Types of constants; each has a solver of its own."""
 
 PARAMETER_ERRORS = (TypeError, ValueError, ArithmeticError, LookupError)
 """What a split of ours raises over parameters that it cannot use."""
@@ -335,8 +327,8 @@ def solver_constants(size: Size) -> SolverParameters:
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):
         parameters = module.solver_parameters(size)
-    if type(parameters) not in SOLVER_PARAMETERS:
-        type_names = [known_type.__name__ for known_type in SOLVER_PARAMETERS]
+    if type(parameters) not in IMPLEMENTATIONS:
+        type_names = [known_type.__name__ for known_type in IMPLEMENTATIONS]
         raise UsageError(
             "a split returned no constants of a solver",
             where=f"{size.generator}.solver_parameters",

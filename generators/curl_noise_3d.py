@@ -86,9 +86,9 @@ def ring_potential(
     square = x_square + y_square + z_square
     radius_square = radius * radius
     minus_q = square.scale(-1.0 / radius_square)
-    remainder = minus_q.shift(1.0)  # 1 - q
-    is_inside = remainder.value > 0.0
-    inside = remainder.only_where(is_inside)
+    one_minus_q = minus_q.shift(1.0)
+    is_inside = one_minus_q.value > 0.0
+    inside = one_minus_q.only_where(is_inside)
     square_inside = inside * inside
     strength = square_inside * square_inside
     # the cross product of the normal and the way from the centre
@@ -103,22 +103,16 @@ def ring_potential(
 
 
 def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
-    """Draw the rings of a scenario; their potentials add up."""
-    point_count = len(position)
-    total_x = constant(0.0, point_count, 3)
-    total_y = constant(0.0, point_count, 3)
-    total_z = constant(0.0, point_count, 3)
+    """Draw the rings of a scenario."""
+    potential = [constant(0.0, len(position), 3) for _ in range(3)]
     for _ in range(size.value("ring_count")):
         centre = rng.random((3,))
         normal = draw_direction(rng, 3)
         radius = draw_between(rng, size, "ring_radius")
-        ring_x, ring_y, ring_z = ring_potential(
-            position, centre=centre, normal=normal, radius=radius
-        )
-        total_x = total_x + ring_x
-        total_y = total_y + ring_y
-        total_z = total_z + ring_z
-    return curl([total_x, total_y, total_z])
+        ring = ring_potential(position, centre=centre, normal=normal, radius=radius)
+        for axis in range(3):
+            potential[axis] = potential[axis] + ring[axis]
+    return curl(potential)
 
 
 def draw_noise(rng: RandomSource, position: Array, frequency: int) -> Flow:

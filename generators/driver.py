@@ -111,7 +111,10 @@ class Driver(ABC, Generic[Parameters]):
 
     @abstractmethod
     def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
+        """Return what each scenario went through during the last advance.
+
+        Before the first one these are the extremes of the loaded state.
+        """
 
     @abstractmethod
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:

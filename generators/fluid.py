@@ -129,12 +129,8 @@ def _start_region(size: Size, start: str) -> Region:
     margin = size.value("margin")
     least = low + margin
     most = high - margin
-    inner_left = max(left, least)
-    inner_right = min(right, most)
-    inner_bottom = max(bottom, least)
-    inner_top = min(top, most)
-    horizontal = (inner_left, inner_right)
-    vertical = (inner_bottom, inner_top)
+    horizontal = (max(left, least), min(right, most))
+    vertical = (max(bottom, least), min(top, most))
     return horizontal, vertical
 
 

@@ -101,7 +101,10 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         kernels.friction.from_numpy(friction)
 
     def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
+        """Return what each scenario went through during the last advance.
+
+        Before the first one these are the extremes of the loaded state.
+        """
         extremes = self._read(self._kernels.extremes)
         # largest abs(v) + abs(A o) of each scenario
         self._reach = extremes[:, :, 3].max(axis=1)

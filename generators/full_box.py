@@ -131,7 +131,10 @@ class FullBox(Driver[FullBoxParameters]):
         return np.asarray(interior[..., : self.dimension])
 
     def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
+        """Return what each scenario went through during the last advance.
+
+        Before the first one these are the extremes of the loaded state.
+        """
         # largest velocity of any particle by component, and J, shape [scenario, 4]
         particle_extremes = self._read(self._kernels.extremes)
         extremes = particle_extremes.max(axis=1)

@@ -90,19 +90,15 @@ def _render_size(values: Measured) -> list[str]:
 
     lines.append("      statistics:")
     for name, row in values.statistics.items():
-        texts = map(_format_number, row)
-        numbers = ", ".join(texts)
+        numbers = ", ".join(map(_format_number, row))
         lines.append(f"        {name}: [{numbers}]")
 
     limits = [_format_number(value) for value in values.twin_floor]
     rows = []
     for start in range(0, len(limits), _PER_LINE):
-        end = start + _PER_LINE
-        text_row = ", ".join(limits[start:end])
-        rows.append(text_row)
-    text_rows = ",\n         ".join(rows)
+        rows.append(", ".join(limits[start : start + _PER_LINE]))
     lines.append("      twin_floor:")
-    lines.append(f"        [{text_rows}]")
+    lines.append("        [" + ",\n         ".join(rows) + "]")
     return lines
 
 

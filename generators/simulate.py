@@ -276,8 +276,7 @@ def draw_perturbation(size: Size, scenario: int) -> Singles:
     )
     words = (*scenario_words, 1)
     seed = np.random.SeedSequence(words)
-    bits = np.random.PCG64(seed)
-    rng = np.random.Generator(bits)
+    rng = np.random.Generator(np.random.PCG64(seed))
     shape = (size.particles, size.box.dimension)
     draws = rng.random(shape)
     is_negative = draws < 0.5

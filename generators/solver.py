@@ -28,7 +28,10 @@ Singles = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """What one scenario went through during the last advance."""
+    """What one scenario went through during the last advance.
+
+    Before the first one these are the extremes of the loaded state.
+    """
 
     finite: bool  # whether every position, velocity and J is a finite number
     # largest absolute velocity component of any particle or node at any substep
@@ -68,15 +71,19 @@ class Solver(Protocol):
         """
 
     def health(self) -> list[Health]:
-        """Return what each scenario went through during the last advance."""
+        """Return what each scenario went through during the last advance.
+
+        Before the first one these are the extremes of the loaded state.
+        """
 
 
-_IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
+IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
     ClosedBoxParameters: (".closed_box", "ClosedBox"),
     FreeSurfaceParameters: (".free_surface", "FreeSurface"),
     FreeSurface3DParameters: (".free_surface_3d", "FreeSurface3D"),
     FullBoxParameters: (".full_box", "FullBox"),
 }
+"""Module and class of the solver of each type of constants."""
 
 
 def build(
@@ -97,7 +104,7 @@ def build(
     Raises:
         UsageError: a device or count that cannot be.
     """
-    module_name, class_name = _IMPLEMENTATIONS[type(parameters)]
+    module_name, class_name = IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
     # before Taichi itself, which it keeps quiet
     importlib.import_module(".backend", package)

@@ -154,10 +154,10 @@ class SoundnessRecorder:
         exact_greatest = greatest.astype(np.float64)
         largest_exponent = p.snow_hardening * (1.0 - exact_least)
         smallest_exponent = p.snow_hardening * (1.0 - exact_greatest)
-        hardest_exponent = math.log(p.snow_hardening_max)
-        softest_exponent = math.log(p.snow_hardening_min)
-        is_hard = largest_exponent >= hardest_exponent
-        is_soft = smallest_exponent <= softest_exponent
+        exponent_max = math.log(p.snow_hardening_max)
+        exponent_min = math.log(p.snow_hardening_min)
+        is_hard = largest_exponent >= exponent_max
+        is_soft = smallest_exponent <= exponent_min
         jp_min = np.float32(p.snow_jp_min)
         is_dense = least <= jp_min
         is_at_snow_bound = is_dense | is_hard | is_soft

@@ -569,6 +569,13 @@ def loss_of(row: TableRow, column: Column) -> float:
     return column.loss(value)
 
 
+def is_beside_dearer_solver(row: TableRow) -> bool:
+    """Tell whether a row is compared with a solver that costs more than the model."""
+    if isinstance(row, ReferenceRow) or row.against_classical is None:
+        return False
+    return row.solver_costs_more
+
+
 def metric_value(row: TableRow, key: str) -> Value | None:
     """Return a metric, a skill or a ratio, with interval; None where a row has none."""
     if row.on_shift is not None:

@@ -39,6 +39,7 @@ from .columns import (
     cost_of,
     format_ranks,
     format_value,
+    is_beside_dearer_solver,
     leader_of,
     level_of,
     source_of_cost,
@@ -938,8 +939,10 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "times. Those of the shaded rows are of another run. A speed-up below 1× means "
         "slower than the simulator."
     )
-    if any(row.solver_costs_more for row in tab.rows):
-        yield escaped(f"{SOLVER_COSTS_MORE} every classical solver costs more.")
+    if any(is_beside_dearer_solver(row) for row in tab.rows):
+        yield escaped(
+            f"{SOLVER_COSTS_MORE} every classical solver costs more than the model."
+        )
     if any(row.failed_gates for row in tab.rows):
         yield _explain(*UNDER_TRAINED)
     if any(row.diverged for row in tab.rows):

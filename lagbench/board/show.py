@@ -24,6 +24,7 @@ from .columns import (
     cost_of,
     describe_check,
     format_ranks,
+    is_beside_dearer_solver,
     level_of,
     metric_value,
     source_of_cost,
@@ -117,8 +118,10 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
             remarks = _shorten_remarks(table_row, room)
         table_rows.append((*line, remarks))
     legend = list(_legend_of(tab, table_rows, wide=wide))
-    if any(_is_beside_dearer_solver(row) for row in rows):
-        legend.append(f"{SOLVER_COSTS_MORE}: all classical solvers cost more")
+    if any(is_beside_dearer_solver(row) for row in rows):
+        legend.append(
+            f"{SOLVER_COSTS_MORE}: all classical solvers cost more than the model"
+        )
     if has_shift and SHIFT not in names:
         legend.append(f"{HEADINGS[SHIFT]}: only with --wide")
     return Table(
@@ -294,7 +297,7 @@ def _format_row(
         value = metric_value(row, name)
         is_skill = name in (SKILL.key, SHIFT)
         cell = _format_value(value, wide=wide, is_skill=is_skill)
-        if name == AGAINST_CLASSICAL.key and _is_beside_dearer_solver(row):
+        if name == AGAINST_CLASSICAL.key and is_beside_dearer_solver(row):
             cell += SOLVER_COSTS_MORE
         values.append(cell)
     seconds = _format_seconds(row)
@@ -302,13 +305,6 @@ def _format_row(
         return (NOTHING, row.name, *values, seconds)
     name = row.id if wide else _format_name(tab, row)
     return (_format_rank(row), name, *values, seconds)
-
-
-def _is_beside_dearer_solver(row: TableRow) -> bool:
-    """Tell whether a row is compared with a solver that costs more than the model."""
-    if isinstance(row, ReferenceRow) or row.against_classical is None:
-        return False
-    return row.solver_costs_more
 
 
 def _format_name(tab: Tab, row: BoardRow) -> str:

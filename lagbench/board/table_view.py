@@ -22,6 +22,7 @@ from .columns import (
     TableRow,
     columns_of,
     format_value,
+    is_beside_dearer_solver,
     loss_of,
     metric_value,
     presets_of,
@@ -272,8 +273,7 @@ def _sign_of(row: TableRow, column: Column, metric: Value | None) -> str:
         return ""
     if metric.undefined:
         return HAS_GAPS
-    is_comparison = column is AGAINST_CLASSICAL
-    if is_comparison and isinstance(row, BoardRow) and row.solver_costs_more:
+    if column is AGAINST_CLASSICAL and is_beside_dearer_solver(row):
         return SOLVER_COSTS_MORE
     return ""
 
@@ -285,7 +285,7 @@ def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
         return ""
     notes = []
     if _sign_of(row, column, metric) == SOLVER_COSTS_MORE:
-        notes.append("the classical solver costs more")
+        notes.append("the classical solver costs more than the model")
     if not math.isnan(metric.low + metric.high):
         notes.append(f"95 %: {text(metric.low)} … {text(metric.high)}")
     if not math.isnan(metric.std):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lagbench.errors import format_count
 
 if TYPE_CHECKING:
@@ -149,6 +151,8 @@ def describe_input(detail: ErrorDetails) -> str:
 
 def describe_value(value: object) -> str:
     """Return a value of a file, shortened; of a list and the like only the class."""
+    if isinstance(value, np.generic):
+        value = value.item()
     # Python prints no thousands of digits.
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a whole number of {value.bit_length()} bits"

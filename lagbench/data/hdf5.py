@@ -16,6 +16,8 @@ import numpy as np
 
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, check_regular
 
+from .variables import HIDDEN_ATTRIBUTES
+
 MAX_LINKS = 1000
 """Most entries of a group that are inspected."""
 
@@ -42,20 +44,6 @@ INSIDE = ("compact", "contiguous", "chunked")
 LINKS = {h5py.h5l.TYPE_SOFT: "soft link", h5py.h5l.TYPE_EXTERNAL: "external link"}
 
 OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
-
-HIDDEN_ATTRIBUTES = frozenset(
-    (
-        "CLASS",
-        "NAME",
-        "REFERENCE_LIST",
-        "DIMENSION_LIST",
-        "_Netcdf4Dimid",
-        "_Netcdf4Coordinates",
-        "_NCProperties",
-        "_nc3_strict",
-    )
-)
-"""Attributes by which netCDF stores dimensions; it shows them to nobody."""
 
 NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
 """Start of the name of a dimension that has no variable of its own."""

@@ -77,13 +77,20 @@ def url_of(root: Path) -> str | None:
 def working_copy_of(url: str) -> Path:
     """Return the working copy of a root in a store; its name is readable and unique.
 
+    Raises:
+        UsageError: the user has no home folder, and no folder is named.
+
     >>> working_copy_of("s3://bucket/data").name
     's3-bucket-data-397b84d8'
     """
     address = hide_user(url, mark="")
     words = re.sub(r"[^A-Za-z0-9._]+", "-", address).strip("-.")[:60]
     digest = hashlib.sha256(url.encode()).hexdigest()
-    return cache_folder("stores") / f"{words}-{digest[:8]}"
+    try:
+        stores = cache_folder("stores")
+    except RuntimeError as error:
+        raise no_home_error(CACHE_VARIABLE) from error
+    return stores / f"{words}-{digest[:8]}"
 
 
 def cache_folder(part: str) -> Path:
@@ -94,16 +101,16 @@ def cache_folder(part: str) -> Path:
             holds all parts together.
 
     Raises:
-        UsageError: ``LAGBENCH_CACHE`` begins with the home folder of an unknown user,
-            or it is not set and the user has no home folder.
+        RuntimeError: the user has no home folder.
+        UsageError: ``LAGBENCH_CACHE`` begins with the home folder of an unknown user.
     """
     folder = os.environ.get(CACHE_VARIABLE)
     if folder:
         return expand_path(folder, CACHE_VARIABLE)
-    try:
-        return platformdirs.user_cache_path("lagbench", appauthor=False) / part
-    except RuntimeError as error:
-        raise no_home_error(CACHE_VARIABLE) from error
+    cache = platformdirs.user_cache_path("lagbench", appauthor=False)
+    if not cache.is_absolute():  # older versions of platformdirs begin it with ~
+        raise RuntimeError(str(cache))
+    return cache / part
 
 
 MANIFEST_NAME = "manifest.json"
@@ -266,8 +273,8 @@ def no_home_error(where: str) -> UsageError:
     return UsageError(
         "you have no home folder",
         where=where,
-        expected="a folder, or a home folder in which lagbench has one",
-        got="neither HOME nor a home folder of your user",
+        expected="a folder, or a home folder",
+        got="no home folder",
         fix=f"set HOME, or name a folder: {where}",
     )
 

@@ -88,9 +88,12 @@ def resolve_root(root: str | Path | None = None) -> Path:
     named_root = _named_root(root)
     if named_root is None:
         try:
-            return platformdirs.user_data_path("lagbench", appauthor=False)
+            folder = platformdirs.user_data_path("lagbench", appauthor=False)
         except RuntimeError as error:
             raise no_home_error(_ROOT_OPTION) from error
+        if not folder.is_absolute():  # older versions of platformdirs begin it with ~
+            raise no_home_error(_ROOT_OPTION)
+        return folder
     url = as_url(named_root)
     if url is not None:
         return _make_working_copy(url)

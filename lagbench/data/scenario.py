@@ -467,10 +467,10 @@ def _require_attribute(file: h5py.File, name: str) -> Any:  # noqa: ANN401 (text
 
 
 def _require_integer(file: h5py.File, name: str) -> int:
-    value = np.asarray(_require_attribute(file, name))
-    if value.size != 1 or value.dtype.kind not in "iu":
-        raise DataError(f"the attribute {name!r} is no integer")
-    return int(value.item())
+    value = _require_attribute(file, name)
+    if not isinstance(value, int | np.integer):
+        raise DataError(f"the attribute {name!r} is {value!a}, and no integer")
+    return int(value)
 
 
 def _require_text(file: h5py.File, name: str) -> str:

@@ -64,6 +64,20 @@ UNCHECKED_ATTRIBUTES = {"content_sha256", "long_name"}
 The hash is checked elsewhere, and a patch release may reword a name.
 """
 
+HIDDEN_ATTRIBUTES = frozenset(
+    (
+        "CLASS",
+        "NAME",
+        "REFERENCE_LIST",
+        "DIMENSION_LIST",
+        "_Netcdf4Dimid",
+        "_Netcdf4Coordinates",
+        "_NCProperties",
+        "_nc3_strict",
+    )
+)
+"""Attributes by which netCDF stores dimensions; it shows them to nobody."""
+
 MAX_VALUES_PER_FRAME = 20_000_000
 """Values of a variable in one frame, which is read at once.
 

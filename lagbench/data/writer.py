@@ -36,16 +36,18 @@ from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
 from .field_errors import describe_value
 from .layout import ScenarioKey
-from .variables import MAX_VALUES_PER_FRAME, expected_attributes, open_netcdf
+from .variables import (
+    HIDDEN_ATTRIBUTES,
+    MAX_VALUES_PER_FRAME,
+    expected_attributes,
+    open_netcdf,
+)
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
 
 CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable [bytes]; frames are written once, in order."""
-
-MOST_LETTERS = 80
-"""Letters of a wrong name in a message."""
 
 PARTICLES_PER_CHUNK = 1 << 17
 """Most particles in a chunk: 1 MiB, the default chunk cache of HDF5.
@@ -75,25 +77,33 @@ _RESERVED = {
 }
 """Attributes of the file that no parameter may be named like."""
 
-_KEPT_BY_NETCDF = {
-    "CLASS",
-    "DIMENSION_LIST",
-    "NAME",
-    "REFERENCE_LIST",
+_KEPT_BY_NETCDF = HIDDEN_ATTRIBUTES | {
     "_ARRAY_DIMENSIONS",
     "_Codecs",
     "_Format",
     "_IsNetcdf4",
-    "_NCProperties",
-    "_Netcdf4Coordinates",
-    "_Netcdf4Dimid",
     "_SuperblockVersion",
-    "_nc3_strict",
+    "_nczarr_array",
+    "_nczarr_attr",
+    "_nczarr_group",
+    "_nczarr_superblock",
 }
 """Attributes that netCDF and HDF5 keep for themselves."""
 
 LONGEST_NAME = 256
 """Longest name of an attribute in netCDF [bytes]."""
+
+POSSIBLE_NAME = (
+    f"an identifier of at most {LONGEST_NAME} bytes in the composed form (NFC), which "
+    "neither the file nor netCDF uses"
+)
+"""What the name of a parameter has to be."""
+
+STORABLE_VALUE = (
+    "a finite number, a whole one of 64 bits at most, or a text that is not empty and "
+    "has no NUL and no lone surrogate"
+)
+"""What the value of a parameter has to be."""
 
 _SURROGATES = re.compile("[\ud800-\udfff]")
 """Halves of characters, which no UTF-8 has."""
@@ -414,25 +424,21 @@ def _check_parameters(
     """Return parameters as plain values; refuse reserved names and other values."""
     plain_values: dict[str, object] = {}
     for name, value in parameters.items():
-        if not can_name_parameter(name):
-            reserved = ", ".join(sorted(_RESERVED | _KEPT_BY_NETCDF))
+        fault = find_name_fault(name)
+        if fault is not None:
             raise DataError(
-                f"a parameter cannot be named {name[:MOST_LETTERS]!a}",
+                f"a parameter cannot be named {describe_value(name)}",
                 where=str(path),
-                expected=f"an identifier of at most {LONGEST_NAME} bytes, composed "
-                f"(NFC), other than {reserved}",
-                got=f"{len(name)} characters",
+                expected=POSSIBLE_NAME,
+                got=fault,
                 fix="rename the parameter",
             )
-        plain_value: object = None
-        with suppress(DataError, UnicodeDecodeError):
-            plain_value = to_plain(value)
-        if not _is_storable(plain_value):
+        plain_value = as_attribute(value)
+        if plain_value is None:
             raise DataError(
                 f"the parameter {name!r} cannot be stored",
                 where=str(path),
-                expected="a finite number, a whole one of 64 bits at most, or a text "
-                "that is not empty and has no NUL and no half of a character",
+                expected=STORABLE_VALUE,
                 got=describe_value(value),
                 fix="give such a value, or leave the parameter out",
             )
@@ -440,26 +446,37 @@ def _check_parameters(
     return plain_values
 
 
-def can_name_parameter(name: str) -> bool:
-    """Tell whether a drawn parameter can have this name in a scenario file.
+def find_name_fault(name: str) -> str | None:
+    """Return why no parameter can have a name in a scenario file; None if one can."""
+    if not name.isidentifier():
+        return "no identifier"
+    if name in _RESERVED:
+        return "the name of an attribute that each file has"
+    if name in _KEPT_BY_NETCDF:
+        return "a name that netCDF keeps for itself"
+    if not unicodedata.is_normalized("NFC", name):
+        return "another form, which netCDF would change"
+    length = len(name.encode("utf-8"))
+    if length > LONGEST_NAME:
+        return f"{length} bytes"
+    return None
 
-    Names of the file's own attributes are taken. netCDF keeps some names for itself. It
-    composes characters (NFC), so another form would not come back.
-    """
-    if name in _RESERVED or name in _KEPT_BY_NETCDF:
-        return False
-    if not name.isidentifier() or not unicodedata.is_normalized("NFC", name):
-        return False
-    return len(name.encode("utf-8")) <= LONGEST_NAME
 
-
-def _is_storable(plain_value: object) -> bool:
-    """Tell whether a plain value can be an attribute."""
+def as_attribute(value: object) -> int | float | str | None:
+    """Return a value as an attribute holds it; None where netCDF cannot store it."""
+    try:
+        plain_value = to_plain(value)
+    except (DataError, UnicodeDecodeError):
+        return None
     if isinstance(plain_value, int):
-        return -(2**63) <= plain_value < 2**64
+        is_storable = -(2**63) <= plain_value < 2**64
+        return plain_value if is_storable else None
     if isinstance(plain_value, str):
-        return plain_value != "" and _SURROGATES.search(plain_value) is None
-    return isinstance(plain_value, float)
+        is_storable = plain_value != "" and not _SURROGATES.search(plain_value)
+        return plain_value if is_storable else None
+    if isinstance(plain_value, float):
+        return plain_value
+    return None
 
 
 @contextmanager
@@ -469,7 +486,9 @@ def _write_errors(path: Path) -> Iterator[None]:
         yield
     except LagbenchError:
         raise
-    except (OSError, RuntimeError, UnicodeError) as error:  # a name that is no UTF-8
+    # UnicodeError: a path that is no UTF-8; AttributeError: what netCDF4 raises over
+    # attributes
+    except (OSError, RuntimeError, UnicodeError, AttributeError) as error:
         free_bytes = 0
         if path.parent.is_dir():
             free_bytes = shutil.disk_usage(path.parent).free

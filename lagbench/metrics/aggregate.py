@@ -38,8 +38,8 @@ LEVEL = 0.95
 RESAMPLES = 10_000
 """Resamples of scenarios and of seeds."""
 
-DRAWN_TOGETHER = 1 << 18
-"""Elements of resamples that are drawn at once."""
+ELEMENTS_PER_BLOCK = 1 << 18
+"""Most elements of resamples that are drawn at once."""
 
 FEWEST_FOR_INTERVAL = 4
 """Fewest scenarios with an interval: Student's quantile of three doubles its width."""
@@ -202,7 +202,7 @@ def _resampled_shares(count: int, stream: int) -> Floats:
     shares = np.empty((RESAMPLES, count))
     # In blocks they are the draws of one call. Of many scenarios one call would take
     # several times the memory of the result.
-    block_length = max(1, DRAWN_TOGETHER // count)
+    block_length = max(1, ELEMENTS_PER_BLOCK // count)
     for start in range(0, RESAMPLES, block_length):
         block = shares[start : start + block_length]
         uniform = generator.random(block.shape)

@@ -153,10 +153,10 @@ follow each analog.
 
 
 def divide_evenly(distances: Floats, particle_count: int) -> list[NDArray[np.intp]]:
-    """Return the followers of each analog, which the particles take in turn.
+    """Return the particles that follow each analog, one array per analog.
 
-    So the numbers of followers differ by one at most. With fewer particles than analogs
-    the last analogs have none.
+    Particle i follows the analog of number i modulo the number of analogs. With fewer
+    particles than analogs the last analogs have no followers.
     """
     analog_count = len(distances)
     followers = []

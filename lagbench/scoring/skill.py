@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lagbench.data.registry import Size
-from lagbench.errors import ChecksFailedError
+from lagbench.errors import ChecksFailedError, format_count
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
     Resampling,
@@ -335,7 +335,8 @@ def skill_gap(
         second_reference: score of the naive predictor there.
 
     Raises:
-        ChecksFailedError: a set has no scenario in which both have a value.
+        ChecksFailedError: a set has no scenario in which both have a value, or the
+            naive predictor has no error there.
     """
     ratios = []
     deviations = []
@@ -350,7 +351,7 @@ def skill_gap(
         has_both = has_base & has_method
         base = base[has_both]
         method = method[has_both]
-        if not base.any():
+        if len(base) == 0:
             raise ChecksFailedError(
                 "there is no scenario that both have",
                 where=seeds[0].metric.name,
@@ -359,6 +360,14 @@ def skill_gap(
                 fix="see which values are undefined: lagbench score --all",
             )
         base_mean = float(np.mean(base))
+        if base_mean == 0.0:
+            raise ChecksFailedError(
+                "the naive predictor has no error, so no skill is defined",
+                where=seeds[0].metric.name,
+                expected="an error above 0 in some scenario",
+                got=f"0 in {format_count(len(base), 'scenario')}",
+                fix="compare with another naive predictor",
+            )
         ratio = float(np.mean(method)) / base_mean
         resampling = resample(_relative_to(base, method, ratio) / base_mean)
         if len(base) < FEWEST_FOR_INTERVAL or resampling is None:

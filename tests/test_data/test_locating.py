@@ -31,6 +31,7 @@ from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.clean import clean
+from lagbench.make.plan import measured_ratio
 from lagbench.make.verify import verify
 
 
@@ -78,7 +79,10 @@ def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None
 def test_a_user_without_a_home_folder_names_the_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such is a user of a container who is in no list of users."""
+    """Such is a user of a container who is in no list of users.
+
+    The measured speeds of the machine lie there too, but nobody needs them.
+    """
 
     def refuse(number: int) -> None:
         raise KeyError(number)
@@ -94,6 +98,7 @@ def test_a_user_without_a_home_folder_names_the_folders(
         resolve_root("s3://bucket/data")
     assert caught.value.where == "LAGBENCH_CACHE"
     assert resolve_root(tmp_path) == tmp_path
+    assert measured_ratio(load().size("cavity", "tiny")) is None
 
 
 def test_an_empty_option_is_not_the_current_folder(

@@ -235,7 +235,7 @@ def test_a_scenario_of_one_frame_is_its_initial_state(
         (HEIGHT, '"height": ""'),
         (HEIGHT, '"height": True'),
         (HEIGHT, '"height": np.True_'),
-        (HEIGHT, '"height": 2**63'),
+        (HEIGHT, '"height": 2**64'),
         (HEIGHT, '"height": 10**400'),
         (HEIGHT, '"height": 10**5000'),
         ("area=width * height", "area=10**400"),

@@ -604,6 +604,14 @@ def test_a_gap_to_a_perfect_prediction_is_that_of_the_other_skill() -> None:
     assert (gap.value, gap.interval) == (0.0, (0.0, 0.0))
 
 
+def test_a_gap_over_a_perfect_naive_predictor_is_refused() -> None:
+    """Nothing is left to learn there: the skill would divide by 0."""
+    perfect = scored([0.0] * 4)
+    with pytest.raises(ChecksFailedError) as caught:
+        skill_gap([scored([1.0] * 4)], perfect, [scored([1.0] * 4)], perfect)
+    assert "0" in str(caught.value.got)
+
+
 def test_the_interval_of_a_gap_holds_the_truth() -> None:
     """Of draws whose expected ratios are known, 95 % of the intervals hold the gap."""
     draw = np.random.default_rng(5)
