@@ -166,11 +166,9 @@ CHECKS: Mapping[str, BoardCheck] = {
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
-        "a line of verified.yaml about an entry that does not exist, or whose score "
-        "files have changed; a level without the records that prove it; a date in "
-        "the future; a cost of a reference predictor, if the data set does not have "
-        "this predictor; a blind score of a season (a test on new scenarios) that "
-        "does not exist",
+        "a line of verified.yaml about a missing entry or other score files; an "
+        "unproved level; a date in the future; a cost for a reference predictor that "
+        "the data set lacks; a blind score of a season that the leaderboard lacks",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
