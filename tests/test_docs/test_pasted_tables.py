@@ -113,7 +113,7 @@ def test_the_differences_of_reproduced_models_are_those_of_verified_yaml() -> No
     heading = "| relative difference of the ranking metric | models |"
     rows = table_like(tables_in(text), heading)
     assert [int(cells_of(row)[1]) for row in rows[1:]] == counts
-    assert f"Together they have {sum(counts)} pairs of an entry and a model" in text
+    assert f"the models of each entry, {sum(counts)} in total" in text
 
 
 def test_the_table_of_gates_has_what_gates_json_records() -> None:
