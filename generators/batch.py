@@ -199,7 +199,7 @@ def _check_values(state: InitialState, where: str) -> None:
                 where=where,
                 expected="a finite number, 0 or more",
                 got=describe_value(value),
-                fix=f"give InitialState such a number as {name}: docs/extending.md",
+                fix=f"give InitialState such a number as {name}",
             )
 
     parameters: object = state.parameters

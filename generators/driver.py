@@ -372,8 +372,8 @@ def check_undriven(index: int, state: InitialState) -> None:
                 where=f"scenario {index}, {name}",
                 expected="None",
                 got=type(value).__name__,
-                fix="return FullBoxParameters from solver_parameters, or leave it out "
-                "of the initial state: docs/extending.md",
+                fix=f"leave {name} out of the initial state; or return "
+                "FullBoxParameters from solver_parameters",
             )
 
 

@@ -118,6 +118,12 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
             remarks = _shorten_remarks(table_row, room)
         table_rows.append((*line, remarks))
     legend = list(_legend_of(tab, table_rows, wide=wide))
+    if AGAINST_CLASSICAL.key in names:
+        legend.append(
+            f"{HEADINGS[AGAINST_CLASSICAL.key]}: score over that of the best classical "
+            "solver that costs no more"
+        )
+        legend.append("s/frame of classical and naive rows: measured in other runs")
     if any(is_beside_dearer_solver(row) for row in rows):
         legend.append(
             f"{SOLVER_COSTS_MORE}: all classical solvers cost more than the model"
@@ -184,7 +190,7 @@ def _legend_of(tab: Tab, rows: Sequence[Sequence[str]], *, wide: bool) -> Iterat
     if not wide and any(row.variant_of for row in tab.rows):
         marks.append("+n: variants (--wide)")
     if any(seconds.endswith(REPORTED) for *_, seconds, _ in rows):
-        marks.append(f"{REPORTED}: self-reported")
+        marks.append(f"{REPORTED}: time self-reported")
     if any(remarks.endswith(LEFT_OUT) for *_, remarks in rows):
         marks.append(f"{LEFT_OUT}: more remarks (--wide)")
     if marks:

@@ -94,8 +94,8 @@ LONGEST_NAME = 256
 """Longest name of an attribute in netCDF [bytes]."""
 
 POSSIBLE_NAME = (
-    f"an identifier of at most {LONGEST_NAME} bytes in the composed form (NFC), which "
-    "neither the file nor netCDF uses"
+    "letters, digits and _, as in disc_radius, and no name that files use; at most "
+    f"{LONGEST_NAME} bytes, in the composed form (NFC)"
 )
 """What the name of a parameter has to be."""
 

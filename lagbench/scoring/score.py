@@ -386,7 +386,8 @@ def _check_overwriting(path: Path, header: Header) -> None:
             where=str(path),
             expected=f"no such file, or the scores of {expected}",
             got=present,
-            fix="keep them: --output FOLDER; or remove them",
+            fix="name another folder for the new scores: --output FOLDER, in Python "
+            "output_dir=; or remove the old ones",
         )
 
 

@@ -418,7 +418,7 @@ def test_the_leaderboard_is_shown_in_one_table_for_each_data_set(
     start = lines.index(titles[0])
     (line,) = [line for line in lines[start : start + 30] if " var-stable " in line]
     assert f"{stated.cost.seconds_per_frame:.2g}*" in line.split()
-    assert "*: self-reported" in lines[start + 1]
+    assert "*: time self-reported" in lines[start + 1]
 
 
 @pytest.mark.parametrize(
