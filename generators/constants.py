@@ -334,7 +334,7 @@ def solver_constants(size: Size) -> SolverParameters:
             where=f"{size.generator}.solver_parameters",
             expected=f"an object of one of these types: {', '.join(type_names)}",
             got=type(parameters).__name__,
-            fix="return constants(FreeSurfaceParameters, size), or those of another "
-            "solver: docs/extending.md",
+            fix="return constants(FreeSurfaceParameters, size), or those of another of "
+            "these types",
         )
     return parameters

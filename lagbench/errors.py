@@ -596,7 +596,9 @@ def load_entry_point(
     try:
         return point.load()
     except SystemExit as error:
-        raise ImportError(f"its module would end the program: {error!r}") from error
+        refusal = ImportError(f"its module would end the program: {error!r}")
+        # with the line that would do so
+        raise refusal.with_traceback(error.__traceback__) from error
     finally:
         timer.cancel()
 

@@ -486,9 +486,7 @@ def _write_errors(path: Path) -> Iterator[None]:
         yield
     except LagbenchError:
         raise
-    # UnicodeError: a path that is no UTF-8; AttributeError: what netCDF4 raises over
-    # attributes
-    except (OSError, RuntimeError, UnicodeError, AttributeError) as error:
+    except (OSError, RuntimeError, UnicodeError) as error:  # a path that is no UTF-8
         free_bytes = 0
         if path.parent.is_dir():
             free_bytes = shutil.disk_usage(path.parent).free

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -721,7 +722,16 @@ def test_parameters_that_would_hide_an_attribute_are_refused(
 def test_names_that_netcdf_keeps_or_changes_are_refused(
     tmp_path: Path, name: str
 ) -> None:
-    """The last one is an n and a tilde. NetCDF would store one character for both."""
+    """NetCDF refuses each name, or has another one in the file.
+
+    The last one is an n and a tilde. NetCDF would store one character for both.
+    """
+    names = []
+    with suppress(AttributeError), netCDF4.Dataset(tmp_path / "raw.nc", "w") as raw:
+        raw.setncattr(name, 1)
+        names = raw.ncattrs()
+    assert name not in names
+
     with pytest.raises(DataError) as caught:
         write_scenario(tmp_path, KEY, parameters={name: 1})
     assert str(caught.value.where).endswith("0003.nc")

@@ -23,7 +23,12 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import PluginWarning
-from lagbench.errors import UsageError, WorkFailedError, load_entry_point
+from lagbench.errors import (
+    UsageError,
+    WorkFailedError,
+    find_place_in_extension,
+    load_entry_point,
+)
 from lagbench.metrics import (
     FAMILIES,
     METRICS,
@@ -468,6 +473,18 @@ def test_a_bad_entry_point_is_left_out(
     assert len(warnings) == 1
     assert value in str(warnings[0].message)
     assert metrics == dict(METRICS)
+
+
+def test_a_module_that_would_end_the_program_is_named_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "parting.py").write_text("import sys\nsys.exit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    point = EntryPoint(name="part", value="parting:VALUE", group=table_module.GROUP)
+    with pytest.raises(ImportError) as caught:
+        load_entry_point(point)
+    place = find_place_in_extension(caught.value, "parting")
+    assert place == f"{tmp_path / 'parting.py'}, line 2"
 
 
 def test_a_module_that_sleeps_is_named(
