@@ -517,7 +517,7 @@ def draw_waves(
     fitting = turn * waves_in_period / periods
     wave_vector = torch.where(periods.isfinite(), fitting, wave_vector)
     wavenumber = torch.linalg.vector_norm(wave_vector, dim=-1, keepdim=True)
-    # A wave longer than the box fits no period: it displaces nothing.
+    # A wave longer than two periods along every axis fits none: it displaces nothing.
     wavenumber = wavenumber.clamp(min=_LEAST_WAVENUMBER)
     amplitude = wave_strain[..., None] * wave_vector / wavenumber**2
 

@@ -234,9 +234,14 @@ def _parse_info(facts: object) -> DatasetInfo:
     """Return the public figures of a data set, whose box is one.
 
     Raises:
-        ValueError: a figure does not fit, or the box is none.
+        ValueError: a figure does not fit, a statistic does not have one number for each
+            axis, or the box is none.
     """
     info: DatasetInfo = TypeAdapter(DatasetInfo).validate_python(facts)
+    axes = len(info.bounds)
+    for name, row in info.statistics.items():
+        if len(row) != axes:
+            raise ValueError(f"{name} has {len(row)} numbers for {axes} axes")
     try:
         Box.from_bounds(info.bounds, parse_periodic(info.periodic, len(info.bounds)))
     except UsageError as error:

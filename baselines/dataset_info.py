@@ -122,10 +122,13 @@ def find_forcing(size: Size, root: Path) -> frozenset[str]:
 
 
 def _find_hash(manifest: Manifest, size: Size) -> str | None:
-    """Return the hash of the data at hand, else that of datasets.yaml."""
+    """Return the hash of the data at hand, else that of datasets.yaml.
+
+    Incomplete data that may have other bits than those of datasets.yaml have no hash.
+    """
     if manifest.dataset_sha256:
         return manifest.dataset_sha256
-    if size.measured is not None:
+    if size.measured is not None and manifest.identity == "bitwise":
         return size.measured.dataset_sha256
     return None
 

@@ -114,7 +114,8 @@ class Optimisation:
         """Return the loss, the weighted sum of the terms; keep the terms.
 
         Raises:
-            UsageError: the terms are no dict of scalars, or no parameter changes them.
+            UsageError: the terms are no dict of scalars by name, one has the name of
+                their sum, or no parameter changes them.
             WorkFailedError: every term has weight 0.
         """
         where = f"{type(self.model).__qualname__}.forward"
@@ -218,14 +219,19 @@ class Optimisation:
 
 
 def _check_terms(terms: object, *, where: str) -> Mapping[str, Tensor]:
-    """Return loss terms; refuse anything but a dict of tensors of one number each."""
+    """Return loss terms; refuse anything but a dict of tensors of one number each.
+
+    The log has the sum of the terms beside them, so no term may have its name.
+    """
     if isinstance(terms, Mapping):
-        values: Mapping[str, object] = terms
+        values: Mapping[object, object] = terms
     else:
         values = {"no dict": terms}
     is_fit = isinstance(terms, Mapping) and len(terms) > 0
     shapes = []
     for name, value in values.items():
+        if not isinstance(name, str) or name == TOTAL:
+            is_fit = False
         if isinstance(value, Tensor):
             is_fit = is_fit and value.numel() == 1
             shapes.append(f"{name}: {value.shape}")
@@ -237,7 +243,8 @@ def _check_terms(terms: object, *, where: str) -> Mapping[str, Tensor]:
     raise UsageError(
         "a model returned no loss",
         where=where,
-        expected="a dict of terms, tensors of one number each",
+        expected="a dict of terms, tensors of one number each, by names that are texts "
+        f"and not {TOTAL!r}",
         got=", ".join(shapes) or "an empty dict",
         fix="mend that class; docs/baselines.md has an example",
     )

@@ -40,8 +40,8 @@ class ParticleGrid(nn.Module):
     """Square or cubic cells, symmetric about the middle of the box.
 
     Walls lie between two nodes. A periodic axis is a whole number of cells long, and
-    its first node lies half a cell from the seam; there cells may be a little longer or
-    shorter than along other axes.
+    its first node lies half a cell from the seam; there cells may be longer or shorter
+    than along other axes.
 
     Each window, or material, has its own layer of nodes, so its particles do not mix
     with others.
@@ -111,8 +111,8 @@ class ParticleGrid(nn.Module):
     ) -> tuple[float, Tensor]:
         """Return a cell's width and the nodes' places along a periodic axis [length].
 
-        The number of nodes is the multiple whose cells are nearest to the spacing, and
-        no fewer than the three nodes that a particle touches.
+        The number of nodes is the multiple that is nearest to the number of spacings in
+        the period. It is at least three: so many nodes a particle touches.
         """
         low, high = interval
         period = high - low

@@ -114,8 +114,9 @@ def predict(
     """Predict every test scenario of the data set that a model was trained on, or of
     another size of it.
 
-    At another size the connectivity radius keeps its ratio to the distance of
-    particles, and statistics stay those of the training.
+    At another size the connectivity radius of the data set keeps its ratio to the
+    distance of particles; a radius among the options stays. Statistics stay those of
+    the training.
 
     An :class:`UnfinishedWarning` tells of a training.json beside the checkpoint whose
     training is not over, a :class:`~lagbench.baselines.start.LastStateWarning` of a

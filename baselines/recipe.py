@@ -12,8 +12,9 @@ file of recipes holds defaults and the differences of each recipe::
       "*/tiny": {model: {latent: 16}, training: {steps: 50}}
       fluid/mini: {training: {steps: 900}, baselines: {gat: {training: {steps: 500}}}}
 
-Later layers win: defaults, the recipe, its part for the baseline, ``--set``. ``steps``
-and ``epochs`` replace each other.
+Later layers win: defaults, the recipe, its part for the baseline, the options of the
+model that a training starts from, ``--set``, the seed. ``*/tiny`` serves splits that
+have no recipe of their own at this size. ``steps`` and ``epochs`` replace each other.
 """
 
 from __future__ import annotations
@@ -342,11 +343,12 @@ def recipe_for(
         entry: the baseline.
         split: name of the split.
         size: name of the size.
-        variant: variant of the recipe, or a YAML file of recipes.
+        variant: variant of the recipe, such as ``short`` of ``cavity/full-short``; or
+            the path of a YAML file that replaces the baseline's own recipes.
         settings: changes, as in ``training.steps=100``.
-        seed: seed in place of the recipe's.
-        learned: options of a trained model to go on with. They win over the recipe, and
-            ``settings`` over them.
+        seed: seed of the training; it wins over ``settings``.
+        learned: options of the model that the training starts from. They win over the
+            recipe, and ``settings`` over them.
 
     Raises:
         UsageError: there is no such recipe, or an option does not fit.
@@ -367,7 +369,8 @@ def recipe_for(
     part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
     if part is None:
         if file.recipes or variant:
-            if path == entry.recipes and not _has_recipes_of(split, size, file):
+            is_own_file = file.recipes and path == entry.recipes
+            if is_own_file and not _has_recipes_of(split, size, file):
                 raise _no_recipe_of_split(entry, f"{split}/{size}", file)
             raise _missing_recipe(entry, name, variant, file)
         part = _SharedRecipe()

@@ -5,13 +5,15 @@
 
 after Sanchez-Gonzalez et al. (2020) and thesis sections 5.6 and 5.7. Training and
 rollouts share :meth:`GraphNetwork.step`. The network's last layer starts at zero. So an
-untrained model with target acceleration keeps every velocity, and training starts from
-there.
+untrained model with target acceleration adds the mean acceleration of train to every
+velocity.
 
-The loss has six terms of motion, density and flow (thesis Eqs. 5.29-5.35) in normalise
-units, as in the thesis: accelerations, velocities and positions over their deviations
-in train; the grid's velocities too, so that vorticity and divergence have the unit
-1/length; density over that around a particle. The training applies the weights.
+The loss has terms of motion (acceleration, velocity and position), and in boxes of two
+dimensions with walls also of density and flow (divergence and vorticity), after Eqs.
+5.29-5.35 of the thesis. The terms are normalised: accelerations, velocities and
+positions by their deviations in train, widened by the noise; the velocities on the grid
+too, so that vorticity and divergence have the unit 1/length; density by that around a
+particle. The training applies the weights.
 """
 
 from __future__ import annotations
@@ -83,8 +85,8 @@ class ParticleState:
     # centre and radius of each window's obstacle [length], shape [window, axis + 1];
     # None where the model does not see it
     obstacle: Tensor | None = None
-    # largest density that relaxation leaves alone [1], shape [window]; None before the
-    # first step of a rollout, and without relaxation
+    # largest density that relaxation leaves alone [1], shape [window]; None without
+    # relaxation
     density_limit: Tensor | None = None
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
@@ -123,7 +125,7 @@ class LossNorm(enum.StrEnum):
 def mean_norm(
     error: Tensor, norm: LossNorm, count: Tensor | int | None = None
 ) -> Tensor:
-    """Return ``(1/N) sum_i ||e_i||_p`` of normalise errors (Eqs. 5.29-5.34).
+    """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors (Eqs. 5.29-5.34).
 
     The errors have shape [..., component]. N counts particles or nodes, by default
     those of the array.
@@ -147,7 +149,7 @@ def loss_terms(
     norm: LossNorm,
     weights: Mapping[str, float],
 ) -> dict[str, Tensor]:
-    """Return the six terms without their weights.
+    """Return the terms of the loss without their weights.
 
     Terms of weight 0 have no graph of gradients. In three dimensions and in periodic
     boxes there are no terms of the grid.
@@ -155,7 +157,7 @@ def loss_terms(
     Args:
         predicted: predicted motion.
         target: true motion.
-        sample: window of each particle, shape [particle].
+        sample: window of each particle, ascending, shape [particle].
         grid: grid of density, divergence and vorticity.
         scales: deviations of errors, one along each axis, by the names in
             :class:`Motion`.
@@ -213,7 +215,11 @@ def _target_fields(target: Motion, grid: Grid, sample: Tensor) -> TensorFields:
 def _predicted_fields(
     predicted: Motion, true_fields: TensorFields, sample: Tensor
 ) -> TensorFields:
-    """Return the fields of the prediction at the nodes that count in the truth."""
+    """Return the fields of the prediction on the grid of the truth.
+
+    Density and velocity are those of all nodes. Vorticity and divergence are 0 except
+    at nodes where those of the truth are defined.
+    """
     windows = int(sample[-1]) + 1
     grid = true_fields.grid
     sums = transfer(
@@ -478,9 +484,16 @@ class GraphNetwork(Baseline):
     def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return the weights, with a fall of 0 if they have none and this model has."""
+        """Return the weights, with a fall if and only if this model has one.
+
+        A fall that the weights have not is 0.
+        """
         name = "free_flight.fall"
-        if self.free_flight is None or name in weights:
+        if self.free_flight is None:
+            others = dict(weights)
+            others.pop(name, None)
+            return others, options
+        if name in weights:
             return weights, options
         no_fall = torch.zeros_like(self.free_flight.fall)
         return {**weights, name: no_fall}, options
@@ -727,24 +740,27 @@ class GraphNetwork(Baseline):
             next_frame = min(given.frames, known_frames - 1)
             per_second = given.wall_velocity[:, next_frame:]
             walls = per_second * self.info.frame_interval
+        position = given.position[:, -1]
+        limit = None
+        if self.relaxation is not None:
+            limit = self.relaxation.limit(position, given.sample)
         return ParticleState(
-            position=given.position[:, -1],
+            position=position,
             velocity=last_velocities(given.position, self.options.velocities, self.box),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
             body_force=self.forcing.coming_force(given),
             obstacle=self.forcing.find_obstacle(given),
+            density_limit=limit,
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
         following, _ = self.step(state)
-        if self.relaxation is None:
-            return following, following.position
         limit = state.density_limit
-        if limit is None:  # the first step of a rollout
-            limit = self.relaxation.limit(state.position, state.sample)
+        if self.relaxation is None or limit is None:
+            return following, following.position
         obstacle = None
         if following.obstacle is not None:
             obstacle = following.obstacle[following.sample]
@@ -754,9 +770,7 @@ class GraphNetwork(Baseline):
         correction = self.box.displacement(following.position, position)
         velocity = following.velocity.clone()
         velocity[:, -1] += correction
-        following = replace(
-            following, position=position, velocity=velocity, density_limit=limit
-        )
+        following = replace(following, position=position, velocity=velocity)
         return following, position
 
     def step(

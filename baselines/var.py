@@ -320,7 +320,10 @@ class LeastSquares:
 
 
 def solve(blocks: LaggedRows) -> LeastSquares:
-    """Return the least-squares solution of X B = Y; of many, that of least norm.
+    """Return the least-squares solution of X B = Y.
+
+    With fewer rows than regressors there are many solutions. This is the one of least
+    norm.
 
     Raises:
         WorkFailedError: there are no rows, or values are not finite.

@@ -12,12 +12,15 @@ draws or the same energy.
 from __future__ import annotations
 
 import argparse
+import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
+from lagbench.errors import LagbenchError
 
 NAMES = ("wall", "motion", "reynolds_number", "start_frame")
 
@@ -51,13 +54,15 @@ def main() -> int:
             f"{speed:.4f} | {reversals} | {energy:.3e} |"
         )
 
-    distinct_parameters = set()
-    distinct_energies = set()
+    draws: Counter[tuple[object, ...]] = Counter()
+    energies: Counter[float] = Counter()
     for *parameters, energy in rows:
-        distinct_parameters.add(tuple(parameters))
-        distinct_energies.add(energy)
-    distinct_count = min(len(distinct_parameters), len(distinct_energies))
-    alike_count = len(rows) - distinct_count
+        draws[tuple(parameters)] += 1
+        energies[energy] += 1
+    alike_count = 0
+    for *parameters, energy in rows:
+        if draws[tuple(parameters)] > 1 or energies[energy] > 1:
+            alike_count += 1
     print(f"\n{len(rows)} scenarios, {alike_count} alike")
     return 1 if alike_count else 0
 
@@ -83,9 +88,12 @@ def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
     moving = components[:, ever_moves]
     mean_square = np.mean(moving**2)
     speed = float(np.sqrt(mean_square))
-    signs = np.sign(moving)
-    sign_changes = np.diff(signs, axis=0)
-    reversals = int(np.count_nonzero(sign_changes))
+    reversals = 0
+    for component in moving.T:
+        # a wall that starts or stops does not change its direction
+        signs = np.sign(component[component != 0.0])
+        sign_changes = np.diff(signs)
+        reversals += int(np.count_nonzero(sign_changes))
     wall, motion, reynolds, start = (parameters[name] for name in NAMES)
     return (
         wall,
@@ -99,4 +107,8 @@ def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"cavity_scenarios: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -1,8 +1,9 @@
 # ruff: noqa: ANN001, ANN201 (Taichi infers the types of its functions)
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""What conventional Taichi code of a fluid has in two and in three dimensions.
+"""A solver of fluids as Taichi code is usually written, to compare ours with.
 
-conventional.py and periodic_cube.py add their boxes, their grids and their substeps.
+This is the part that is the same in two and in three dimensions. conventional.py and
+periodic_cube.py add their boxes, their grids and their substeps.
 """
 
 from __future__ import annotations
@@ -66,7 +67,11 @@ class ConventionalFluid:
 
     @ti.func
     def spline(self, f):
-        """Return the quadratic B-spline weights of the three nodes along each axis."""
+        """Return the quadratic B-spline weights of three nodes, the lowest one first.
+
+        ``f`` is the place of a particle, counted from the lowest node in cells. It is a
+        vector over the axes, and so is each weight.
+        """
         first = 0.5 * (1.5 - f) ** 2
         second = 0.75 - (f - 1) ** 2
         third = 0.5 * (f - 0.5) ** 2

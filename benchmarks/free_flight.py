@@ -22,6 +22,7 @@ from lagbench.baselines.free_flight import find_bodies
 from lagbench.baselines.rollout import scenario_batch, scenario_paths
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
+from lagbench.errors import LagbenchError
 from lagbench.tensors import TensorBox
 
 REACHES = (2.0, 2.8, 3.4, 4.0)  # reaches of forces [radius]
@@ -73,6 +74,13 @@ def count_particle_frames(paths: Sequence[Path]) -> int:
     return count
 
 
+def describe_mean(error_sum: float, particles: int) -> str:
+    """Return the mean error of the flying particles; a text where no body flies."""
+    if particles == 0:
+        return "no body flies"
+    return f"{error_sum / particles:.1e}"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table; return the exit code."""
     parser = argparse.ArgumentParser(
@@ -104,11 +112,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 for body in find_flying(size, path, reach):
                     flying += body.particles
                     error_sum += body.particles * body.error
-            error = error_sum / max(flying, 1)
             share = flying / particle_frames
-            print(f"| {split} {options.size} | {reach:g} | {share:.3f} | {error:.1e} |")
+            error = describe_mean(error_sum, flying)
+            print(f"| {split} {options.size} | {reach:g} | {share:.3f} | {error} |")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"free_flight: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
+import sys
 import time
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.registry import load
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.tables import markdown
 
 SPLIT = "curl-noise"
@@ -131,6 +133,32 @@ def measure_milliseconds(name: str, q: int) -> float:
     return statistics.median(milliseconds)
 
 
+def read_rows(text: str) -> range:
+    """Return the values of q from a first to a last one, as in 1-4.
+
+    Raises:
+        UsageError: there are none, or one is below 1.
+    """
+    first, dash, last = text.partition("-")
+    numbers = [first]
+    if dash:
+        numbers.append(last)
+    rows = range(0)
+    if all(number.isdecimal() for number in numbers):
+        first_q = int(numbers[0])
+        last_q = int(numbers[-1])
+        rows = range(first_q, last_q + 1)
+    if not rows or rows[0] < 1:
+        raise UsageError(
+            "there is nothing to measure",
+            where="--rows",
+            expected="the first and the last q, from 1 on",
+            got=repr(text),
+            fix="give them as in --rows 1-4",
+        )
+    return rows
+
+
 def main() -> int:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(
@@ -139,10 +167,7 @@ def main() -> int:
     parser.add_argument("--rows", default="1-4", help="values of q, as in 1-4")
     parser.add_argument("--output", type=Path, help="folder of the table")
     options = parser.parse_args()
-    first, _, last = options.rows.partition("-")
-    first_q = int(first)
-    last_q = int(last or first)
-    rows = range(first_q, last_q + 1)
+    rows = read_rows(options.rows)
     torch.set_num_threads(1)
 
     counts = PARTICLES * np.square(rows)
@@ -184,10 +209,15 @@ def main() -> int:
     text = f"{caption}\n\n{table}\n"
     print(text)
     if options.output:
+        options.output.mkdir(parents=True, exist_ok=True)
         path = options.output / "inference_cost.md"
         path.write_text(text, encoding="utf-8")
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"inference_cost: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

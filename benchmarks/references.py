@@ -20,11 +20,13 @@ data.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 
 import numpy as np
 
 from lagbench.data.registry import Size, load
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import ReferenceScores, shipped
 from lagbench.references.shipped import solver_seconds
@@ -59,7 +61,15 @@ def main() -> int:
 
     measured = []
     for name in names:
-        split, size_name = name.split("/")
+        split, slash, size_name = name.partition("/")
+        if not slash:
+            raise UsageError(
+                "not the name of a data set",
+                where="--data",
+                expected="a split and a size, as in cavity/full",
+                got=repr(name),
+                fix=f"name a size of the split too: {name}/mini",
+            )
         size = registry.size(split, size_name)
         references = shipped(size)
         if references:
@@ -193,4 +203,8 @@ def _print_active(size: Size, references: Mapping[str, ReferenceScores]) -> None
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"references: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from lagbench.errors import LagbenchError, UsageError
 from lagbench.generators import solver
 from lagbench.generators.split import (
     Device,
@@ -163,7 +165,12 @@ def measure(row: ThesisRow, *, device: Device, repeats: int) -> TimedRow:
 def _fit_exponents(
     rows: Sequence[ThesisRow], times: Sequence[ThesisRow | TimedRow]
 ) -> Exponents:
-    """Fit straight lines to the logarithms of sizes and times of rows (Eq. 3.1)."""
+    """Return the slopes of lines through logarithms of sizes and times (Eq. 3.1).
+
+    Args:
+        rows: rows that state the sizes.
+        times: the same rows with times.
+    """
     squares = [row.q**2 for row in rows]
     particles = [row.particles for row in rows]
     substep_ms = [timed.substep_ms for timed in times]
@@ -260,8 +267,37 @@ def markdown(
     return "\n".join(lines) + "\n"
 
 
+def read_rows(text: str) -> list[ThesisRow]:
+    """Return the rows from a first to a last q, as in 1-4.
+
+    Raises:
+        UsageError: there are no such rows.
+    """
+    first, dash, last = text.partition("-")
+    numbers = [first]
+    if dash:
+        numbers.append(last)
+    rows = []
+    if all(number.isdecimal() for number in numbers):
+        first_q = int(numbers[0])
+        last_q = int(numbers[-1])
+        rows = [row for row in THESIS if first_q <= row.q <= last_q]
+    if not rows:
+        raise UsageError(
+            "Table 3.1 has no such rows",
+            where="--rows",
+            expected=f"the first and the last q, from {THESIS[0].q} to {THESIS[-1].q}",
+            got=repr(text),
+            fix="give them as in --rows 1-4",
+        )
+    return rows
+
+
 def draw(measurements: Sequence[TimedRow], device: str, path: Path) -> None:
-    """Draw Fig. 3.1: (a) log-log with lines, (b) linear with second-degree fits."""
+    """Draw Fig. 3.1: (a) log-log with lines, (b) linear with second-degree fits.
+
+    A line needs two points, and a fit of second degree needs three.
+    """
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     our_points = []
@@ -278,16 +314,18 @@ def draw(measurements: Sequence[TimedRow], device: str, path: Path) -> None:
     )
     for name, colour, points in series:
         x, y = np.array(points, dtype=float).T
-        slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
-        parabola = np.polyfit(x, y, 2)
         line = np.linspace(x.min(), x.max(), 200)
-        power_law = 10**offset * line**slope
-        label = f"{name}: slope {slope:.2f}"
         left.loglog(x, y, "o", color=colour)
-        left.loglog(line, power_law, color=colour, label=label)
-        fitted = np.polyval(parabola, line)
+        if len(points) >= 2:
+            slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
+            power_law = 10**offset * line**slope
+            label = f"{name}: slope {slope:.2f}"
+            left.loglog(line, power_law, color=colour, label=label)
         right.plot(x, y, "o", color=colour)
-        right.plot(line, fitted, color=colour, label=name)
+        if len(points) >= 3:
+            parabola = np.polyfit(x, y, 2)
+            fitted = np.polyval(parabola, line)
+            right.plot(line, fitted, color=colour, label=name)
     for axes, title in ((left, "(a) log-log"), (right, "(b) second-degree fit")):
         axes.set(xlabel="q^2", ylabel="t/frame [ms]", title=title)
         axes.grid(alpha=0.3)
@@ -311,14 +349,10 @@ def main() -> int:
     parser.add_argument("--machine", default="", help="as in 'an NVIDIA H100'")
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
     options = parser.parse_args()
-    first, _, last = options.rows.partition("-")
-    first_q = int(first)
-    last_q = int(last or first)
     measurements = []
-    for row in THESIS:
-        if first_q <= row.q <= last_q:
-            measurement = measure(row, device=options.device, repeats=options.repeats)
-            measurements.append(measurement)
+    for row in read_rows(options.rows):
+        measurement = measure(row, device=options.device, repeats=options.repeats)
+        measurements.append(measurement)
 
     device = options.device.value
     table = markdown(measurements, device, machine=options.machine)
@@ -331,4 +365,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except LagbenchError as error:
+        print(f"table_3_1: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error

@@ -22,7 +22,9 @@ from lagbench.data.grid import Grid, fields
 Floats = NDArray[np.float64]
 
 SIDES = (20, 32, 45, 64, 91, 128, 181, 256)
-"""Particles along a side; from the second on each has twice those before."""
+"""Particles along a side. From the second on, each square has nearly twice as many
+particles as the one before.
+"""
 
 WAVE = 2.0 * math.pi
 
@@ -43,7 +45,11 @@ def velocity(position: Floats) -> Floats:
 
 
 def sample_positions(side: int, jitter: float) -> Floats:
-    """Return a lattice moved by up to half of ``jitter``; random points for NaN."""
+    """Return particles in the unit square, shape [particle, 2].
+
+    They are the points of a lattice, each moved at random by up to half of ``jitter``
+    spacings along each axis. Where ``jitter`` is NaN they are uniform random points.
+    """
     rng = np.random.Generator(np.random.PCG64(0))
     if math.isnan(jitter):
         return rng.random((side * side, 2))

@@ -121,7 +121,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
     Raises:
         WorkFailedError: a value cannot be drawn.
         UsageError: the split returns something else than an initial state, or one that
-            starts at another frame than the split said.
+            starts at another frame than the split said or hides a constant.
     """
     rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     module = split_module(size)
@@ -153,6 +153,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             fix="return an InitialState: docs/extending.md",
         )
     _check_values(state, f"{where}, scenario {scenario}")
+    _refuse_hidden_constants(state, size, f"{where}, scenario {scenario}")
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:
         raise UsageError(
@@ -230,6 +231,27 @@ def _check_values(state: InitialState, where: str) -> None:
                 expected=STORABLE_VALUE,
                 got=describe_value(value),
                 fix=fix,
+            )
+
+
+def _refuse_hidden_constants(state: InitialState, size: Size, where: str) -> None:
+    """Refuse a drawn parameter that files would state in place of a constant.
+
+    Our own splits are exempt. The recorded files of two of them state the draws of
+    ``wall`` and ``friction``.
+    """
+    if size.generator.split(".")[0] == "lagbench":
+        return
+    for name, value in state.parameters.items():
+        file_name = _FILE_NAMES.get(name, name)
+        if file_name in size.parameters:
+            raise UsageError(
+                "a parameter of an initial state has the name of a constant",
+                where=f"{where}, parameter {name!r}",
+                expected=f"a name that is no parameter in {place_of(size)}",
+                got=f"{describe_value(value)}, where {file_name} is "
+                f"{describe_value(size.value(file_name))}",
+                fix="rename the drawn parameter, or leave it out",
             )
 
 

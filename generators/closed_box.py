@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lagbench.data import WALLS
 from lagbench.errors import UsageError
 
-from .driver import Driver, check_program, check_undriven
+from .driver import Driver, check_no_friction, check_program, check_undriven
 from .nodal_stress import NodalStress, broken_jacobian_bounds
 from .solver import Health, Singles
 from .split import ClosedBoxParameters, InitialState
@@ -147,6 +147,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
         check_undriven(index, state)
+        check_no_friction(index, state)
         where = f"scenario {index}, wall_velocity"
         check_program(state.wall_velocity, (4, 2), where=where, has_one_row=True)
         speed_bound = self._kernels.speed_bound / 2.0

@@ -22,6 +22,7 @@ from lagbench.errors import (
     WorkFailedError,
     describe_exception,
     find_place_in_extension,
+    text_of,
 )
 
 from .draws import RandomSource, uniform
@@ -207,7 +208,7 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
                 f"{work} failed in the module of split {size.split!r}",
                 where=place,
                 expected="no exception",
-                got=f"{type(error).__name__}: {error}",
+                got=f"{type(error).__name__}: {text_of(error)}",
                 fix="mend this line of the module, or the parameters that it uses: "
                 f"{place_of(size)}",
             ) from error

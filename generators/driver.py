@@ -216,7 +216,7 @@ class Driver(ABC, Generic[Parameters]):
             expected="; ".join(broken),
             got="; ".join(broken.values()),
             fix="a smaller dt (a larger substeps_per_frame), a softer "
-            "material or smaller velocities",
+            "material, a smaller viscosity or smaller velocities",
         )
 
     def _drive(self, end: int) -> int:
@@ -237,10 +237,14 @@ class Driver(ABC, Generic[Parameters]):
         return state[:, : self.parameters.particles, : self.dimension]
 
     def _read(self, field: Field) -> Singles:
-        """Return a field of the particles, shape [scenario, particle, 4]."""
+        """Return a field of the particles that move, shape [scenario, particle, 4].
+
+        The rows behind them, of the particles that never move, are left out.
+        """
         particles = self.parameters.particles
         if self.device is not Device.CPU:
             return field.to_numpy()[:, :particles]
+        # the CPU simulates one scenario at a time
         values = np.empty((1, particles, 4), np.float32)
         _copy(field, values)
         return values
@@ -375,6 +379,23 @@ def check_undriven(index: int, state: InitialState) -> None:
                 fix=f"leave {name} out of the initial state; or return "
                 "FullBoxParameters from solver_parameters",
             )
+
+
+def check_no_friction(index: int, state: InitialState) -> None:
+    """Refuse friction of the walls, which only free surfaces have.
+
+    Raises:
+        UsageError: the friction is not 0.
+    """
+    if state.friction != 0.0:
+        raise UsageError(
+            "this solver knows no friction",
+            where=f"scenario {index}, friction",
+            expected="0",
+            got=state.friction,
+            fix="leave friction out of the initial state: no_slip of the constants "
+            "tells whether walls hold the fluid",
+        )
 
 
 def check_program(

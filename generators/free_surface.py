@@ -18,6 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.field_errors import describe_value
+from lagbench.errors import UsageError
+
 from .driver import Driver, check_undriven, stack
 from .free_surface_kernels import FreeSurfaceKernels
 from .particle_stress import ParticleStress
@@ -80,6 +83,24 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
         check_undriven(index, state)
+        if state.viscosity != 0.0:
+            raise UsageError(
+                "this solver knows no viscosity of a scenario",
+                where=f"scenario {index}, viscosity",
+                expected="0",
+                got=state.viscosity,
+                fix="leave viscosity out of the initial state: liquid_viscosity of the "
+                "constants is that of the liquid",
+            )
+        walls = np.asarray(state.wall_velocity)
+        if walls.dtype.kind not in "fiu" or walls.any():
+            raise UsageError(
+                "the walls of this solver cannot move",
+                where=f"scenario {index}, wall_velocity",
+                expected="zeros",
+                got=describe_value(state.wall_velocity),
+                fix="leave wall_velocity out of the initial state",
+            )
 
     def _start(self, states: Sequence[InitialState]) -> None:
         shape = (self.scenarios, self.parameters.particles)

@@ -12,7 +12,7 @@ from lagbench.data.box import AXES, WALL_NAMES
 from lagbench.errors import UsageError
 
 from .box_tables import LANES, Singles
-from .driver import Driver, check_program
+from .driver import Driver, check_no_friction, check_program
 from .full_box_parameters import FullBoxParameters
 from .nodal_stress import broken_jacobian_bounds
 from .nodal_stress_nd import NodalStressND
@@ -169,6 +169,7 @@ class FullBox(Driver[FullBoxParameters]):
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
+        check_no_friction(index, state)
         self._check_obstacle(index, state)
         self._check_walls(index, state)
         self._check_force(index, state)

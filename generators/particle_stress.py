@@ -262,9 +262,11 @@ class ParticleStress(FreeSurfaceKernels):
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32) -> i64:
-        """Return n of a node with its mirror images.
+        """Return the fixed-point sum n of a node and of its mirror images.
 
-        Without them a wall node would hold half a cell and a corner a quarter.
+        A node within a cell of a wall has an image. A node on the wall is its own image
+        and counts twice, in a corner four times. Otherwise it would seem to hold half a
+        cell, or in a corner a quarter.
         """
         image_i = self.image(i)
         image_j = self.image(j)

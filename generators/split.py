@@ -152,12 +152,13 @@ class InitialState:
     # area that the material covers [length^2], or its volume in a solid box
     # [length^3]; particle volume is area / particles
     area: float
-    # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
+    # kinematic viscosity nu of a full box [length^2/s]; 0 on a free surface, whose
+    # constants state that of its liquid
     viscosity: float = 0.0
     # velocity of each wall in the order of WALLS [length/s], shape [4, 2], or a program
     # of shape [frame, 4, 2]: row f acts from frame f-1 to f, counted from the first
     # substep; row 0 never acts, the last row acts from its frame on. In a solid box
-    # there are six walls and three axes.
+    # there are six walls and three axes. Zeros on a free surface.
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
     # acceleration of layers of equal height along y [length/s^2], lowest first, a
     # program of shape [frame, layer, axis] whose rows act as those of the walls; in a

@@ -189,11 +189,13 @@ def add_shifted(
 
 @ti.func
 def row_count(rows: Template, s: i32, n: i32) -> Value:
-    """Return the fixed-point sum of a node's weights, and the shifts in its sums.
+    """Return the fixed-point sum of the weights of node n, and the bits of its shifts.
 
-    A row is three nodes along the last axis, and has the number of its last node. A
-    particle adds to a row the weights of its three nodes, and a zero. Each added number
-    brings the bits of one shift, so the fourth sum of a row has only shifts.
+    A row is three nodes along the last axis, and has the number of its last node. So
+    the rows n, n + 1 and n + 2 contain node n. A particle adds to a row the weights of
+    its three nodes, and a zero. Each added number brings the bits of one shift, so the
+    fourth sum of a row has only shifts. The other sums of node n have the same shifts.
+    Their reader subtracts them.
     """
     first = rows[s, n + 2]
     second = rows[s, n + 1]

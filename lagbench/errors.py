@@ -565,12 +565,20 @@ def find_place_in_extension(error: BaseException, *modules: str) -> str | None:
     return place
 
 
+def text_of(error: BaseException) -> str:
+    """Return the text of an exception, which a class of a stranger may fail to form."""
+    try:
+        return str(error)
+    except Exception:
+        return "(its text cannot be formed)"
+
+
 def describe_exception(error: BaseException, *modules: str) -> str:
     """Return the class and the text of an exception, and its line in an extension.
 
     ``modules`` as for :func:`find_place_in_extension`.
     """
-    description = f"{type(error).__name__}: {error}"
+    description = f"{type(error).__name__}: {text_of(error)}"
     place = find_place_in_extension(error, *modules)
     if place is None:
         return description

@@ -27,7 +27,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,10 @@ class Gates:
     free_flight: float | None  # mean vertical error [g]
     settled: float | None  # mean vertical error [g]
     densest_cell: float  # over that of the truth [1]
+    # most scenarios whose single steps were measured; None in older records
+    scenarios: int | None = None
+    # most scenarios that were rolled out; None in older records
+    rollouts: int | None = None
 
     @property
     def failed(self) -> list[str]:
@@ -142,13 +146,25 @@ class StepErrors:
 
 
 @torch.no_grad()
-def predict_step(model: Baseline, window: Batch) -> tuple[Floats, Floats]:
+def predict_step(
+    model: Baseline, window: Batch, beginning: Batch
+) -> tuple[Floats, Floats]:
     """Return error and truth of the acceleration of a window's last frame.
 
     Both are in length/frame^2 and have the shape [particle, axis].
+
+    Args:
+        model: the model that predicts the last frame from the others.
+        window: frames of a scenario.
+        beginning: the given frames of the scenario. Relaxation takes its limit of
+            density from them, as in a rollout.
     """
     given = window.part(slice(window.frames - 1))
-    _, predicted = model.advance(model.start(given))
+    state = model.start(given)
+    if isinstance(model, GraphNetwork):
+        first_state = model.start(beginning)
+        state = replace(state, density_limit=first_state.density_limit)
+    _, predicted = model.advance(state)
     box = model.box.box
     frames = window.position.double().numpy()
     before = box.displacement(frames[:, -3], frames[:, -2])
@@ -169,9 +185,10 @@ def measure_steps(
     needed = max(model.history, 3)
     for path in paths:
         scenario = scenario_batch(path, viscosity=size.viscosity())
+        beginning = scenario.part(slice(size.task.input_frames))
         for last in range(needed, scenario.frames, every):
             window = scenario.part(slice(last - needed, last + 1))
-            error, truth = predict_step(model, window)
+            error, truth = predict_step(model, window, beginning)
             errors.add(error, truth, fall)
     return errors
 
@@ -240,6 +257,8 @@ def measure(
         free_flight=_mean(errors.free_flight),
         settled=_mean(errors.settled),
         densest_cell=round_digits(measure_collapse(model, paths[:rollouts], size), 4),
+        scenarios=scenarios,
+        rollouts=rollouts,
     )
 
 
@@ -274,7 +293,11 @@ def read_recorded(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    keys = {field.name for field in fields(Gates)}
+    keys = set()
+    for field in fields(Gates):
+        # older files lack the fields that have a default
+        if field.default is MISSING:
+            keys.add(field.name)
     try:
         content = json.loads(path.read_text("utf-8"))
         lines = list(map(dict, content["weights"]))
@@ -310,7 +333,9 @@ def active_rows(folder: Folder) -> list[Gates]:
     rows = []
     for line in read_recorded(folder.path / GATES):
         if line["weights_sha256"] in active_hashes:
-            measures = {field.name: line[field.name] for field in fields(Gates)}
+            measures: dict[str, Any] = {}
+            for field in fields(Gates):
+                measures[field.name] = line.get(field.name)
             rows.append(Gates(**measures))
     return rows
 

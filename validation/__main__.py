@@ -202,7 +202,10 @@ def _draw(result: ExperimentResult, path: Path) -> None:
 
 
 def round_floats(value: object) -> object:
-    """Return a JSON value with its floats cut to significant digits, NaN as null."""
+    """Return a JSON value with its floats rounded to :data:`DIGITS` significant digits.
+
+    Numbers that are not finite become null.
+    """
     if isinstance(value, float):
         return round_digits(value, DIGITS) if math.isfinite(value) else None
     if isinstance(value, dict):

@@ -209,6 +209,7 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
     Keys come from ``meta``, else from the entry that gets more seeds, else from the
     predictions.
     """
+    _refuse_two_solver_times(meta)
     if extended is not None:
         meta = _fill_from_entry(meta, extended)
     _require_possible_training(headers, meta)
@@ -258,11 +259,28 @@ def _cost_of(
     headers: Sequence[Header], meta: Meta, extended: Entry | None
 ) -> object | None:
     solver_seconds = meta.solver_seconds_per_frame
-    if extended is None:
-        return meta.cost or mean_cost(headers, solver_seconds)
     if meta.cost is not None and solver_seconds is not None:
         return meta.cost.model_copy(update={"solver_seconds_per_frame": solver_seconds})
+    if meta.cost is None and extended is None:
+        return mean_cost(headers, solver_seconds)
     return meta.cost
+
+
+def _refuse_two_solver_times(meta: Meta) -> None:
+    """Refuse a description whose cost and short form state two times of the solver."""
+    if meta.cost is None or meta.solver_seconds_per_frame is None:
+        return
+    times = {meta.cost.solver_seconds_per_frame, meta.solver_seconds_per_frame}
+    if len(times - {None}) > 1:
+        raise UsageError(
+            "the description states two times of the solver",
+            where="solver_seconds_per_frame and cost.solver_seconds_per_frame in "
+            "--from meta.yaml",
+            expected="one time, or the same in both keys",
+            got=f"{meta.solver_seconds_per_frame} and "
+            f"{meta.cost.solver_seconds_per_frame}",
+            fix="leave one of the two keys out",
+        )
 
 
 def _budget_of(

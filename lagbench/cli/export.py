@@ -40,8 +40,9 @@ def export_command(
         bool | None,
         option(
             "--from-walls/--unit-box",
-            "For lagrangebench-h5: measure positions from the lower walls or from the "
-            "corner of the unit box. Default in full boxes: the lower walls.",
+            "For lagrangebench-h5: the origin of the positions is the corner of the "
+            "lower walls, or that of the unit box, as in lagbench. Default: the walls "
+            "in full boxes, the unit box on free surfaces.",
         ),
     ] = None,
     wall_particles: Annotated[

@@ -28,6 +28,7 @@ from lagbench.errors import (
     escape_unprintable,
     explain_system_error,
     find_place_in_extension,
+    text_of,
 )
 
 from .commands import (
@@ -547,7 +548,7 @@ def _unexpected_error_message(error: Exception) -> str:
     else:
         advice = f"mend or uninstall the package of {place};"
         fix = f"{advice}\n       {debug_command} has the whole trace"
-    texts = [str(error), *getattr(error, "__notes__", ())]
+    texts = [text_of(error), *getattr(error, "__notes__", ())]
     description = escape_unprintable(", ".join(texts))
     kind = type(error).__name__
     return f"lagbench: unexpected {kind}: {description}\n  fix: {fix}"
@@ -582,24 +583,26 @@ def _output_errors() -> Iterator[None]:
         raise typer.Exit(PIPE_CLOSED) from None
     except (MemoryError, ImportError) as error:
         is_memory = isinstance(error, MemoryError)
-        if not is_memory and not any(word in str(error) for word in MEMORY_WORDS):
+        text = text_of(error)
+        if not is_memory and not any(word in text for word in MEMORY_WORDS):
             raise
         raise WorkFailedError(
             "there is not enough memory",
             where="this process",
             expected="room for the libraries and the data",
-            got=f"{type(error).__name__}: {str(error)[:200]}",
+            got=f"{type(error).__name__}: {text[:200]}",
             fix="raise the limit (`ulimit -v unlimited`, or that of the batch system), "
             "close other programs, or take fewer --workers",
         ) from error
     except RuntimeError as error:
-        if PROCESSOR_WORDS not in str(error):
+        text = text_of(error)
+        if PROCESSOR_WORDS not in text:
             raise
         raise WorkFailedError(
             "the installed NumPy cannot run on this processor",
             where="this machine",
             expected="a processor with the instructions that NumPy was built for",
-            got=" ".join(str(error).split()),
+            got=" ".join(text.split()),
             fix="install an older NumPy, which needs fewer: pip install 'numpy<2.4'",
         ) from error
     except OSError as error:

@@ -187,7 +187,11 @@ def run_command(
     ] = False,
     check: Annotated[
         bool,
-        option("--check", "Compare with the scores on the board; write nothing there."),
+        option(
+            "--check",
+            "Compare saved scores with those on the board, and write nothing there; "
+            "with --again predict anew.",
+        ),
     ] = False,
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
@@ -199,13 +203,14 @@ def run_command(
 ) -> None:
     """Score the frozen models of a season on its blind scenarios.
 
-    An interrupted run goes on where it stopped.
+    An interrupted run goes on where it stopped. Models that an earlier run has scored
+    are not predicted again.
 
     Exit code 0: done; with --check, the scores agree
-    1: with --check, the scores differ; or a model is not the frozen one
-    2: no such season
+    1: with --check, the scores differ or are missing; or a model is not the frozen one
+    2: no such season, or it waits for its value
     3: a model cannot be read
-    4: blind scenarios are missing, or not those of the season
+    4: public data or blind scenarios are missing, or not those of the season
     5: out of memory or disk
     """
     board = find_board(board, reads=check)

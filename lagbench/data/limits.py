@@ -190,7 +190,7 @@ def check_frames(
             raise ValueError(f"size {size}: frames must name every scenario once")
     for scenario, count in frame_counts:
         if not FRAMES.holds(count):
-            raise ValueError(f"{key}: expected {FRAMES}; got {count!r}")
+            raise ValueError(f"{key}: expected {FRAMES}; got {describe_value(count)}")
         for subset in SCORED_SUBSETS:
             if scenario in subsets.get(subset, ()) and count < task_frames:
                 least = f"at least input_frames + horizon = {task_frames}"

@@ -42,7 +42,7 @@ from lagbench.errors import (
 )
 
 from .box import Box, parse_periodic
-from .checksums import HASHED_SUBSETS
+from .checksums import HASHED_SUBSETS, dataset_hash
 from .field_errors import describe_expectation, describe_input, is_own_sentence
 from .grid import Grid, Placement
 from .layout import (
@@ -555,6 +555,8 @@ class Registry:
     def size(self, split: str, name: str) -> Size:
         """Return one size of a split with its merged parameters and measured values.
 
+        Values that were recorded of an older MAJOR version are left out.
+
         Raises:
             UsageError: there is no such split, or it has no such size.
         """
@@ -585,11 +587,30 @@ class Registry:
             particle_counts=entry.particle_counts,
             parameters=parameters,
             task=entry.task,
-            measured=self.measured.get(split, {}).get(name),
+            measured=self._measured_values(split, name),
             file=self.files.get(split, Path("datasets.yaml")),
             package_file=split in self.package_splits,
             draw_seed=entry.draw_seed,
         )
+
+    def _measured_values(self, split: str, name: str) -> Measured | None:
+        """Return what is recorded of a size; None where its MAJOR version is older.
+
+        The data set hash is formed with the MAJOR version, so it tells which one it is.
+        """
+        measured = self.measured.get(split, {}).get(name)
+        if measured is None:
+            return None
+        hashes = measured.subset_sha256
+        if not hashes.keys() >= set(HASHED_SUBSETS):
+            return measured
+        major = major_of(self.splits[split].version)
+        if measured.dataset_sha256 == dataset_hash(split, name, major, hashes):
+            return measured
+        for older in range(1, major):
+            if measured.dataset_sha256 == dataset_hash(split, name, older, hashes):
+                return None
+        return measured
 
 
 class _RegistryFile(_RegistryModel):
@@ -675,8 +696,9 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
 
 def _describe_plugin_error(point: EntryPoint, error: Exception) -> str:
     package = package_of(point)
-    reason = str(error)
-    if not isinstance(error, LagbenchError):
+    if isinstance(error, LagbenchError):
+        reason = str(error)
+    else:
         reason = describe_exception(error)
     return f"package {package} adds no split {point.name!r} ({point.value}): {reason}"
 

@@ -276,7 +276,7 @@ class DownloadJob:
         self._old_manifest = read_or_empty(size, root)
         self._entries: list[FileEntry] = []
         self.present: list[int] = []
-        self.missing: list[int] = []
+        self.missing: list[int] = []  # still to fetch
         meter.begin("checking", total=len(selected), scenarios=len(selected))
         for scenario in selected:
             inspected = inspect_scenario(
@@ -457,14 +457,18 @@ class DownloadJob:
         self._meter.count(byte_count)
 
     def write_manifest(self) -> Manifest:
-        """Write the manifest of what is there now; return it."""
+        """Write the manifest of the selected files that are there; return it.
+
+        Scenarios that were not selected keep their entries of the old manifest. Without
+        any entry nothing is written.
+        """
         record_entry_hashes(self.size.folder(self.root), self._entries)
-        old_entries = []
+        kept_entries = []
         for entry in self._old_manifest.files:
             if entry.scenario not in self.missing:
-                old_entries.append(entry)
-        kept_entries = tuple(old_entries)
-        old_manifest = self._old_manifest.model_copy(update={"files": kept_entries})
+                kept_entries.append(entry)
+        update = {"files": tuple(kept_entries)}
+        old_manifest = self._old_manifest.model_copy(update=update)
         manifest = merge_entries(self.size, old_manifest, self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:
             statistics = {}

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import HASHED_SUBSETS
+from lagbench.data.layout import expand_path
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
@@ -120,6 +121,9 @@ def export(
     _check_from_walls(file_format, from_walls=from_walls)
     tier, data_root, rooted_registry = locate(split, size, root=root, registry=registry)
     target = Path(output)
+    if str(output).startswith("~"):
+        # as a shell does, and as `root` does
+        target = expand_path(output, "--output")
     path_by_subset = {}
     for subset in HASHED_SUBSETS:
         path_by_subset[subset] = target / f"{subset}{ENDINGS[file_format]}"
@@ -414,11 +418,18 @@ def _write_h5(
 ) -> list[tuple[int, int]]:
     """Write one subset for LagrangeBench, whole or not at all.
 
-    Its reader takes the length of the first trajectory for all: longer runs become
-    several, and what is left over is not written. It reads chunks of one frame 5 to 10
-    times faster.
+    LagrangeBench takes the length of the first trajectory for all. So each run is cut
+    into trajectories of this length, and the frames left over are not written. Chunks
+    have one frame: LagrangeBench reads these 5 to 10 times faster than other chunks.
 
-    Returns frames and particles of each trajectory.
+    Args:
+        path: the file.
+        runs: scenarios, or their active frames.
+        length: frames of each trajectory.
+        origin: point from which positions are measured [length].
+
+    Returns:
+        Frames and particles of each trajectory.
     """
     shift = np.asarray(origin, np.float32)
     shapes: list[tuple[int, int]] = []

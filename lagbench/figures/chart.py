@@ -80,14 +80,14 @@ def linear(
 ) -> AxisScale:
     """Return a linear axis that covers a range with about so many steps.
 
-    A tight axis ends at the range, others at the next ticks. A range of rounding is
-    widened.
+    A tight axis ends at the range, others at the next ticks. If low and high differ
+    only by rounding, the range is widened to the greater magnitude of the two.
     """
     greatest = max(abs(low), abs(high))
     if not high - low > ROUNDING * greatest:
-        middle = greatest or 1.0
-        high = low + 0.5 * middle
-        low = low - 0.5 * middle
+        width = greatest or 1.0
+        high = low + 0.5 * width
+        low = low - 0.5 * width
     step = _round_up((high - low) / count)
     first = math.floor(low / step + 1e-9)
     last = math.ceil(high / step - 1e-9)

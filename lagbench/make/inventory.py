@@ -29,7 +29,7 @@ from lagbench.data.manifest import (
     Manifest,
     describe_file,
 )
-from lagbench.data.registry import Size
+from lagbench.data.registry import Size, default_path
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.data.statistics import QUANTITIES
 from lagbench.errors import DataError
@@ -475,12 +475,20 @@ def recording_hint(split: str, size_name: str, root: Path) -> list[str]:
 
 
 def _hash_error(size: Size, what: str, place: str) -> DataError:
+    fix = "see docs/determinism.md; `lagbench doctor` prints what a report needs"
+    is_ours = size.file.resolve() == default_path().resolve()
+    if not is_ours and size.draw_seed is None:
+        fix = (
+            f"if you changed the split, raise MAJOR of its version in {size.file}, "
+            "generate again, and record the new hashes with "
+            f"`python -m lagbench.generators.record` (docs/extending.md); else {fix}"
+        )
     return DataError(
         what,
         where=f"{size.split} {size.name}, {place}",
         expected=f"the hashes in {size.record_name}",
         got="other hashes",
-        fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
+        fix=fix,
     )
 
 

@@ -285,7 +285,15 @@ def free_bytes(folder: Path) -> int:
 
 
 def check_disk(root: Path, needed: int) -> None:
-    """Refuse to start a generation whose files, of so many bytes, cannot fit."""
+    """Refuse to start work whose files do not fit on the disk of the root folder.
+
+    Args:
+        root: folder of all data sets.
+        needed: bytes that a generation or a download will write.
+
+    Raises:
+        WorkFailedError: the disk has fewer free bytes.
+    """
     free = free_bytes(root)
     if free < needed:
         raise WorkFailedError(

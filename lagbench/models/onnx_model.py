@@ -143,10 +143,10 @@ class OnnxModel:
         return answer
 
     def _make_request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
-        """Return as JSON what the child process needs to roll a scenario out.
+        """Return what the child process needs to roll a scenario out, ready for JSON.
 
-        The model gets velocities of walls and forces per unit of time; files hold them
-        per frame.
+        The model gets velocities of walls and forces per unit of time, as files have
+        them. :class:`Given` has them per frame.
         """
         with read_scenario(scenario_file) as file:
             given = given_in(file, self.size, self.root)

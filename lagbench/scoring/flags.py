@@ -3,7 +3,7 @@
 ``copy_suspect``: the error moves from frame to frame as that of no rollout does.
 ``below_twin_floor``: closer to the truth than the solver itself after a perturbation of
 2^-20.
-``physics``: kinetic energy or filled area far from the truth's.
+``physics``: kinetic energy, or filled area (in space, volume), far from the truth's.
 
 The thresholds lie between honest predictions of our own splits and predictions made
 from the truth: ``python benchmarks/flag_calibration.py`` prints both, docs/scoring.md
@@ -50,7 +50,9 @@ ENERGY = (0.1, 10.0)
 """Range of kinetic energy over the truth's outside of which ``physics`` is raised."""
 
 OCCUPANCY = (0.5, 1.5)
-"""Range of filled area over the truth's outside of which ``physics`` is raised."""
+"""Range of filled area or volume over the truth's outside of which ``physics`` is
+raised.
+"""
 
 REGULAR_SHARE = 0.1
 """The predictability limit counts below this share of the RMSE of persistence."""
@@ -292,17 +294,23 @@ def judge_predictability(
     return _make_flag(name, {reason: count > 0}, evidence)
 
 
-def judge_physics(traces: Sequence[Trace]) -> Flag:
-    """Judge whether energy and filled area stay near the truth's."""
+def judge_physics(traces: Sequence[Trace], *, dimension: int = 2) -> Flag:
+    """Judge whether energy and filled area, or volume, stay near the truth's.
+
+    Args:
+        traces: those of all scenarios.
+        dimension: number of axes of the box, 2 or 3.
+    """
     predicted_motion = sum(np.sum(trace.predicted_motion) for trace in traces)
     motion = sum(np.sum(trace.motion) for trace in traces)
     energy = _ratio(predicted_motion, motion)
     occupancy = float(np.mean([np.mean(trace.occupancy) for trace in traces]))
     outside = float(np.mean([np.mean(trace.outside) for trace in traces]))
 
+    extent = "area" if dimension == 2 else "volume"
     reasons = {
         f"{energy:.2g} times the truth's kinetic energy": _is_beyond(energy, ENERGY),
-        f"the particles fill {occupancy:.2g} times the truth's area": (
+        f"the particles fill {occupancy:.2g} times the truth's {extent}": (
             _is_beyond(occupancy, OCCUPANCY)
         ),
     }

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from lagbench.errors import WorkFailedError, find_place_in_extension
+from lagbench.errors import WorkFailedError, find_place_in_extension, text_of
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import Severity, ValidationIssue, quote
@@ -61,7 +61,7 @@ def package_metric_errors() -> Iterator[None]:
         ]
         where = ", ".join(place for place in places if place)
         raise PackageMetricError(
-            name, where=where, got=quote(f"{type(error).__name__}: {error}")
+            name, where=where, got=quote(f"{type(error).__name__}: {text_of(error)}")
         ) from error
 
 

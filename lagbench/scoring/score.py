@@ -537,5 +537,5 @@ def _judge(
     return (
         judge_copying(traces),
         judge_predictability(error, persistence_error, task.predictability_limit),
-        judge_physics(traces),
+        judge_physics(traces, dimension=task.size.dimension),
     )

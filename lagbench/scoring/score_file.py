@@ -79,12 +79,13 @@ class SubmissionStatistics:
         return aggregate(metrics, self.tallies)
 
 
-def read_statistics(path: Path) -> SubmissionStatistics:
+def read_statistics(path: str | Path) -> SubmissionStatistics:
     """Read the statistics of a scores.nc.
 
     Raises:
         UnreadableFileError: it is no scores.nc.
     """
+    path = Path(path)
     try:
         with open_hdf5(path) as file:
             return statistics_in(file)

@@ -5,10 +5,10 @@ perfect, 0 means that nothing was learned, below 0 the method is worse than not
 learning.
 
 ``against_classical = score / score of the best classical solver that costs no more per
-frame``. Below 1 learning pays: at this cost no solver here is as accurate. Where every
-solver costs more, it is the ratio to the cheapest one. It keeps the rule of McGreivy
-and Hakim (Nature Machine Intelligence 6 (2024) 1256): compare at equal cost or at equal
-accuracy, and with an efficient solver.
+frame``. Learning pays if the whole interval is below 1: at this cost no solver here is
+as accurate. Where every solver costs more, it is the ratio to the cheapest one. It
+keeps the rule of McGreivy and Hakim (Nature Machine Intelligence 6 (2024) 1256):
+compare at equal cost or at equal accuracy, and with an efficient solver.
 
 The best predictor has the least mean over its own scenarios (see
 :mod:`lagbench.references`); the ratio is over the scenarios that both have.
@@ -68,8 +68,8 @@ class AgainstClassical:
 
     metric: str  # name of the ranking metric
     reference: str  # name of the classical solver
-    # score / score of that solver; below 1 learning pays, above 1 it does not unless
-    # the solver costs more
+    # score / score of that solver: learning pays if the whole interval is below 1; it
+    # does not pay if the interval is above 1 and the solver costs no more
     value: float
     interval: tuple[float, float]  # 95 %, as that of a skill
     std: float = math.nan  # sample standard deviation over seeds; NaN for one
@@ -87,7 +87,11 @@ class AgainstClassical:
 
 
 def best_reference(references: Mapping[str, Score]) -> str | None:
-    """Return the name of the reference with the least mean, None if none is above 0."""
+    """Return the name of the reference with the least mean above 0; None without one.
+
+    Less must be better. A mean of 0 or NaN does not count, because nothing can be
+    divided by it.
+    """
     means = {}
     for name, score in references.items():
         means[name] = score.mean

@@ -165,9 +165,15 @@ def fetch_archive(
         size: the data set.
         url: folder of the archive.
         requests: files to fetch, by scenario id.
-        report: receives the number of bytes that arrived and were not passed over.
+        report: receives the number of bytes that arrived. It counts all members,
+            also those that are read only to reach a later one.
         limit: most bytes of an archive.
         hint: how the user mends a store with wrong data.
+
+    Raises:
+        NotInStoreError: the store has no such archive.
+        DataError: the archive is of another data set, lacks a scenario, or has a wrong
+            member.
     """
     address = f"{url}/{archive_name(size)}"
     missing = set(requests)

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
+from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.layout import MANIFEST_NAME, format_ids, url_of
 from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
@@ -94,11 +95,20 @@ def parse_manifest(size: Size, text: bytes, *, where: str, hint: str) -> Manifes
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
+        place = where
+        expected = "a manifest.json as lagbench generate writes it"
+        got = ascii(text[:80].decode("utf-8", "replace"))
+        first_error = error.errors()[0]
+        key = ".".join(str(part) for part in first_error["loc"])
+        if key:
+            place = f"{where}, key {key[:200]!a}"
+            expected = f"{expected}, here {describe_expectation(first_error)}"
+            got = describe_input(first_error)
         raise NotDataError(
             "the store's manifest.json is no manifest of lagbench",
-            where=where,
-            expected="a manifest.json as lagbench generate writes it",
-            got=ascii(text[:80].decode("utf-8", "replace")),
+            where=place,
+            expected=expected,
+            got=got,
             fix=hint,
         ) from error
     if not manifest.is_of(size.split, size.name, size.major):

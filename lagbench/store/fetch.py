@@ -310,10 +310,12 @@ class TransferRate:
         self._seconds = 0.0
 
     def count(self, byte_count: int, seconds: float) -> None:
-        """Count bytes and the time that they took.
+        """Count bytes and the time that was spent on waiting for them.
+
+        The rate is checked after each minute of waiting. Then the count begins anew.
 
         Raises:
-            TooSlowError: too few bytes have arrived within the last minute.
+            TooSlowError: too few bytes have arrived in this minute.
         """
         self._byte_count += byte_count
         self._seconds += seconds

@@ -261,7 +261,7 @@ class FrameStore:
             split=_read_text(file, "split"),
             size=_read_text(file, "size"),
             major=major_of(_read_text(file, "version")),
-            scenario=int(np.asarray(file.attrs["scenario"]).item()),
+            scenario=self._read_id(file, scenario),
             frames=frames,
         )
         expected = _Identity(
@@ -282,6 +282,17 @@ class FrameStore:
                 got=f"{tuple(stated)}, content hash {content_hash[:16]}",
                 fix=self._repair_hint(scenario),
             )
+
+    def _read_id(self, file: h5py.File, scenario: int) -> int:
+        """Return the id that a file states; refuse what is no whole number."""
+        value = np.asarray(file.attrs["scenario"])
+        if value.size == 1 and value.dtype.kind in "iu":
+            return int(value.item())
+        raise damage_error(
+            self._paths[scenario],
+            f"attribute scenario = {ascii(value.tolist())[:80]}",
+            fix=self._repair_hint(scenario),
+        )
 
     @contextmanager
     def _damage_errors(self, scenario: int) -> Iterator[None]:

@@ -30,17 +30,24 @@ def check_split(
     info: FileInfo,
     size: Size | None,
     *,
-    unknown_size: Mapping[str, str] | None,
+    lookup_error: Mapping[str, str] | None,
     issues: IssueCollector,
 ) -> Size | None:
-    """Check that the registry has the split, size and subset of a file; return it.
+    """Return the registry's entry of the split, size and subset that a file names.
+
+    The caller has looked for the entry before, from an earlier reading of the file. So
+    only the names of split and size are compared here.
 
     Args:
         info: what the file says.
-        size: the entry of the registry of that name; None where there is none.
-        unknown_size: the parts of the error where there is none: what, where, expected,
-            got and fix.
-        issues: where an issue is added.
+        size: the entry that the caller found; None where there is none.
+        lookup_error: the parts of the caller's error (what, where, expected, got and
+            fix), which may be about the split, the size or the subset; None where the
+            caller found an entry.
+        issues: receives an issue where there is no entry.
+
+    Returns:
+        The entry, or None where there is none.
     """
     split_name = info.attributes["split"]
     size_name = info.attributes["size"]
@@ -50,9 +57,9 @@ def check_split(
     issues.complete("split")
     if size is not None and (size.split, size.name) == (split_name, size_name):
         return size
-    if unknown_size is None:
+    if lookup_error is None:
         # somebody wrote the file between the two times that it was read
-        unknown_size = {
+        lookup_error = {
             "what": "no such split and size",
             "where": "attributes 'split' and 'size'",
             "expected": "a split and size that `lagbench list` shows",
@@ -61,11 +68,11 @@ def check_split(
         }
     issues.error(
         "split",
-        unknown_size["what"],
-        where=unknown_size["where"],
-        expected=unknown_size["expected"],
-        got=unknown_size["got"],
-        fix=unknown_size["fix"],
+        lookup_error["what"],
+        where=lookup_error["where"],
+        expected=lookup_error["expected"],
+        got=lookup_error["got"],
+        fix=lookup_error["fix"],
     )
     return None
 

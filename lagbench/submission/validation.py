@@ -212,7 +212,7 @@ def _examine(
     be fetched, and that is no work for a child that reads what a stranger wrote.
     """
     names = caller(read_names, {"path": str(path)})
-    size, unknown_size = _find_size(names, registry)
+    size, lookup_error = _find_size(names, registry)
     size_json = None
     if size is not None:
         update_working_copy(size, root, size.scored_scenarios)
@@ -221,7 +221,7 @@ def _examine(
         "path": str(path),
         "root": str(root),
         "size": size_json,
-        "unknown_size": unknown_size,
+        "lookup_error": lookup_error,
         "require_truth": require_truth,
     }
     return size, caller(run_checks, request)
@@ -303,7 +303,7 @@ def run_checks(request: Request) -> Answer:
                     names[name] = value
             issues.complete("readable")
             size = check_split(
-                info, size, unknown_size=request["unknown_size"], issues=issues
+                info, size, lookup_error=request["lookup_error"], issues=issues
             )
             if _check_headers(info, size, root=root, issues=issues) and size:
                 content_hash = _check_values(

@@ -16,13 +16,19 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from lagbench.data.local import resolve_root, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
-from lagbench.errors import LagbenchError, UsageError, suggest_name
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    suggest_name,
+)
 from lagbench.work.machine import worker_count
 
 from .catalogue import ITEMS
@@ -281,9 +287,9 @@ def _needed_runs(
 ) -> list[Run]:
     """Return split, model and seed of every run that items need, seed by seed.
 
-    Models without the variant of the recipes are left out, with a note: their plain
-    recipe may take days where the variant takes minutes. A variant that no model has is
-    a mistake of the user, which the training reports.
+    Models without a recipe are left out, with a note. So are models without the variant
+    of the recipes: their plain recipe may take days where the variant takes minutes. A
+    variant that no model has is a mistake of the user, which the training reports.
     """
     needed = _needed_models(items, split)
     with_recipe = []
@@ -293,7 +299,10 @@ def _needed_runs(
     if with_recipe:
         for where, name in needed:
             if (where, name) not in with_recipe:
-                _leave_out(plan, f"{where} {plan.size} {name}", ROSTER[name].baseline)
+                model = ROSTER[name]
+                can_be_made = replace(plan, recipe=None).has_recipe(where, model)
+                what = f"{where} {plan.size} {name}"
+                _leave_out(what, plan.recipe or model.recipe, can_be_made=can_be_made)
 
     runs = []
     for seed in plan.seeds:
@@ -315,14 +324,25 @@ def _needed_studies(plan: Plan, items: Sequence[ThesisItem]) -> Iterator[str]:
         if has_variant and not (plan.recipe and has_own_recipes):
             yield study
         else:
-            _leave_out(plan, f"studies of {study}", "mlp")
+            can_be_made = plan.recipe is not None
+            _leave_out(f"studies of {study}", plan.recipe, can_be_made=can_be_made)
 
 
-def _leave_out(plan: Plan, what: str, baseline: str) -> None:
-    note(
-        f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; "
-        "without --recipe it is made"
-    )
+def _leave_out(what: str, variant: str | None, *, can_be_made: bool) -> None:
+    """Report what is left out.
+
+    Args:
+        what: a run, or a table of MLPs.
+        variant: the variant of the recipes that it does not have; None for the size's
+            own recipe.
+        can_be_made: whether it is made without the option ``--recipe``.
+    """
+    text = f"{what}: left out, it has no recipe"
+    if variant is not None:
+        text += f" {variant!r}"
+    if can_be_made:
+        text += "; without --recipe it is made"
+    note(text)
 
 
 def _head(plan: Plan, item: ThesisItem) -> str:
@@ -384,12 +404,26 @@ def _parse_seeds(text: str) -> tuple[int, ...]:
 
 
 def _print(text: str) -> None:
-    """Print a text; if the reader has left, as ``head`` does, the work goes on."""
+    """Print a text; if the reader has left, as ``head`` does, the work goes on.
+
+    Raises:
+        WorkFailedError: the text cannot be written, as on a full disk.
+    """
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:
+        # What is still in the buffer goes nowhere; else Python would complain of it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return
+        raise WorkFailedError(
+            "cannot print the results",
+            where="standard output",
+            expected="a place that can be written to",
+            got=error,
+            fix="free disk space, or send the output elsewhere",
+        ) from error
 
 
 if __name__ == "__main__":

@@ -89,9 +89,14 @@ class Plan:
         return None
 
     def has_recipe(self, split: str, model: RosterModel) -> bool:
-        """Return whether a model has the chosen variant of the recipes."""
-        if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
+        """Return whether a model has a recipe for a split, of the chosen variant.
+
+        A model that stands for a variant of the recipes has no other one.
+        """
+        if self.recipe is not None and self.recipe.endswith((".yaml", ".yml")):
             return True
+        if self.recipe is not None and model.recipe not in (None, self.recipe):
+            return False
 
         # these load torch
         from lagbench.baselines.catalogue import find
@@ -101,8 +106,13 @@ class Plan:
             names = recipe_names(find(model.baseline))
         except UsageError:  # the model cannot be loaded: training says why
             return True
-        variant = f"{self.size}-{self.recipe}"
-        return f"{split}/{variant}" in names or f"*/{variant}" in names
+        variant = self.recipe or model.recipe
+        if variant is None and not names:  # its defaults are its recipe
+            return True
+        size_name = self.size
+        if variant is not None:
+            size_name = f"{self.size}-{variant}"
+        return f"{split}/{size_name}" in names or f"*/{size_name}" in names
 
     def home(self, split: str) -> Path:
         """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import pickle
+import shutil
 import struct
 import tracemalloc
 import zipfile
@@ -33,7 +34,10 @@ from lagbench.baselines.checkpoint import (
     round_weights,
     save,
 )
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.data.manifest import read_or_empty, write_manifest
 from lagbench.data.registry import Registry
+from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 
@@ -233,6 +237,9 @@ ONE = torch.ones(1)
         ("facts", "particles", -3),
         ("facts", "radius", math.inf),
         ("facts", "statistics", "velocity_std", [math.nan, 1.0]),
+        ("facts", "statistics", "velocity_std", [1.0, 1.0, 1.0]),
+        ("facts", "statistics", "velocity_std", [1.0]),
+        ("facts", "statistics", "velocity_std", []),
         ("facts", "bounds", [[1.0, 0.0], [0.0, 1.0]]),
         ("facts", "periodic", ["z"]),
         {"optimizer": 5},
@@ -382,6 +389,34 @@ def test_the_error_for_an_unknown_baseline_names_the_file() -> None:
     with pytest.raises(UsageError) as caught:
         restore(example(), where="a.pt")
     assert caught.value.where == "a.pt"
+
+
+def test_incomplete_data_of_other_bits_have_no_hash(
+    generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Those of a machine that promises equal bits have the hash of datasets.yaml."""
+    size = load_registry().size("curl-noise", "tiny")
+    shutil.copytree(size.folder(generated.root), size.folder(tmp_path))
+    whole = read_or_empty(size, generated.root)
+    files = [entry for entry in whole.files if entry.subset != "test"]
+    hashes = {name: whole.subset_sha256[name] for name in ("train", "valid")}
+    incomplete = whole.model_copy(
+        update={
+            "complete": False,
+            "dataset_sha256": None,
+            "subset_sha256": hashes,
+            "files": tuple(files),
+        }
+    )
+    write_manifest(tmp_path, incomplete)
+    info = read_dataset_info("curl-noise", "tiny", root=tmp_path)
+    assert info.dataset_sha256 == size.measured.dataset_sha256
+
+    other_bits = incomplete.model_copy(update={"identity": "tolerance"})
+    write_manifest(tmp_path, other_bits)
+    with pytest.raises(DataError) as caught:
+        read_dataset_info("curl-noise", "tiny", root=tmp_path)
+    assert str(tmp_path) in str(caught.value.where)
 
 
 def test_data_of_another_version(

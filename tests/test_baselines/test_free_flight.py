@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import torch
+from scipy.sparse.csgraph import connected_components
 from simple_models import batch, info, network, rolled
 from torch import Tensor
 
@@ -82,6 +83,54 @@ def test_periodic_ends_link_and_are_no_walls(dimension: int) -> None:
     periodic = [True] + [False] * (dimension - 1)
     assert body_numbers(ends, periodic=periodic) == ([0, 0], [True])
     assert body_numbers(ends) == ([0, 1], [False, False])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("is_periodic", [False, True])
+@pytest.mark.parametrize("reach", [0.02, 0.05, 0.1])
+def test_bodies_are_the_components_of_all_pairs(
+    dimension: int, is_periodic: bool, reach: float
+) -> None:
+    """SciPy's distances of all pairs say so: in two blobs, and in a spray of drops."""
+    rng = np.random.default_rng(4)
+    blobs = [rng.uniform(low, low + 0.2, (150, dimension)) for low in (0.25, 0.5)]
+    spray = rng.uniform(0.0, 1.0, (60, dimension))
+    position = np.concatenate([*blobs, spray])
+    velocity = rng.normal(0.0, 0.01, position.shape)
+    box = Box.from_bounds([(0.0, 1.0)] * dimension, [is_periodic] * dimension)
+
+    next_position = position + velocity
+    if is_periodic:
+        next_position %= 1.0
+    else:
+        next_position = next_position.clip(0.0, 1.0)
+    is_linked = np.zeros((len(position), len(position)), np.bool_)
+    for each in (position, next_position):
+        difference = each[:, None] - each
+        if is_periodic:
+            difference -= np.round(difference)
+        distance = np.linalg.norm(difference, axis=2)
+        is_linked |= distance <= reach
+    count, label = connected_components(is_linked)
+
+    bodies = find_bodies(
+        torch.from_numpy(position),
+        torch.from_numpy(velocity),
+        torch.zeros(len(position), dtype=torch.int64),
+        reach=reach,
+        box=TensorBox(box),
+    )
+    assert len(bodies.flies) == count
+    assert bodies.body.tolist() == label.tolist()
+
+
+def test_no_particles_are_no_bodies() -> None:
+    """An empty window has none."""
+    box = TensorBox(Box.from_bounds([(0.0, 1.0)] * 2))
+    nothing = torch.zeros(0, 2)
+    windows = torch.zeros(0, dtype=torch.int64)
+    bodies = find_bodies(nothing, nothing, windows, reach=REACH, box=box)
+    assert len(bodies.body) == len(bodies.flies) == 0
 
 
 def free_flight(gravity: Tensor, *, dimension: int = 2) -> FreeFlight:

@@ -443,7 +443,7 @@ def test_no_such_recipe(entry: CatalogueEntry) -> None:
             "conserving",
             "--size mini or full has it",
         ),
-        (bare, "cavity", "tiny", "long", "no recipe"),
+        (bare, "cavity", "tiny", "long", "leave --recipe out"),
     ):
         with pytest.raises(UsageError, match=words):
             recipe_for(asked, split, size, variant=variant)

@@ -83,6 +83,9 @@ class Wrong(Drift):
         lambda motion: {"motion": motion.item()},
         lambda motion: {},
         lambda motion: {"motion": motion * torch.ones(3), "idle": motion},
+        lambda motion: {0: motion},
+        lambda motion: {None: motion, "idle": motion},
+        lambda motion: {"motion": motion, "total": motion},
     ],
 )
 def test_a_loss_that_nothing_is_learned_from(
@@ -90,7 +93,10 @@ def test_a_loss_that_nothing_is_learned_from(
     monkeypatch: pytest.MonkeyPatch,
     loss: Any,
 ) -> None:
-    """No dict, no gradient, several numbers, no tensor, no term."""
+    """No dict, no gradient, several numbers, no tensor, no term, or a wrong name.
+
+    A name is a text, and not that of the sum of all terms.
+    """
     monkeypatch.setattr(Wrong, "loss", staticmethod(loss))
     with pytest.raises(UsageError) as caught:
         run("wrong", "steps=2")

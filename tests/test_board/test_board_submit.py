@@ -287,6 +287,30 @@ def test_a_cost_of_predictions_that_no_entry_can_hold(
     assert f"{key}: " in str(caught.value.got)
 
 
+STATED_COST = {"seconds_per_frame": 0.125, "device": "a desktop"}
+
+
+def test_the_solvers_time_adds_to_a_stated_cost(
+    own: BoardBench, predictions: Path
+) -> None:
+    own.submit(predictions, cost=STATED_COST, solver_seconds_per_frame=0.5)
+    entry = read_entry(own.entry("my-model"))
+    assert entry.cost is not None
+    expected = {**STATED_COST, "solver_seconds_per_frame": 0.5}
+    assert entry.cost.model_dump() == expected
+
+
+@pytest.mark.usefixtures("unscored")
+def test_two_times_of_the_solver_are_refused(
+    own: BoardBench, predictions: Path
+) -> None:
+    cost = {**STATED_COST, "solver_seconds_per_frame": 0.25}
+    with pytest.raises(UsageError) as caught:
+        own.submit(predictions, cost=cost, solver_seconds_per_frame=0.5)
+    assert "solver_seconds_per_frame" in str(caught.value.where)
+    assert has_all_parts(caught.value)
+
+
 @pytest.mark.parametrize("keys", [{"kind": "naive"}, {"command": "  "}])
 def test_a_description_that_the_board_would_refuse(keys: Keys) -> None:
     """Naive predictors are references; blanks are no command."""

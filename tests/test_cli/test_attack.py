@@ -12,6 +12,7 @@ import pytest
 
 from lagbench.errors import UsageError
 from validation.attack.__main__ import choose_targets, main
+from validation.attack.running import take_snapshot
 from validation.attack.targets import Target
 
 REPOSITORY = Path(__file__).parents[2]
@@ -117,3 +118,16 @@ def test_numbers_of_an_attack_are_not_negative(
         main(["--root", str(tmp_path), "--work", str(work), *words])
     assert caught.value.code == 2
     assert not work.exists()
+
+
+def test_a_snapshot_notices_another_target_of_a_link(tmp_path: Path) -> None:
+    """Nothing behind a link is read."""
+    link = tmp_path / "link"
+    link.symlink_to("first")
+    before = take_snapshot(tmp_path)
+    assert take_snapshot(tmp_path) == before
+    link.unlink()
+    link.symlink_to("second")
+    after = take_snapshot(tmp_path)
+    assert after.keys() == before.keys()
+    assert after != before

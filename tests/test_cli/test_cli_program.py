@@ -134,6 +134,24 @@ def test_an_unexpected_error_is_short(
     assert run("list").exception is error
 
 
+class MuteError(RuntimeError):
+    """An exception whose author forgot an attribute."""
+
+    def __str__(self) -> str:
+        """Fail to return a text."""
+        return str(self.missing)  # type: ignore[attr-defined]
+
+
+def test_an_exception_without_a_text_is_named_by_its_class(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raise_in_list(MuteError(), monkeypatch)
+    result = run("list")
+    assert result.exit_code == 5
+    assert "MuteError" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 def test_an_interruption_is_no_error_to_trace(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from lagbench.data import registry
 from lagbench.data.box import Box
-from lagbench.data.limits import NEEDED, SUBSETS, Limit, check_parameters
+from lagbench.data.limits import NEEDED, SUBSETS, Limit, check_frames, check_parameters
 from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
@@ -620,6 +620,11 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
             "import no_such_module_at_all",
             "ModuleNotFoundError.*no_such_module_at_all",
         ),
+        (
+            "mute",
+            "class Mute(Exception): __str__ = lambda self: self.missing\nraise Mute",
+            "Mute",
+        ),
         ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "/nowhere/datasets.yaml"),
         ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
         ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
@@ -744,3 +749,23 @@ def test_an_integer_beyond_every_float_is_no_finite_number() -> None:
     with pytest.raises(ValueError, match=r"sizes\.tiny.*grid") as caught:
         check_parameters("tiny", values | {"grid": huge}, declared)
     assert len(str(caught.value)) < 200
+    with pytest.raises(ValueError, match=r"sizes\.tiny\.frames") as caught:
+        check_frames("tiny", huge, {"train": (0,)}, task_frames=4)
+    assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("version", "is_compared"),
+    [("2.1.0", True), ("2.9.0", True), ("3.0.0", False), ("7.0.0", False)],
+)
+def test_hashes_of_an_older_major_version_do_not_count(
+    version: str, is_compared: bool, tmp_path: Path
+) -> None:
+    """The author of a split has raised MAJOR, and has not recorded new hashes yet."""
+    text = default_path().read_text()
+    head, rest = text.split("  cavity:\n    version: 2.1.0\n", 1)
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"{head}  cavity:\n    version: {version}\n{rest}")
+    loaded = load(path)
+    assert (loaded.size("cavity", "tiny").measured is not None) == is_compared
+    assert loaded.size("fluid", "tiny").measured is not None

@@ -644,3 +644,18 @@ def test_statistics_of_another_form_stop_the_export(
         )
     assert "curl-noise tiny" in str(caught.value.where)
     assert not output.exists()
+
+
+def test_a_folder_below_home_is_that_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No folder of the name ~ is made; the root folder may be named so too."""
+    home = tmp_path / "home"
+    (home / "export").mkdir(parents=True)
+    (home / "export" / "notes.txt").touch()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError) as caught:
+        export("cavity", "tiny", format="gns-npz", output="~/export", root="~/no-data")
+    assert caught.value.where == str(home / "export")
+    assert not (tmp_path / "~").exists()

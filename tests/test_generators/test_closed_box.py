@@ -388,8 +388,9 @@ def test_states_outside_the_bounds_are_refused() -> None:
                 centre=(0.5, 0.5), radius=0.1, position=np.zeros((0, 2))
             )
         },
+        {"friction": 0.1},
     ],
-    ids=["force", "stream", "obstacle"],
+    ids=["force", "stream", "obstacle", "friction"],
 )
 def test_what_the_solver_has_not_is_refused(driving: dict[str, Any]) -> None:
     """The file would state a force that never acted."""
@@ -398,6 +399,15 @@ def test_what_the_solver_has_not_is_refused(driving: dict[str, Any]) -> None:
         loaded(NO_SLIP, [state])
     (name,) = driving
     assert caught.value.where == f"scenario 0, {name}"
+
+
+def test_a_blow_up_names_the_viscosity_among_its_causes() -> None:
+    """Of nu dt / dx^2 = 10, explicit diffusion grows without bound."""
+    viscosity = 10.0 / (NO_SLIP.dt * NO_SLIP.grid**2)
+    solver = loaded(NO_SLIP, [scenario(NO_SLIP, speed=0.1, viscosity=viscosity)])
+    with pytest.raises(WorkFailedError) as caught:
+        solver.advance(100)
+    assert "viscosity" in str(caught.value.fix)
 
 
 @pytest.mark.parametrize(

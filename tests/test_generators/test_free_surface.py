@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -292,6 +293,27 @@ def test_states_that_do_not_fit_are_refused() -> None:
     with pytest.raises(UsageError) as caught:
         solver.load([forced])
     assert caught.value.where == "scenario 0, body_force"
+
+
+@pytest.mark.parametrize(
+    "unused",
+    [
+        {"viscosity": 1e-3},
+        {"wall_velocity": np.full((4, 2), 0.1)},
+        {"wall_velocity": np.full((3, 4, 2), 0.1)},
+        {"wall_velocity": "slow"},
+    ],
+    ids=["viscosity", "walls", "program of walls", "text"],
+)
+def test_what_the_solver_does_not_read_is_refused(unused: dict[str, Any]) -> None:
+    """The state would state a motion, or a viscosity, that never acted."""
+    solver = start(CONSTANTS, [ball(Material.LIQUID)])
+    state = dataclasses.replace(ball(Material.LIQUID), **unused)
+    with pytest.raises(UsageError) as caught:
+        solver.load([state])
+    (name,) = unused
+    assert caught.value.where == f"scenario 0, {name}"
+    assert caught.value.fix
 
 
 def test_courant_numbers_by_hand() -> None:

@@ -90,6 +90,16 @@ def test_a_program_that_is_none_is_refused(name: str, program: object) -> None:
     solver.close()
 
 
+def test_friction_is_refused() -> None:
+    """Walls of a full box hold the fluid or let it slide; none has friction."""
+    state = dataclasses.replace(mixed_state(), friction=0.1)
+    solver = FullBox(constants(MIXED_BOX, MIXED_COUNTS, force_layers=2))
+    with pytest.raises(UsageError) as caught:
+        solver.load([state])
+    assert caught.value.where == "scenario 0, friction"
+    solver.close()
+
+
 def test_positions_may_be_lists() -> None:
     """As velocities may."""
     state = mixed_state()

@@ -32,6 +32,17 @@ Install = Callable[..., Path]
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "dam_break" / "dam_break"
 SOURCE = (EXAMPLE / "__init__.py").read_text()
 
+MUTE = """class Mute(Exception):
+    def __str__(self):
+        return self.missing
+
+
+def fail():
+    raise Mute
+
+
+GAP = 0.01"""
+
 WIDTH = "uniform(rng, 0.2, 0.4)"
 HEIGHT = '"height": height'
 CONSTANTS = "constants(FreeSurfaceParameters, size)"
@@ -75,6 +86,17 @@ def test_an_exception_of_initial_state_names_file_and_line(
     assert caught.value.where == line_of(module_file, change)
     assert str(caught.value.got).startswith(f"{kind}: ")
     assert "Traceback" not in str(caught.value)
+
+
+def test_an_exception_without_a_text_is_named_by_its_class(package: Install) -> None:
+    """Its author forgot an attribute; ours is no error about this."""
+    size, module_file = own_size(package, "GAP = 0.01", MUTE)
+    source = module_file.read_text()
+    module_file.write_text(source.replace(WIDTH, "fail()"))
+    with pytest.raises(WorkFailedError) as caught:
+        draw_initial_state(size, 3)
+    assert caught.value.where == line_of(module_file, "raise Mute")
+    assert "Mute" in str(caught.value.got)
 
 
 @pytest.mark.parametrize("bound", ["float('nan')", "1e9"])
@@ -263,6 +285,29 @@ def test_a_value_that_cannot_be_stored_is_refused_as_it_is_drawn(
     assert str(caught.value.where).startswith("mine.initial_state, scenario 3")
     parts = (caught.value.expected, caught.value.got, caught.value.fix)
     assert None not in parts
+
+
+@pytest.mark.parametrize("name", ["gravity", "density", "wall"])
+def test_a_drawn_parameter_cannot_hide_a_constant(name: str, package: Install) -> None:
+    """The file would state the draw in place of the constant, which acted."""
+    size, _ = own_size(package, HEIGHT, f'"{name}": height')
+    assert name in size.parameters
+    with pytest.raises(UsageError) as caught:
+        draw_initial_state(size, 3)
+    assert caught.value.where == f"mine.initial_state, scenario 3, parameter {name!r}"
+    assert caught.value.fix
+
+
+def test_a_drawn_parameter_cannot_hide_a_constant_by_its_name_in_files(
+    package: Install,
+) -> None:
+    """Files call the drawn ``reynolds`` by another name."""
+    size, _ = own_size(package, HEIGHT, '"reynolds": height')
+    draw_initial_state(size, 3)
+    constant = size.parameters["gravity"]
+    parameters = {**size.parameters, "reynolds_number": constant}
+    with pytest.raises(UsageError):
+        draw_initial_state(size.model_copy(update={"parameters": parameters}), 3)
 
 
 def test_parameters_of_our_own_splits_are_blamed_on_the_registry(

@@ -193,6 +193,35 @@ def test_changed_bits_need_another_version(
     )
 
 
+def test_a_new_major_version_is_recorded_in_place_of_the_old_one(
+    copied: Callable[[], Path],
+    registry: Path,
+    generated: GenerationResult,
+) -> None:
+    """Nothing is allowed that the version does not tell."""
+    assert run(generated.root, registry) == 0
+    text = registry.read_text()
+    old_version = load(registry).size(SPLIT, SIZE).version
+    place = f"  {SPLIT}:\n    version: "
+    assert text.count(f"{place}{old_version}") == 1
+    registry.write_text(text.replace(f"{place}{old_version}", f"{place}3.0.0"))
+
+    root = copied()
+    folder = root / SPLIT / SIZE
+    (folder / "v2").rename(folder / "v3")
+    path = folder / "v3" / "manifest.json"
+    content = json.loads(path.read_text())
+    new_hash = "3" * 64
+    content |= {"version": "3.0.0", "dataset_sha256": new_hash}
+    path.write_text(json.dumps(content))
+    assert run(root, registry) == 0
+    released = json.loads((registry.parent / "released.json").read_text())
+    assert released == {
+        f"{SPLIT}/{SIZE}/v2": generated.dataset_sha256,
+        f"{SPLIT}/{SIZE}/v3": new_hash,
+    }
+
+
 def test_incomplete_or_changed_data_are_not_recorded(
     copied: Callable[[], Path],
     registry: Path,

@@ -21,11 +21,12 @@ from typer.testing import CliRunner
 
 from lagbench.cli.program import app
 from lagbench.data.manifest import Manifest, read_manifest
-from lagbench.data.registry import Registry, load
+from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.generators.record import measured_values, replace_measured
 from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.inventory import compare_hashes
 from lagbench.make.verify import VerificationResult, evenly_spaced, verify
 
 Copy = Callable[[], Path]
@@ -322,6 +323,23 @@ def test_the_data_set_hash_is_compared_too(
     with pytest.raises(DataError) as caught:
         result.check()
     assert caught.value.where.endswith("curl-noise/tiny/v2")
+
+
+def test_other_hashes_of_a_changed_split_say_how_to_record_new_ones(
+    generated: GenerationResult, measured: Registry, tmp_path: Path
+) -> None:
+    """Whoever describes a split may have changed it; nobody changes ours."""
+    manifest = manifest_of(generated.root)
+    wrong = told_otherwise(measured, scenario_sha256={2: "0" * 16})
+    ours = wrong.size(SPLIT, SIZE).model_copy(update={"file": default_path()})
+    own_file = tmp_path / "datasets.yaml"
+    own = ours.model_copy(update={"file": own_file})
+    for size, is_own in ((own, True), (ours, False)):
+        with pytest.raises(DataError) as caught:
+            compare_hashes(size, manifest, promised=[2])
+        fix = str(caught.value.fix)
+        assert ("generators.record" in fix) == is_own
+        assert (str(own_file) in fix) == is_own
 
 
 def test_strangers_and_a_lying_manifest_are_warnings(

@@ -224,6 +224,10 @@ def test_a_wrong_area_raises_the_flag() -> None:
     wide = replace(trace, occupancy=2.0 * trace.occupancy)
     flag = judge_physics([wide])
     assert "area" in flag.reasons[0]
+    in_space = judge_physics([wide], dimension=3)
+    assert in_space.raised
+    assert "volume" in in_space.reasons[0]
+    assert "area" not in in_space.reasons[0]
 
 
 def one_step(truth: Floats, n: int, h: int) -> Floats:

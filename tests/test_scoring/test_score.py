@@ -577,6 +577,26 @@ def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) ->
     assert "package" not in str(caught.value)
 
 
+class MuteError(Exception):
+    """An exception whose author forgot an attribute."""
+
+    def __str__(self) -> str:
+        """Fail to return a text."""
+        return str(self.missing)  # type: ignore[attr-defined]
+
+
+def test_an_own_metric_may_raise_an_exception_without_a_text(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    def broken(pair: FramePair) -> float:
+        raise MuteError
+
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    with pytest.raises(WorkFailedError, match="broken") as caught:
+        bench.evaluate(path, metrics=[broken])
+    assert "MuteError" in str(caught.value.got)
+
+
 @pytest.mark.parametrize("metrics", ["vorticity_rmse", ["vorticity_rmse"]])
 def test_a_built_in_metric_needs_no_argument(
     bench: ScoreBench, tmp_path: Path, metrics: object

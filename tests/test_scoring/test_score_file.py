@@ -155,7 +155,7 @@ def test_six_scenarios_of_598_frames_take_300_kb(
     write_statistics(large, path)
     assert 200_000 < path.stat().st_size <= MAX_BYTES
 
-    statistics = read_statistics(path)
+    statistics = read_statistics(str(path))
     metrics = select(statistics.tallies[54].names)
     expected = aggregate(metrics, large.tallies[SUBMISSION])
     scores = statistics.scores()

@@ -319,6 +319,23 @@ def test_a_wrong_manifest_is_refused(
     assert set(tmp_path.rglob("manifest.json")) == before
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "place"),
+    [("comlete", True, "comlete"), ("files", [{"scenario": "x"}], "files.0.scenario")],
+)
+def test_the_wrong_key_of_a_stores_manifest_is_named(
+    key: str, value: object, place: str
+) -> None:
+    """Whoever serves the address can mend it."""
+    size = load().size(SPLIT, SIZE)
+    content = {"split": SPLIT, "size": SIZE, "version": size.version, key: value}
+    text = json.dumps(content).encode()
+    with pytest.raises(NotDataError) as caught:
+        copy.parse_manifest(size, text, where="s3://a/manifest.json", hint="mend it")
+    assert place in str(caught.value.where)
+    assert "s3://a/manifest.json" in str(caught.value.where)
+
+
 def test_a_terminal_shows_the_progress(
     url: str,
     tiny: Registry,

@@ -1021,6 +1021,17 @@ def test_a_scenario_under_another_id_is_refused(tmp_path: Path, train: Open) -> 
     assert isinstance(data[60], Window)
 
 
+@pytest.mark.parametrize("stated", ["abc", "0", 0.5, math.nan, [0, 0]])
+def test_an_id_that_is_no_whole_number_is_damage(
+    stated: object, tmp_path: Path, train: Open
+) -> None:
+    """The error names the attribute."""
+    folder = write_train(tmp_path)
+    with h5py.File(folder / "0000.nc", "r+") as file:
+        file.attrs["scenario"] = stated
+    assert_data_error(train(tmp_path), 0, "attribute scenario")
+
+
 def test_there_is_no_window_beyond_the_last(train: Open) -> None:
     with pytest.raises(IndexError):
         train()[WINDOWS]

@@ -6,13 +6,17 @@ import importlib
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from score_bench import ScoreBench, still
 
+from benchmarks import free_flight, inference_cost, table_3_1
 from benchmarks.naive_attempts import measured_frames
 from lagbench.data.registry import load
+from lagbench.errors import UsageError
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -37,6 +41,7 @@ def run_script(words: str, *arguments: object) -> subprocess.CompletedProcess[st
         "flag_calibration --size tiny --splits cavity",
         "operator_recipes --size tiny --split cavity",
         "naive_attempts --split fluid",
+        "free_flight",
     ],
 )
 def test_missing_data_are_named_with_their_remedy(words: str, tmp_path: Path) -> None:
@@ -56,6 +61,8 @@ def test_missing_data_are_named_with_their_remedy(words: str, tmp_path: Path) ->
         ("operator_recipes --operator gsn --root . --split cavity", "gns"),
         ("scaling_plan --rows 12", "9"),
         ("scaling_plan --rows x", "9"),
+        ("table_3_1 --rows x", "9"),
+        ("references --data cavity", "cavity/full"),
         ("solver_against --against no-commit", "no-commit"),
         ("solver_against --against HEAD --rounds 0", "rounds"),
     ],
@@ -76,6 +83,37 @@ def test_the_plan_is_made_from_the_largest_row_in_any_order(
     script = importlib.import_module("scaling_plan")
     rows = script.read_rows("4,2,4")
     assert [row.q for row in rows] == [2, 4]
+
+
+@pytest.mark.parametrize("script", [table_3_1, inference_cost])
+def test_rows_are_those_from_the_first_to_the_last(script: ModuleType) -> None:
+    """Others are refused before the files of earlier measurements are replaced."""
+    assert len(script.read_rows("2")) == 1
+    assert len(script.read_rows("1-4")) == 4
+    for text in ("0", "4-1", "1-", "-1", "", "1,2", "one"):
+        with pytest.raises(UsageError) as caught:
+            script.read_rows(text)
+        assert caught.value.where == "--rows"
+    with pytest.raises(UsageError):
+        table_3_1.read_rows("20")
+
+
+def test_one_row_has_no_slope(tmp_path: Path) -> None:
+    """No line is drawn, and NumPy does not warn of a fit."""
+    row = table_3_1.THESIS[1]
+    timed = table_3_1.TimedRow(row=row, substep_ms=1.0, frame_ms=20.0)
+    path = tmp_path / "one.png"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table_3_1.draw([timed], "cpu", path)
+    assert path.stat().st_size > 0
+
+
+def test_bodies_that_do_not_fly_have_no_error() -> None:
+    """A 0 would say that they move exactly with gravity."""
+    assert float(free_flight.describe_mean(3.0, 2)) == 1.5
+    text = free_flight.describe_mean(0.0, 0)
+    assert not any(character.isdigit() for character in text)
 
 
 def test_predictions_of_another_data_set_are_refused(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from model_board import NAME, PATH, ModelBoard
+from simple_models import batch, network
 
 from lagbench.baselines.checkpoint import load, save
 from lagbench.board.folder import Folder
@@ -22,6 +23,7 @@ from studies.gates import (
     board_weights,
     count_densest,
     main,
+    predict_step,
     read_recorded,
     to_json,
     to_markdown,
@@ -52,6 +54,26 @@ def test_the_bias_is_that_of_windows_in_free_flight_or_at_rest() -> None:
     errors.add(error, 3.0 * falling, -GRAVITY)
     assert errors.free_flight == pytest.approx([-0.4])
     assert errors.settled == pytest.approx([-0.2])
+
+
+def test_relaxation_of_a_step_has_the_limit_of_a_rollout() -> None:
+    """Dense matter beside a spray stays, if it was as dense in the beginning."""
+    model = network(radius=0.03, relaxation=3, densest=1.2)
+    axis = np.linspace(0.2, 0.38, 10)
+    block = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    spray = np.random.default_rng(0).uniform(0.5, 0.9, (100, 2))
+    beginning = np.concatenate([block, block + np.array([0.0, 0.4])])
+    later = np.concatenate([block, spray])
+    rest = np.repeat(later[None], model.history + 1, axis=0)
+    given = batch(np.repeat(beginning[None], 2, axis=0))
+
+    error, truth = predict_step(model, batch(rest), given)
+    assert not truth.any()
+    assert np.abs(error[:100]).max() < 1e-6
+
+    of_later = batch(rest[:2])
+    disturbed, _ = predict_step(model, batch(rest), of_later)
+    assert np.abs(disturbed[:100]).max() > 1e-3
 
 
 def test_the_fullest_cell_is_counted() -> None:
@@ -97,6 +119,35 @@ def test_what_is_recorded_of_other_weights_stays(tmp_path: Path) -> None:
     first, second = read_recorded(path)
     assert first["one_step"] == 0.5
     assert second["method"] == "gns_1"
+
+
+def test_the_numbers_of_scenarios_are_recorded(tmp_path: Path) -> None:
+    """Whoever measures again knows on how many; older lines do not state them."""
+    path = tmp_path / "gates.json"
+    measured = replace(GATES, scenarios=8, rollouts=4)
+    older = replace(GATES, method="gns_1")
+    lines = json.loads(to_json([older]))["weights"]
+    for line in lines:
+        del line["scenarios"], line["rollouts"]
+    path.write_text(to_json([measured], recorded=lines))
+    first, second = read_recorded(path)
+    assert (first["scenarios"], first["rollouts"]) == (8, 4)
+    assert "scenarios" not in second
+    assert to_markdown([measured]) == to_markdown([GATES])
+
+
+def test_older_measures_are_printed(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They do not state on how many scenarios they were made."""
+    entry = yaml.safe_load((board / PATH).read_text())
+    digest = entry["predictions"][0]["weights"]["sha256"]
+    row = replace(GATES, weights_sha256=digest)
+    content = json.loads(to_json([row]))
+    for line in content["weights"]:
+        del line["scenarios"], line["rollouts"]
+    assert recorded(board, content) == 0
+    assert capsys.readouterr().out == to_markdown([row])
 
 
 def weights_of(board: Path) -> list[Path]:

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 
 from lagbench.baselines import catalogue
 from lagbench.data.registry import Registry
-from lagbench.errors import UsageError
+from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score_file import read_statistics
 from studies.thesis import __main__ as command
@@ -29,6 +31,7 @@ pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 Reproduce = Callable[..., int]
 
 SPLIT = "curl-noise"
+REPOSITORY = Path(__file__).parents[2]
 
 ONLY = ("--only", "fig_5_22")
 """A figure that needs one run, of SuperGAT."""
@@ -277,6 +280,55 @@ def test_plans_for_full_are_listed_without_data(
     assert "studies of table_4_2\n" in output.out
     assert "lagbench generate --split fluid --size full" in output.err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("recipe", [(), ("--recipe", "short")])
+def test_models_without_a_recipe_for_the_size_are_left_out(
+    recipe: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At full curl noise has recipes for neither the plain VAR nor the unrolled GNS."""
+    words = [
+        *("--size", "full"),
+        *("--split", SPLIT),
+        *("--root", str(tmp_path)),
+        *("--runs", str(tmp_path / "runs")),
+        "--dry-run",
+    ]
+    assert command.main([*words, *recipe]) == 0
+    output = capsys.readouterr()
+    assert line_of("curl-noise full gns-0", output.out)
+    for name in ("var", "gns-unrolled"):
+        assert "left out" in line_of(f"curl-noise full {name}", output.err)
+        assert f"{name}-0" not in output.out
+
+
+def test_a_variant_is_not_trained_in_the_place_of_another_one(tmp_path: Path) -> None:
+    """The unrolled GNS has a recipe of its own, and no other one."""
+    plan = Plan(size="mini", root=tmp_path, runs=tmp_path, output=tmp_path)
+    unrolled = ROSTER["gns-unrolled"]
+    assert plan.has_recipe(SPLIT, unrolled)
+    assert replace(plan, recipe="unrolled").has_recipe(SPLIT, unrolled)
+    assert not replace(plan, recipe="pushforward").has_recipe(SPLIT, unrolled)
+    assert replace(plan, recipe="pushforward").has_recipe(SPLIT, ROSTER["gns"])
+
+
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="the system has no full device"
+)
+def test_a_full_disk_is_an_error_with_a_message() -> None:
+    """It has the exit code of work that failed."""
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "studies.thesis", "--list"],
+            cwd=REPOSITORY,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == WorkFailedError.exit_code
+    assert done.stderr.startswith("error: ")
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.slow

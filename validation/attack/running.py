@@ -145,7 +145,10 @@ def _exit_code(error: SystemExit) -> int:
 
 
 def take_snapshot(folder: Path) -> dict[str, str]:
-    """Return what lies below a folder: a text for each path, links not followed."""
+    """Return what lies below a folder: a text for each path.
+
+    Links are not followed; the text of a link has its target.
+    """
     snapshot = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -159,6 +162,8 @@ def take_snapshot(folder: Path) -> dict[str, str]:
                 text += f" {hashlib.sha256(path.read_bytes()).hexdigest()}"
             else:
                 text += f" {status.st_mtime_ns}"
+        elif stat.S_ISLNK(kind):
+            text += f" {os.readlink(path)}"
         snapshot[name] = text
     return snapshot
 
