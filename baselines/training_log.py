@@ -72,7 +72,11 @@ class TrainingLog:
     def time_validation(
         self, processes: int = 1, *, device: str = "cpu"
     ) -> Iterator[None]:
-        """Add the processor time of a validation, for which all processes wait."""
+        """Add the processor time of the ``with`` block as that of a validation.
+
+        One process validates, and the others wait. The time of each counts
+        (:meth:`read_clocks`). It is part of ``cpu_seconds`` too.
+        """
         self.read_clocks(processes, device=device)
         before = self.cpu_seconds
         yield

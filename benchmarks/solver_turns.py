@@ -56,7 +56,7 @@ class Side:
     def __init__(self, tree: Path, split: str, size: str) -> None:
         core = min(os.sched_getaffinity(0))
         command = [sys.executable, __file__, "--serve", split, "--size", size]
-        # HERE lends only this script: lagbench comes from the tree.
+        # Both sides run the benchmark scripts of HERE; lagbench comes from the tree.
         self._process = subprocess.Popen(
             command,
             cwd=tree,

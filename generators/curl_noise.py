@@ -12,8 +12,8 @@ hence no flow crosses them; u_x + v_y = 0 holds to the bit. The equations have n
 viscosity, the transfers have: larger vortices live longer, about three quarters of the
 energy is left after 600 frames at frequency 4 of full, a few per cent at 13.
 
-The subset ``shift`` lies outside train on purpose: its scenarios alternate between a
-frequency below all of train and one above.
+The subset ``shift`` of mini and full lies outside train on purpose: its scenarios
+alternate between a frequency below all of train and one above.
 """
 
 from __future__ import annotations

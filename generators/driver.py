@@ -43,7 +43,8 @@ class Field(Protocol):
 class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
-    x: Field  # particle positions [length], filled up with zeros
+    # particle positions [length]; in full boxes the last component is the largest -J
+    x: Field
     particle_state: Field  # what particles spread, the velocity first
     particle_volume: Field  # m / (rho dx^d), shape [scenario]
     speed_bound: float  # the CFL bound dx/dt [length/s]

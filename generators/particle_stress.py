@@ -422,7 +422,11 @@ class ParticleStress(FreeSurfaceKernels):
 
     @ti.kernel
     def restart_extremes(self) -> Nothing:
-        """Start an advance: the extremes are those of the present state."""
+        """Start an advance: the extremes are those of the present state.
+
+        They are the speed, the least J and the largest J of a particle. Its reach, the
+        fourth one, is 0 until it moves.
+        """
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, self.particles):
             state = self.particle_state[s, p]

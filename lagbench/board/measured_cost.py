@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
+from lagbench.errors import LagbenchError
 from lagbench.references.predictor import Given, Kind, ReferencePredictor, given_in
 from lagbench.references.table import references_of
 from lagbench.scoring.task import ScoredTask
@@ -68,9 +69,12 @@ def measure_costs(
     root: Path,
     time_solver: TimeSolver | None,
     meter: Meter,
+    keep_failure: Callable[[Entry, LagbenchError], None],
     repeats: int = REPEATS,
 ) -> list[tuple[Entry, MeasuredCost]]:
     """Return the cost of a frame for entries of one data set.
+
+    An entry whose model fails has no cost.
 
     Args:
         timed: entries of one split and size, with their models.
@@ -78,6 +82,7 @@ def measure_costs(
         root: folder of all data sets.
         time_solver: function that returns the solver's time; None leaves it out.
         meter: counts the rows that are timed.
+        keep_failure: receives an entry whose model fails, and the error.
         repeats: turns of every row.
     """
     size = task.size
@@ -91,6 +96,7 @@ def measure_costs(
         if not reference.reads_train:
             references.append(reference)
 
+    running = list(timed)
     rounds: list[dict[str, float]] = []
     row_count = len(timed) + len(references) + 1
     meter.begin(
@@ -106,14 +112,20 @@ def measure_costs(
         for reference in references:
             seconds[f"reference {reference.name}"] = time_reference(reference, given)
             meter.count(1)
-        for one in timed:
-            frames = min(TIMED_FRAMES, task.config.horizon)
-            seconds[f"model {one.entry.method}"] = one.runner.time(path, frames)
+        frames = min(TIMED_FRAMES, task.config.horizon)
+        for one in tuple(running):
+            try:
+                frame_seconds = one.runner.time(path, frames)
+            except LagbenchError as error:
+                keep_failure(one.entry, error)
+                running.remove(one)
+            else:
+                seconds[f"model {one.entry.method}"] = frame_seconds
             meter.count(1)
         rounds.append(seconds)
 
     least = {}
-    for name in rounds[0]:
+    for name in rounds[-1]:
         least[name] = round_digits(min(row[name] for row in rounds), DIGITS)
     kinds: dict[Kind, dict[str, float]] = {Kind.CLASSICAL: {}, Kind.NAIVE: {}}
     for reference in references:
@@ -121,7 +133,7 @@ def measure_costs(
             least[f"reference {reference.name}"], 1e-7
         )
     costs = []
-    for one in timed:
+    for one in running:
         cost = MeasuredCost(
             machine=describe_processor(),
             date=today(),

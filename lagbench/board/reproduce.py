@@ -189,7 +189,7 @@ def reproduce(
                 path = entry.yaml_path.as_posix()
                 run.result.failures.append(Failure(entry=path, error=error))
     if costs:
-        run.measure_frame_costs(chosen, time_solver)
+        run.measure_frame_costs(chosen, time_solver, is_named=is_named)
     for entry in chosen:
         line = run.line_of(entry)
         if line is not None:
@@ -364,9 +364,9 @@ class _Reproduction:
         def change(line: Verification) -> Verification:
             return with_reproduction(line, reproduction, seeds=len(entry.predictions))
 
-        self._change(entry, change)
+        self._change_line(entry, change)
 
-    def _change(
+    def _change_line(
         self, entry: Entry, change: Callable[[Verification], Verification]
     ) -> None:
         """Change the verification of an entry: in verified.yaml, or without recording
@@ -383,7 +383,11 @@ class _Reproduction:
         self._lines[entry.yaml_path.as_posix()] = change(line)
 
     def measure_frame_costs(
-        self, entries: Sequence[Entry], time_solver: TimeSolver | None
+        self,
+        entries: Sequence[Entry],
+        time_solver: TimeSolver | None,
+        *,
+        is_named: bool,
     ) -> None:
         """Measure what a frame costs each model on the data sets of some entries.
 
@@ -400,8 +404,14 @@ class _Reproduction:
             for entry in named:
                 if entry not in group:
                     group.append(entry)
-            if self.again or not self._have_costs_of_one_run(group):
+            if not self.again and self._have_costs_of_one_run(group):
+                continue
+            try:
                 self._measure_costs_of_data_set(group, time_solver)
+            except LagbenchError as error:
+                if is_named:
+                    raise
+                self._keep_failure(named[0], error)
 
     def _have_costs_of_one_run(self, entries: Sequence[Entry]) -> bool:
         costs = []
@@ -415,11 +425,17 @@ class _Reproduction:
     def _measure_costs_of_data_set(
         self, entries: Sequence[Entry], time_solver: TimeSolver | None
     ) -> None:
+        """Time the models of entries of one data set in one run, and keep the costs.
+
+        The first model of an entry that opens is timed. An entry without such a model,
+        or whose model fails, gets no cost; the result has its error. Costs go to
+        verified.yaml, or stay in memory if nothing is recorded.
+        """
         timed = []
         opened: list[Runner] = []
         try:
             for entry in entries:
-                runner = self._open_first_model(entry)
+                runner = self._open_a_model(entry)
                 if runner is not None:
                     opened.append(runner)
                     timed.append(TimedEntry(entry=entry, runner=runner))
@@ -427,16 +443,21 @@ class _Reproduction:
                 return
             task = self._task(entries[0])
             costs = measure_costs(
-                timed, task, root=self.root, time_solver=time_solver, meter=self.meter
+                timed,
+                task,
+                root=self.root,
+                time_solver=time_solver,
+                meter=self.meter,
+                keep_failure=self._keep_failure,
             )
         finally:
             for runner in opened:
                 runner.close()
         for entry, cost in costs:
-            self._change(entry, partial(_with_cost, cost=cost))
+            self._change_line(entry, partial(_with_cost, cost=cost))
             self.result.measured.append("/".join(entry.place))
 
-    def _open_first_model(self, entry: Entry) -> Runner | None:
+    def _open_a_model(self, entry: Entry) -> Runner | None:
         """Return the first model of an entry that can be opened, None without one.
 
         The first error is kept in the result.
@@ -453,11 +474,15 @@ class _Reproduction:
                     registry=self.registry,
                 )
             except LagbenchError as error:
-                path = entry.yaml_path.as_posix()
-                failed = {failure.entry for failure in self.result.failures}
-                if path not in failed:
-                    self.result.failures.append(Failure(entry=path, error=error))
+                self._keep_failure(entry, error)
         return None
+
+    def _keep_failure(self, entry: Entry, error: LagbenchError) -> None:
+        """Keep the first error of an entry in the result."""
+        path = entry.yaml_path.as_posix()
+        failed = {failure.entry for failure in self.result.failures}
+        if path not in failed:
+            self.result.failures.append(Failure(entry=path, error=error))
 
 
 def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:

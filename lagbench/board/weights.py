@@ -222,9 +222,14 @@ def _require_known_settings(file: WeightsFile, settings: Sequence[str]) -> None:
 def _require_new_use(
     file: WeightsFile, settings: Sequence[str], uses: Sequence[WeightsUse]
 ) -> None:
-    """Refuse predictions that an active entry makes with the same weights and options.
+    """Refuse weights with which a rival predicts already, with the same options.
 
     Options that change nothing in the recipe of the weights do not count.
+
+    Args:
+        file: the weights.
+        settings: options of the new predictions.
+        uses: weights of the rivals, which are the other active entries of the data set.
     """
     effective = file.list_effective_settings(settings)
     for use in uses:

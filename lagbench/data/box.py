@@ -171,7 +171,7 @@ class Box:
         if not self.is_periodic:
             return way
         period = np.where(self.periodic, self.lengths, np.inf)
-        return np.asarray(way - period_multiple(way, period))
+        return np.asarray(way - _nearest_multiple(way, period))
 
     def wrap(self, position: ArrayLike) -> Floats:
         """Return positions moved by whole periods into [low, high) of periodic axes.
@@ -326,14 +326,14 @@ def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
     return tuple(name in axes for name in names)
 
 
-def period_multiple(way: Floats, period: Floats) -> Floats:
-    """Return the whole number of periods next to each component, as a length.
+def _nearest_multiple(difference: Floats, period: Floats) -> Floats:
+    """Return the multiple of the period that is nearest to each component [length].
 
     An infinite period stands for an axis with walls: its multiple is 0.
     """
     finite = np.isfinite(period)
     length = np.where(finite, period, 1.0)
-    return np.where(finite, length * np.rint(way / length), 0.0)
+    return np.where(finite, length * np.rint(difference / length), 0.0)
 
 
 # --- the obstacle in the box ----------------------------------------------------------

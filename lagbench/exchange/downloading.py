@@ -226,14 +226,17 @@ def _describe_data(
     store: Publication | None,
     published: Sequence[int],
 ) -> None:
-    """Write the card of the data that were fetched, also into their own store.
+    """Write the cards of a data set after a download.
+
+    If the root folder is the working copy of a store, the cards go to this store too.
 
     Args:
         job: what was fetched.
         split: description of the split.
         manifest: manifest of the data.
-        store: where the root folder itself is kept, if in a store.
-        published: ids of the scenarios that this store has; a card needs them here.
+        store: the store of which the root folder is the working copy; None without one.
+        published: ids of scenarios that this store has already. They are fetched first,
+            because cards are made from files in the root folder.
     """
     if store:
         store.fetch(published)

@@ -312,7 +312,7 @@ def _vector_bytes(drawn: Figure, ending: str) -> bytes:
     """Return the figure as a PDF or SVG file without date or software."""
     matplotlib = require("matplotlib", extra="plots")
     if ending == ".svg":
-        fields = ["Date"]
+        fields = ["Date", "Creator"]
     else:
         fields = ["CreationDate", "Producer", "Creator"]
     no_metadata = dict.fromkeys(fields)

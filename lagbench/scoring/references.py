@@ -174,10 +174,15 @@ class ReferenceTallies:
 
 
 def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
-    """Measure the references on one scenario, or read the result of an earlier run."""
+    """Measure the references on one scenario, or read the result of an earlier run.
+
+    A result of other references does not count.
+    """
     if job.saved is not None and job.saved.is_file():
-        report(job.task.config.horizon)
-        return _load(job.scenario, job.saved)
+        earlier = _load(job.scenario, job.saved)
+        if earlier.tallies.keys() == set(job.references):
+            report(job.task.config.horizon)
+            return earlier
 
     seconds: dict[str, list[float]] = {name: [] for name in job.references}
     with job.task.opened(job.scenario) as truth:

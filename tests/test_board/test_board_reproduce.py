@@ -9,19 +9,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from model_board import NAME, PATH, ModelBoard
+from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from lagbench.board.check import CheckResult
-from lagbench.board.entry import Level, Verification
+from lagbench.board.entry import Entry, Level, Verification
+from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
+from lagbench.board.measured_cost import TimedEntry, measure_costs
 from lagbench.board.reproduce import ReproduceResult, reproduce
 from lagbench.board.scores_compared import TOLERANCE, sample_scenarios
 from lagbench.board.verified import read_verified
 from lagbench.cli.program import app
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.data.registry import load
+from lagbench.errors import (
+    ChecksFailedError,
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+)
+from lagbench.scoring.task import load_scored_task
+from lagbench.work.progress import Meter
 
 
 @pytest.fixture
@@ -124,6 +136,80 @@ def test_costs_of_a_data_set_are_of_one_run(own: ModelBoard) -> None:
     own.edit(own.folder / "verified.yaml", change_cost)
     fifth = run_again(own, **options, time_solver=lambda *_: 0.25)
     assert fifth.measured == [NAME, other_name]
+
+
+class SteadyRunner:
+    """A runner whose frames take half a second."""
+
+    def predict(
+        self, scenario_file: Path, frames: int | None = None
+    ) -> NDArray[np.float32]:
+        """Nobody asks for positions here."""
+        raise NotImplementedError
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Return the time of a frame."""
+        return 0.5
+
+    def close(self) -> None:
+        """Free nothing."""
+
+
+class FailingRunner(SteadyRunner):
+    """A runner whose model opens but does not run, as some ONNX models."""
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Fail."""
+        raise failure_of("this model")
+
+
+def failure_of(place: str) -> WorkFailedError:
+    """Return an error of a model."""
+    return WorkFailedError(
+        "it does not run", where=place, expected="a run", got="none", fix="mend it"
+    )
+
+
+def test_a_model_that_fails_has_no_cost_and_the_others_have(own: ModelBoard) -> None:
+    """Its entry and the error are kept."""
+    size = load().size("curl-noise", "tiny")
+    task = load_scored_task(size, own.root)
+    entry = read_entry(own.folder / PATH)
+    other = entry.model_copy(update={"method": "other"})
+    kept = []
+
+    def keep_failure(entry: Entry, error: LagbenchError) -> None:
+        kept.append(entry.method)
+
+    costs = measure_costs(
+        [
+            TimedEntry(entry=entry, runner=FailingRunner()),
+            TimedEntry(entry=other, runner=SteadyRunner()),
+        ],
+        task,
+        root=own.root,
+        time_solver=None,
+        meter=Meter(None),
+        keep_failure=keep_failure,
+    )
+    assert [entry.method for entry, _ in costs] == ["other"]
+    assert [cost.seconds_per_frame for _, cost in costs] == [0.5]
+    assert kept == ["gns"]
+
+
+@pytest.mark.slow
+def test_costs_that_fail_stop_no_other_data_set(own: ModelBoard) -> None:
+    """With --all the error is kept; that of a named entry is raised."""
+
+    def fail(split: str, size: str) -> float:
+        raise failure_of(f"{split} {size}")
+
+    options: dict[str, Any] = {"scores": False, "costs": True, "time_solver": fail}
+    result = run_again(own, **options)
+    assert [failure.entry for failure in result.failures] == [PATH]
+    assert result.exit_code == WorkFailedError.exit_code
+    with pytest.raises(WorkFailedError):
+        run_again(own, NAME, **options)
 
 
 def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
@@ -445,12 +446,13 @@ def test_vector_pictures_have_the_same_bytes_twice(
     ending: str,
     head: bytes,
 ) -> None:
-    """PDF and SVG hold no date."""
+    """PDF and SVG state no date, and no version of the software."""
     first_path = plot_frame(swirl, 0, tmp_path / f"first.{ending}")
     second_path = plot_frame(swirl, 0, tmp_path / f"second.{ending}")
     first = first_path.read_bytes()
     assert first == second_path.read_bytes()
     assert first.startswith(head)
+    assert f"Matplotlib v{matplotlib.__version__}".encode() not in first
 
 
 def test_another_ending_is_refused(swirl: Path, tmp_path: Path) -> None:

@@ -532,6 +532,11 @@ def test_an_interrupted_measurement_goes_on(
     assert_allclose(resumed[0], 4.0 * first[0])
     fresh = measure_persistence()
     assert_array_equal(fresh, first)
+    names = ["constant-velocity", "persistence"]
+    both = measure(size, root, names=names, resume=True)
+    assert set(both) == set(names)
+    remeasured = both["persistence"].scores["position_mse"].values
+    assert_array_equal(remeasured[0], first[0])
 
 
 def test_scoring_takes_what_is_shipped(
