@@ -1,6 +1,6 @@
 """Do bodies in free flight have the mean acceleration of gravity?
 
-    python benchmarks/free_flight.py --root FOLDER [--split NAME ...]
+    python benchmarks/free_flight.py --root FOLDER [--split NAME ...] [--reach R ...]
 
 Prints which share of the particles belongs to such bodies in the true data, and how far
 the mean acceleration of these bodies is from gravity. Each row has another reach of the
@@ -91,6 +91,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--root", type=Path, default=os.environ.get("LAGBENCH_ROOT"))
     parser.add_argument("--split", nargs="+", default=["fluid"])
     parser.add_argument("--size", default="mini")
+    parser.add_argument(
+        "--reach",
+        nargs="+",
+        type=float,
+        default=REACHES,
+        metavar="R",
+        help="reaches of the forces [radius]",
+    )
     options = parser.parse_args(arguments)
     if options.root is None:
         parser.error("name the folder of all data sets: --root FOLDER")
@@ -105,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         paths = list(paths_by_id.values())[:SCENARIOS]
         particle_frames = count_particle_frames(paths)
-        for reach in REACHES:
+        for reach in options.reach:
             flying = 0
             error_sum = 0.0
             for path in paths:
