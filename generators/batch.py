@@ -153,7 +153,6 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             fix="return an InitialState: docs/extending.md",
         )
     _check_values(state, f"{where}, scenario {scenario}")
-    _refuse_hidden_constants(state, size, f"{where}, scenario {scenario}")
     stated_start = start_frame(size, scenario)
     if state.start_frame != stated_start:
         raise UsageError(
@@ -164,6 +163,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
             fix="let the split have a function start_frame(size, scenario, rng) that "
             "returns the start_frame of its initial state",
         )
+    _refuse_hidden_constants(state, size, f"{where}, scenario {scenario}")
     return state
 
 

@@ -15,6 +15,7 @@ from registry_text import described_splits
 from scenario_factory import frames_of, make_key, write_scenario
 
 from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.layout import major_of
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import format_yaml, read_yaml
 from lagbench.submission import ValidationResult, validate, write
@@ -148,7 +149,7 @@ def _write_registry(path: Path, hashes: dict[int, str]) -> None:
         "test": subset_hash(hashes),
     }
     measured = {
-        "dataset_sha256": dataset_hash("cavity", "tiny", 1, subsets),
+        "dataset_sha256": dataset_hash("cavity", "tiny", major_of(VERSION), subsets),
         "subset_sha256": subsets,
         "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
         "statistics": {},

@@ -162,8 +162,8 @@ def angular_momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_scale(pair: FramePair) -> float:
-    """Sum of distance from the box centre times speed, in the truth; divides the error
-    in angular_momentum_error.
+    """Sum of true distance from the box centre times speed, for
+    angular_momentum_error.
     """
     return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)
 
