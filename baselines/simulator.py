@@ -300,7 +300,7 @@ class GraphNetworkOptions(Options):
     # strain of one wave; each draws its own, from 0. With recovery the model learns to
     # even out densities.
     compression: float = Field(default=0.0, ge=0.0, le=1.0)
-    loss: LossWeights = LossWeights()  # weights of the six terms
+    loss: LossWeights = LossWeights()  # weights of the terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
     # weight of an operator's link prediction; the operator's own when None
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
@@ -563,7 +563,7 @@ class GraphNetwork(Baseline):
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return the six terms of Eq. 5.35 and the operator's own, without weights.
+        """Return the terms of Eq. 5.35 and the operator's own, without weights.
 
         They are means over the steps.
         """

@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lagbench.atomic import write_atomically
 from lagbench.baselines.baseline import Baseline
@@ -84,9 +85,9 @@ class Gates:
     free_flight: float | None  # mean vertical error [g]
     settled: float | None  # mean vertical error [g]
     densest_cell: float  # over that of the truth [1]
-    # most scenarios whose single steps were measured; None in older records
+    # the option --scenarios, the most scenarios of single steps; None in older records
     scenarios: int | None = None
-    # most scenarios that were rolled out; None in older records
+    # the option --rollouts, the most scenarios of rollouts; None in older records
     rollouts: int | None = None
 
     @property
@@ -147,7 +148,7 @@ class StepErrors:
 
 @torch.no_grad()
 def predict_step(
-    model: Baseline, window: Batch, beginning: Batch
+    model: Baseline, window: Batch, density_limit: Tensor | None
 ) -> tuple[Floats, Floats]:
     """Return error and truth of the acceleration of a window's last frame.
 
@@ -156,14 +157,13 @@ def predict_step(
     Args:
         model: the model that predicts the last frame from the others.
         window: frames of a scenario.
-        beginning: the given frames of the scenario. Relaxation takes its limit of
-            density from them, as in a rollout.
+        density_limit: largest density that relaxation leaves alone in a rollout of the
+            scenario, shape [1]; None without relaxation.
     """
     given = window.part(slice(window.frames - 1))
     state = model.start(given)
     if isinstance(model, GraphNetwork):
-        first_state = model.start(beginning)
-        state = replace(state, density_limit=first_state.density_limit)
+        state = replace(state, density_limit=density_limit)
     _, predicted = model.advance(state)
     box = model.box.box
     frames = window.position.double().numpy()
@@ -171,6 +171,22 @@ def predict_step(
     true_velocity = box.displacement(frames[:, -2], frames[:, -1])
     error = box.displacement(frames[:, -1], predicted.double().numpy())
     return np.asarray(error), np.asarray(true_velocity - before)
+
+
+@torch.no_grad()
+def rollout_limit(model: Baseline, given: Batch) -> Tensor | None:
+    """Return the largest density that relaxation leaves alone in a rollout, shape [1].
+
+    None without relaxation.
+
+    Args:
+        model: the model.
+        given: given frames of a scenario.
+    """
+    if not isinstance(model, GraphNetwork):
+        return None
+    limit: Tensor | None = model.start(given).density_limit
+    return limit
 
 
 def measure_steps(
@@ -185,10 +201,10 @@ def measure_steps(
     needed = max(model.history, 3)
     for path in paths:
         scenario = scenario_batch(path, viscosity=size.viscosity())
-        beginning = scenario.part(slice(size.task.input_frames))
+        limit = rollout_limit(model, scenario.part(slice(size.task.input_frames)))
         for last in range(needed, scenario.frames, every):
             window = scenario.part(slice(last - needed, last + 1))
-            error, truth = predict_step(model, window, beginning)
+            error, truth = predict_step(model, window, limit)
             errors.add(error, truth, fall)
     return errors
 

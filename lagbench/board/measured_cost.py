@@ -123,6 +123,8 @@ def measure_costs(
                 seconds[f"model {one.entry.method}"] = frame_seconds
             meter.count(1)
         rounds.append(seconds)
+        if not running:
+            return []
 
     least = {}
     for name in rounds[-1]:

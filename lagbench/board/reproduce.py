@@ -57,7 +57,9 @@ from .verified import read_verified, record, verification_of
 class Failure:
     """An entry that could not be run."""
 
-    entry: str  # path of its YAML file in the leaderboard's folder
+    # path of its YAML file in the leaderboard's folder; the data set (split/size) where
+    # the costs of all its entries failed
+    entry: str
     error: LagbenchError
 
 
@@ -411,7 +413,8 @@ class _Reproduction:
             except LagbenchError as error:
                 if is_named:
                     raise
-                self._keep_failure(named[0], error)
+                failure = Failure(entry=f"{split}/{size}", error=error)
+                self.result.failures.append(failure)
 
     def _have_costs_of_one_run(self, entries: Sequence[Entry]) -> bool:
         costs = []
@@ -453,9 +456,17 @@ class _Reproduction:
         finally:
             for runner in opened:
                 runner.close()
+        measured = {}
         for entry, cost in costs:
-            self._change_line(entry, partial(_with_cost, cost=cost))
-            self.result.measured.append("/".join(entry.place))
+            measured[entry.yaml_path] = cost
+        for entry in entries:
+            new_cost = measured.get(entry.yaml_path)
+            if new_cost is not None:
+                self.result.measured.append("/".join(entry.place))
+            elif self.line_of(entry) is None:
+                continue
+            # a cost of an earlier run does not compare with those of this one
+            self._change_line(entry, partial(_with_cost, cost=new_cost))
 
     def _open_a_model(self, entry: Entry) -> Runner | None:
         """Return the first model of an entry that can be opened, None without one.
@@ -485,7 +496,7 @@ class _Reproduction:
             self.result.failures.append(Failure(entry=path, error=error))
 
 
-def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
+def _with_cost(line: Verification, cost: MeasuredCost | None) -> Verification:
     return line.model_copy(update={"cost": cost})
 
 

@@ -521,6 +521,10 @@ class Split(_RegistryModel):
         return self
 
 
+MOST_OLDER_VERSIONS = 100
+"""Most older MAJOR versions whose hashes are recognised."""
+
+
 class Registry:
     """All splits of one datasets.yaml and of the installed packages that add splits."""
 
@@ -607,7 +611,8 @@ class Registry:
         major = major_of(self.splits[split].version)
         if measured.dataset_sha256 == dataset_hash(split, name, major, hashes):
             return measured
-        for older in range(1, major):
+        first = max(1, major - MOST_OLDER_VERSIONS)
+        for older in range(first, major):
             if measured.dataset_sha256 == dataset_hash(split, name, older, hashes):
                 return None
         return measured

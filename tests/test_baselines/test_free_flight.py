@@ -124,6 +124,29 @@ def test_bodies_are_the_components_of_all_pairs(
     assert bodies.body.tolist() == label.tolist()
 
 
+def test_large_bodies_of_two_windows_stay_apart() -> None:
+    """Both windows have the same particles at the same places."""
+    rng = np.random.default_rng(5)
+    block = torch.from_numpy(rng.uniform(0.3, 0.6, (300, 2)))
+    position = torch.cat([block, block])
+    sample = torch.arange(2).repeat_interleave(300)
+    box = TensorBox(Box.from_bounds([(0.0, 1.0)] * 2))
+    bodies = find_bodies(
+        position, torch.zeros_like(position), sample, reach=REACH, box=box
+    )
+    assert bodies.body.tolist() == [0] * 300 + [1] * 300
+
+
+def test_weights_lose_their_fall_in_a_model_without_free_flight() -> None:
+    """A training may start from weights with free flight, and go on without it."""
+    flying = network(free_flight=3.4)
+    plain = network()
+    weights = dict(flying.state_dict())
+    adapted, _ = plain.adapt_weights(weights, {})
+    assert adapted.keys() == plain.state_dict().keys()
+    assert "free_flight.fall" in weights
+
+
 def test_no_particles_are_no_bodies() -> None:
     """An empty window has none."""
     box = TensorBox(Box.from_bounds([(0.0, 1.0)] * 2))

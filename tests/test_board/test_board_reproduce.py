@@ -206,7 +206,7 @@ def test_costs_that_fail_stop_no_other_data_set(own: ModelBoard) -> None:
 
     options: dict[str, Any] = {"scores": False, "costs": True, "time_solver": fail}
     result = run_again(own, **options)
-    assert [failure.entry for failure in result.failures] == [PATH]
+    assert [failure.entry for failure in result.failures] == ["curl-noise/tiny"]
     assert result.exit_code == WorkFailedError.exit_code
     with pytest.raises(WorkFailedError):
         run_again(own, NAME, **options)

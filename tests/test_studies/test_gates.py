@@ -25,6 +25,7 @@ from studies.gates import (
     main,
     predict_step,
     read_recorded,
+    rollout_limit,
     to_json,
     to_markdown,
 )
@@ -67,12 +68,13 @@ def test_relaxation_of_a_step_has_the_limit_of_a_rollout() -> None:
     rest = np.repeat(later[None], model.history + 1, axis=0)
     given = batch(np.repeat(beginning[None], 2, axis=0))
 
-    error, truth = predict_step(model, batch(rest), given)
+    limit = rollout_limit(model, given)
+    error, truth = predict_step(model, batch(rest), limit)
     assert not truth.any()
     assert np.abs(error[:100]).max() < 1e-6
 
-    of_later = batch(rest[:2])
-    disturbed, _ = predict_step(model, batch(rest), of_later)
+    limit_of_later = rollout_limit(model, batch(rest[:2]))
+    disturbed, _ = predict_step(model, batch(rest), limit_of_later)
     assert np.abs(disturbed[:100]).max() > 1e-3
 
 
