@@ -103,9 +103,9 @@ HOW_TO_READ = """\
   the number of models in the comparison (Holm). With fewer than six scenarios there is
   no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
-  GPUs. Each of its tables has one scenario. So compare its numbers with ours only
-  roughly. Size `mini` has about a quarter of the particles and about half the cells
-  along an axis. So at `mini` compare only the order of the models.
+  GPUs. Each value in its tables comes from one scenario. So compare its numbers with
+  ours only roughly. Size `mini` has about a quarter of the particles and about half
+  the cells along an axis. So at `mini` compare only the order of the models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
   lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
 - **Comparisons** have two models, *first* and *second*. `where` is the data set. The
@@ -163,7 +163,9 @@ from the recipe. `none` means that no option differs. If the seeds of a model ha
 different values, slashes separate the values, in the order of the seeds. If there is
 no record of the training, `recipe` and `changed` come from the entry. The speed-up is
 the time of our solver for a frame, on one core, divided by the time of the model on the
-same machine. Hours do not include validations."""
+same machine. The times are those of the entry, mostly means over whole rollouts. The
+first table of this page has means over the first ten frames, which were measured in
+another run. So the two can differ. Hours do not include validations."""
 
 COMMANDS = """\
 ## How to make these results again
