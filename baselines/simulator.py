@@ -85,8 +85,8 @@ class ParticleState:
     # centre and radius of each window's obstacle [length], shape [window, axis + 1];
     # None where the model does not see it
     obstacle: Tensor | None = None
-    # largest density that relaxation leaves alone [1], shape [window]; None without
-    # relaxation
+    # largest density that relaxation leaves alone [1], shape [window]; None before the
+    # first step of a rollout, and without relaxation
     density_limit: Tensor | None = None
 
     def move(self, position: Tensor, velocity: Tensor) -> Self:
@@ -740,27 +740,24 @@ class GraphNetwork(Baseline):
             next_frame = min(given.frames, known_frames - 1)
             per_second = given.wall_velocity[:, next_frame:]
             walls = per_second * self.info.frame_interval
-        position = given.position[:, -1]
-        limit = None
-        if self.relaxation is not None:
-            limit = self.relaxation.limit(position, given.sample)
         return ParticleState(
-            position=position,
+            position=given.position[:, -1],
             velocity=last_velocities(given.position, self.options.velocities, self.box),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
             body_force=self.forcing.coming_force(given),
             obstacle=self.forcing.find_obstacle(given),
-            density_limit=limit,
         )
 
     def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
         """Return the next state and positions [length], shape [particle, axis]."""
         following, _ = self.step(state)
-        limit = state.density_limit
-        if self.relaxation is None or limit is None:
+        if self.relaxation is None:
             return following, following.position
+        limit = state.density_limit
+        if limit is None:  # the first step of a rollout
+            limit = self.relaxation.limit(state.position, state.sample)
         obstacle = None
         if following.obstacle is not None:
             obstacle = following.obstacle[following.sample]
@@ -770,7 +767,9 @@ class GraphNetwork(Baseline):
         correction = self.box.displacement(following.position, position)
         velocity = following.velocity.clone()
         velocity[:, -1] += correction
-        following = replace(following, position=position, velocity=velocity)
+        following = replace(
+            following, position=position, velocity=velocity, density_limit=limit
+        )
         return following, position
 
     def step(

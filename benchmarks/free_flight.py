@@ -102,6 +102,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.root is None:
         parser.error("name the folder of all data sets: --root FOLDER")
+    if min(options.reach) <= 0.0:
+        parser.error(f"a reach must be above 0; got {min(options.reach):g}")
 
     registry = load_registry()
     print("| data set | reach [radius] | share of particles | mean error [g] |")

@@ -26,6 +26,7 @@ from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
+from lagbench.data.layout import parse_ids
 from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.figures.tables import markdown
@@ -133,26 +134,18 @@ def measure_milliseconds(name: str, q: int) -> float:
     return statistics.median(milliseconds)
 
 
-def read_rows(text: str) -> range:
-    """Return the values of q from a first to a last one, as in 1-4.
+def read_rows(text: str) -> tuple[int, ...]:
+    """Return the values of q that a text names, as in 1-4.
 
     Raises:
         UsageError: there are none, or one is below 1.
     """
-    first, dash, last = text.partition("-")
-    numbers = [first]
-    if dash:
-        numbers.append(last)
-    rows = range(0)
-    if all(number.isdecimal() for number in numbers):
-        first_q = int(numbers[0])
-        last_q = int(numbers[-1])
-        rows = range(first_q, last_q + 1)
-    if not rows or rows[0] < 1:
+    rows = parse_ids(text, where="--rows", noun="q")
+    if min(rows) < 1:
         raise UsageError(
             "there is nothing to measure",
             where="--rows",
-            expected="the first and the last q, from 1 on",
+            expected="values of q from 1 on",
             got=repr(text),
             fix="give them as in --rows 1-4",
         )

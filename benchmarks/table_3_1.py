@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from lagbench.data.layout import parse_ids
 from lagbench.errors import LagbenchError, UsageError
 from lagbench.generators import solver
 from lagbench.generators.split import (
@@ -268,25 +269,18 @@ def markdown(
 
 
 def read_rows(text: str) -> list[ThesisRow]:
-    """Return the rows from a first to a last q, as in 1-4.
+    """Return the rows whose values of q a text names, as in 1-4.
 
     Raises:
-        UsageError: there are no such rows.
+        UsageError: a row does not exist.
     """
-    first, dash, last = text.partition("-")
-    numbers = [first]
-    if dash:
-        numbers.append(last)
-    rows = []
-    if all(number.isdecimal() for number in numbers):
-        first_q = int(numbers[0])
-        last_q = int(numbers[-1])
-        rows = [row for row in THESIS if first_q <= row.q <= last_q]
-    if not rows:
+    numbers = parse_ids(text, where="--rows", noun="q")
+    rows = [row for row in THESIS if row.q in numbers]
+    if len(rows) < len(numbers):
         raise UsageError(
             "Table 3.1 has no such rows",
             where="--rows",
-            expected=f"the first and the last q, from {THESIS[0].q} to {THESIS[-1].q}",
+            expected=f"values of q from {THESIS[0].q} to {THESIS[-1].q}",
             got=repr(text),
             fix="give them as in --rows 1-4",
         )

@@ -183,10 +183,9 @@ def rollout_limit(model: Baseline, given: Batch) -> Tensor | None:
         model: the model.
         given: given frames of a scenario.
     """
-    if not isinstance(model, GraphNetwork):
+    if not isinstance(model, GraphNetwork) or model.relaxation is None:
         return None
-    limit: Tensor | None = model.start(given).density_limit
-    return limit
+    return model.relaxation.limit(given.position[:, -1], given.sample)
 
 
 def measure_steps(

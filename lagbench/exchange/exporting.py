@@ -120,10 +120,7 @@ def export(
     file_format = parse_format(format)
     _check_from_walls(file_format, from_walls=from_walls)
     tier, data_root, rooted_registry = locate(split, size, root=root, registry=registry)
-    target = Path(output)
-    if str(output).startswith("~"):
-        # as a shell does, and as `root` does
-        target = expand_path(output, "--output")
+    target = expand_path(output, "--output")
     path_by_subset = {}
     for subset in HASHED_SUBSETS:
         path_by_subset[subset] = target / f"{subset}{ENDINGS[file_format]}"

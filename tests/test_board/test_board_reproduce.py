@@ -138,6 +138,35 @@ def test_costs_of_a_data_set_are_of_one_run(own: ModelBoard) -> None:
     assert fifth.measured == [NAME, other_name]
 
 
+@pytest.mark.slow
+def test_a_cost_of_an_earlier_run_does_not_stay(own: ModelBoard) -> None:
+    """An entry whose model is damaged later loses its cost when others are measured."""
+    other = PATH.replace("gns", "second")
+    other_name = NAME.replace("gns", "second")
+    shutil.copy(own.folder / PATH, own.folder / other)
+    own_weights = own.weights.with_name("second_0.pt")
+    shutil.copy(own.weights, own_weights)
+
+    def take_own_weights(content: Content) -> None:
+        content["method"] = "second"
+        content["name"] = "A second one"
+        weights = content["predictions"][0]["weights"]
+        weights["path"] = own_weights.relative_to(own.folder).as_posix()
+
+    own.edit(own.folder / other, take_own_weights)
+    options: dict[str, Any] = {"scores": False, "costs": True, "again": True}
+    first = run_again(own, **options)
+    assert first.measured == [NAME, other_name]
+    assert lines_of(own)[other].cost is not None
+
+    own_weights.write_bytes(b"damaged")
+    second = run_again(own, **options)
+    assert second.measured == [NAME]
+    assert [failure.entry for failure in second.failures] == [other]
+    assert lines_of(own)[PATH].cost is not None
+    assert lines_of(own)[other].cost is None
+
+
 class SteadyRunner:
     """A runner whose frames take half a second."""
 
@@ -198,8 +227,8 @@ def test_a_model_that_fails_has_no_cost_and_the_others_have(own: ModelBoard) -> 
 
 
 @pytest.mark.slow
-def test_costs_that_fail_stop_no_other_data_set(own: ModelBoard) -> None:
-    """With --all the error is kept; that of a named entry is raised."""
+def test_an_error_of_all_costs_is_kept_or_raised(own: ModelBoard) -> None:
+    """With --all it is kept under the data set; with a named entry it is raised."""
 
     def fail(split: str, size: str) -> float:
         raise failure_of(f"{split} {size}")
