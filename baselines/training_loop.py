@@ -14,8 +14,9 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 
 import torch
@@ -23,6 +24,7 @@ from lightning_fabric import Fabric
 from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 
+from lagbench.errors import WorkFailedError
 from lagbench.tensors import Batch, TensorWindow
 
 from .checkpoint import load, round_weights, save
@@ -137,23 +139,24 @@ class TrainingLoop:
         """Train to the end, or until validations or a user stop it."""
         steps = self.optimisation.steps
         step = self.optimisation.step
-        if self.fabric.is_global_zero:
-            self._tensorboard = SummaryWriter(str(self.job.folder.tensorboard))
-        try:
-            with self._interrupts.listen(), _silence_writer():
-                self.job.meter.begin(
-                    "training", total=steps, scenarios=steps, done=step
-                )
-                self._train(loader)
-        except Exception:
-            # The checkpoint stays as it is.
+        with ExitStack() as stack:
             if self.fabric.is_global_zero:
-                self.log.state = "failed"
-                self._write_log()
-            raise
-        finally:
-            if self._tensorboard is not None:
-                self._tensorboard.close()
+                writer = _open_tensorboard(self.job.folder.tensorboard)
+                self._tensorboard = stack.enter_context(writer)
+            try:
+                with self._interrupts.listen():
+                    self.job.meter.begin(
+                        "training", total=steps, scenarios=steps, done=step
+                    )
+                    self._train(loader)
+            except Exception:
+                # The checkpoint stays as it is.
+                if self.fabric.is_global_zero:
+                    self.log.state = "failed"
+                    # A disk that takes no log does not hide the first error.
+                    with suppress(WorkFailedError):
+                        self._write_log()
+                raise
 
     def _train(self, loader: Loader) -> None:
         fabric = self.fabric
@@ -332,11 +335,15 @@ class TrainingLoop:
 
 
 @contextmanager
-def _silence_writer() -> Iterator[None]:
-    """Keep tracebacks of TensorBoard's thread from users, as where a disk vanishes.
+def _open_tensorboard(folder: Path) -> Iterator[SummaryWriter]:
+    """Yield a writer into a folder, and close it.
 
-    The training meets the same error as it gives the thread its next number.
+    The writer has a thread of its own, which may meet an error of the disk. Its
+    traceback is not shown: the training meets the same error at its next number.
     """
+    before = set(threading.enumerate())
+    writer = SummaryWriter(str(folder))
+    threads = set(threading.enumerate()) - before
     show = threading.excepthook
 
     def show_others(details: threading.ExceptHookArgs) -> None:
@@ -345,8 +352,17 @@ def _silence_writer() -> Iterator[None]:
 
     threading.excepthook = show_others
     try:
-        yield
+        yield writer
+        writer.close()
+    except BaseException:
+        # An error of closing does not hide the first one.
+        with suppress(OSError):
+            writer.close()
+        raise
     finally:
+        # A thread that met an error calls the hook a moment later.
+        for thread in threads:
+            thread.join(timeout=1)
         threading.excepthook = show
 
 
