@@ -22,7 +22,7 @@ import numpy as np
 
 from lagbench.data.field_errors import describe_value
 from lagbench.data.registry import Size
-from lagbench.data.writer import (
+from lagbench.data.variables import (
     POSSIBLE_NAME,
     STORABLE_VALUE,
     as_attribute,

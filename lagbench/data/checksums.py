@@ -36,42 +36,13 @@ from lagbench.errors import (
 )
 
 from .layout import NOTES_NAME
+from .variables import to_plain
 
 HASHED_SUBSETS = ("train", "valid", "test")
 """Subsets that the data set hash covers."""
 
 BLOCK_BYTES = 1 << 18
 """Values are made canonical in blocks that fit the second-level cache [bytes]."""
-
-
-def to_plain(value: object) -> object:
-    """Return a JSON value equal to an attribute, whatever library read it.
-
-    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
-    element become Python numbers; -0.0 becomes 0.0.
-    """
-    if isinstance(value, (np.ndarray, np.generic)):
-        if value.size == 1:
-            value = value.item()
-        else:
-            value = value.tolist()
-    if isinstance(value, bytes):
-        value = value.decode("utf-8")
-    if isinstance(value, int):
-        return int(value)
-    if isinstance(value, float) and math.isfinite(value):
-        return value + 0.0
-    if isinstance(value, str) and "\0" not in value:
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_plain(item) for item in value]
-    raise DataError(
-        "a value cannot be hashed",
-        expected="a finite number, a string without NUL, or lists and mappings of them",
-        got=repr(value),
-    )
 
 
 def round_digits(value: float, digits: int = 9) -> float:

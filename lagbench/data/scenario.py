@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from lagbench.errors import LIMIT_FIXES, DataError, LagbenchError, WorkFailedError
 
 from . import MATERIALS
-from .checksums import ContentHasher, to_plain
+from .checksums import ContentHasher
 from .hdf5 import (
     DEFLATE_RATIO,
     is_text,
@@ -40,6 +40,7 @@ from .variables import (
     MAX_VALUES_PER_FRAME,
     expected_attributes,
     list_differing_attributes,
+    to_plain,
 )
 
 BLOCK_BYTES = 1 << 20

@@ -1,19 +1,24 @@
-"""The variables of a scenario file, and the attributes that they must have.
+"""The variables of a scenario file and their attributes; its parameters.
 
-Attributes do not enter the content hash, yet readers compute with them: a
+Attributes of variables do not enter the content hash, yet readers compute with them: a
 ``scale_factor`` or other ``units`` change what xarray returns although no stored value
 changed. So a variable has exactly the attributes of :data:`ATTRIBUTES`.
+
+Parameters of a scenario are attributes of the file. They do enter the hash.
 """
 
 from __future__ import annotations
 
+import math
+import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lagbench.errors import UsageError
+from lagbench.errors import DataError, UsageError
 
 from . import MATERIALS
 
@@ -78,6 +83,59 @@ HIDDEN_ATTRIBUTES = frozenset(
 )
 """Attributes by which netCDF stores dimensions; it shows them to nobody."""
 
+_RESERVED = {
+    "Conventions",
+    "title",
+    "source",
+    "license",
+    "lagbench_format",
+    "lagbench_version",
+    "split",
+    "size",
+    "version",
+    "scenario",
+    "subset",
+    "seed",
+    "generator",
+    "device",
+    "hashed_parameters",
+    "content_sha256",
+    "facts",
+    "periodic",
+}
+"""Attributes of the file that no parameter may be named like."""
+
+_KEPT_BY_NETCDF = HIDDEN_ATTRIBUTES | {
+    "_ARRAY_DIMENSIONS",
+    "_Codecs",
+    "_Format",
+    "_IsNetcdf4",
+    "_SuperblockVersion",
+    "_nczarr_array",
+    "_nczarr_attr",
+    "_nczarr_group",
+    "_nczarr_superblock",
+}
+"""Attributes that netCDF and HDF5 keep for themselves."""
+
+LONGEST_NAME = 256
+"""Longest name of an attribute in netCDF [bytes]."""
+
+POSSIBLE_NAME = (
+    "letters, digits and _, as in disc_radius, and no name that files use; at most "
+    f"{LONGEST_NAME} bytes, in the composed form (NFC)"
+)
+"""What the name of a parameter has to be."""
+
+STORABLE_VALUE = (
+    "a finite number, a whole one of 64 bits at most, or a text that is not empty and "
+    "has no NUL and no lone surrogate"
+)
+"""What the value of a parameter has to be."""
+
+_SURROGATES = re.compile("[\ud800-\udfff]")
+"""Halves of characters, which no UTF-8 has."""
+
 MAX_VALUES_PER_FRAME = 20_000_000
 """Values of a variable in one frame, which is read at once.
 
@@ -138,3 +196,66 @@ def _is_equal(expected: object, value: object) -> bool:
         and expected.dtype == value.dtype
         and np.array_equal(expected, value)
     )
+
+
+def to_plain(value: object) -> object:
+    """Return a JSON value equal to an attribute, whatever library read it.
+
+    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
+    element become Python numbers; -0.0 becomes 0.0.
+    """
+    if isinstance(value, (np.ndarray, np.generic)):
+        if value.size == 1:
+            value = value.item()
+        else:
+            value = value.tolist()
+    if isinstance(value, bytes):
+        value = value.decode("utf-8")
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float) and math.isfinite(value):
+        return value + 0.0
+    if isinstance(value, str) and "\0" not in value:
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item) for item in value]
+    raise DataError(
+        "a value cannot be hashed",
+        expected="a finite number, a string without NUL, or lists and mappings of them",
+        got=repr(value),
+    )
+
+
+def find_name_fault(name: str) -> str | None:
+    """Return why no parameter can have a name in a scenario file; None if one can."""
+    if not name.isidentifier():
+        return "no identifier"
+    if name in _RESERVED:
+        return "the name of an attribute that each file has"
+    if name in _KEPT_BY_NETCDF:
+        return "a name that netCDF keeps for itself"
+    if not unicodedata.is_normalized("NFC", name):
+        return "another form, which netCDF would change"
+    length = len(name.encode("utf-8"))
+    if length > LONGEST_NAME:
+        return f"{length} bytes"
+    return None
+
+
+def as_attribute(value: object) -> int | float | str | None:
+    """Return a value as an attribute holds it; None where netCDF cannot store it."""
+    try:
+        plain_value = to_plain(value)
+    except (DataError, UnicodeDecodeError):
+        return None
+    if isinstance(plain_value, int):
+        is_storable = -(2**63) <= plain_value < 2**64
+        return plain_value if is_storable else None
+    if isinstance(plain_value, str):
+        is_storable = plain_value != "" and not _SURROGATES.search(plain_value)
+        return plain_value if is_storable else None
+    if isinstance(plain_value, float):
+        return plain_value
+    return None

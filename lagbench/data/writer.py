@@ -10,9 +10,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
-import re
 import shutil
-import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
@@ -33,13 +31,16 @@ from lagbench.errors import (
 
 from . import MATERIALS
 from .box import AXES, WALL_NAMES, parse_periodic
-from .checksums import ContentHasher, to_plain
+from .checksums import ContentHasher
 from .field_errors import describe_value
 from .layout import ScenarioKey
 from .variables import (
-    HIDDEN_ATTRIBUTES,
     MAX_VALUES_PER_FRAME,
+    POSSIBLE_NAME,
+    STORABLE_VALUE,
+    as_attribute,
     expected_attributes,
+    find_name_fault,
     open_netcdf,
 )
 
@@ -54,59 +55,6 @@ PARTICLES_PER_CHUNK = 1 << 17
 
 Larger frames have several chunks.
 """
-
-_RESERVED = {
-    "Conventions",
-    "title",
-    "source",
-    "license",
-    "lagbench_format",
-    "lagbench_version",
-    "split",
-    "size",
-    "version",
-    "scenario",
-    "subset",
-    "seed",
-    "generator",
-    "device",
-    "hashed_parameters",
-    "content_sha256",
-    "facts",
-    "periodic",
-}
-"""Attributes of the file that no parameter may be named like."""
-
-_KEPT_BY_NETCDF = HIDDEN_ATTRIBUTES | {
-    "_ARRAY_DIMENSIONS",
-    "_Codecs",
-    "_Format",
-    "_IsNetcdf4",
-    "_SuperblockVersion",
-    "_nczarr_array",
-    "_nczarr_attr",
-    "_nczarr_group",
-    "_nczarr_superblock",
-}
-"""Attributes that netCDF and HDF5 keep for themselves."""
-
-LONGEST_NAME = 256
-"""Longest name of an attribute in netCDF [bytes]."""
-
-POSSIBLE_NAME = (
-    "letters, digits and _, as in disc_radius, and no name that files use; at most "
-    f"{LONGEST_NAME} bytes, in the composed form (NFC)"
-)
-"""What the name of a parameter has to be."""
-
-STORABLE_VALUE = (
-    "a finite number, a whole one of 64 bits at most, or a text that is not empty and "
-    "has no NUL and no lone surrogate"
-)
-"""What the value of a parameter has to be."""
-
-_SURROGATES = re.compile("[\ud800-\udfff]")
-"""Halves of characters, which no UTF-8 has."""
 
 
 class ScenarioWriter:
@@ -444,39 +392,6 @@ def _check_parameters(
             )
         plain_values[name] = plain_value
     return plain_values
-
-
-def find_name_fault(name: str) -> str | None:
-    """Return why no parameter can have a name in a scenario file; None if one can."""
-    if not name.isidentifier():
-        return "no identifier"
-    if name in _RESERVED:
-        return "the name of an attribute that each file has"
-    if name in _KEPT_BY_NETCDF:
-        return "a name that netCDF keeps for itself"
-    if not unicodedata.is_normalized("NFC", name):
-        return "another form, which netCDF would change"
-    length = len(name.encode("utf-8"))
-    if length > LONGEST_NAME:
-        return f"{length} bytes"
-    return None
-
-
-def as_attribute(value: object) -> int | float | str | None:
-    """Return a value as an attribute holds it; None where netCDF cannot store it."""
-    try:
-        plain_value = to_plain(value)
-    except (DataError, UnicodeDecodeError):
-        return None
-    if isinstance(plain_value, int):
-        is_storable = -(2**63) <= plain_value < 2**64
-        return plain_value if is_storable else None
-    if isinstance(plain_value, str):
-        is_storable = plain_value != "" and not _SURROGATES.search(plain_value)
-        return plain_value if is_storable else None
-    if isinstance(plain_value, float):
-        return plain_value
-    return None
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256, load_recorded_hashes, to_plain
+from lagbench.data.checksums import file_sha256, load_recorded_hashes
 from lagbench.data.layout import (
     PICTURES,
     format_ids,
@@ -32,6 +32,7 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size, default_path
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.data.statistics import QUANTITIES
+from lagbench.data.variables import to_plain
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw_initial_state, file_parameters
 from lagbench.generators.simulate import OUTCOMES

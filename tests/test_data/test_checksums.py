@@ -23,8 +23,8 @@ from lagbench.data.checksums import (
     load_recorded_hashes,
     record_hashes,
     subset_hash,
-    to_plain,
 )
+from lagbench.data.variables import to_plain
 from lagbench.errors import DataError
 
 FLOATS = hnp.arrays(
