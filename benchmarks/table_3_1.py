@@ -245,9 +245,11 @@ def markdown(
         )
     lines += [
         "",
-        "A row `A against B` shows the exponent p in A ~ B^p. It is the slope of a "
-        "least-squares line through the logarithms of A and B. The last two columns "
-        "are the same if the table has all rows of the thesis.",
+        "The next table shows how the times grow. In its row `A against B` p is the "
+        "exponent in A ~ B^p: the slope of a least-squares line through the logarithms "
+        'of A and B. The column "thesis, same rows" uses only the rows of the thesis '
+        "that are in the table above. If the table above has all rows of the thesis, "
+        "the last two columns are equal.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
