@@ -8,6 +8,7 @@ from typing import Annotated
 import lagbench
 from lagbench.data.local import locate_split
 from lagbench.data.registry import Split, load
+from lagbench.errors import escape_line
 
 from .options import (
     JsonFlag,
@@ -25,6 +26,20 @@ TITLE = (
     "for neural surrogates of Lagrangian continuum simulators"
 )
 RELEASE_YEAR = 2026
+
+# BibTeX counts braces, also those behind a backslash, so that none may stand alone.
+TEX_ESCAPES = {
+    "\\": "/",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\textbraceleft{}",
+    "}": r"\textbraceright{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
 
 
 def cite_command(
@@ -46,8 +61,10 @@ def cite_command(
     name, _, registry = locate_split(split, root=root)
     entry = registry.split(name)
     hashes = {}
-    for size, measured in registry.measured.get(name, {}).items():
-        hashes[size] = measured.dataset_sha256
+    for size in entry.sizes:
+        measured = registry.size(name, size).measured
+        if measured is not None:
+            hashes[size] = measured.dataset_sha256
     if bibtex:
         text = _split_bibtex(name, entry, hashes)
         print_result({"bibtex": text}, [text], as_json=as_json)
@@ -61,10 +78,12 @@ def cite_command(
         "citation": entry.citation,
         "dataset_sha256": hashes,
     }
+    # strangers describe local splits
+    title = escape_line(entry.title)
+    licence = escape_line(entry.licence)
     lines = [
-        f"lagbench, split {name!r} ({entry.title}), version {entry.version}, "
-        f"{entry.licence}.",
-        f"After: {entry.citation}.",
+        f"lagbench, split {name!r} ({title}), version {entry.version}, {licence}.",
+        f"After: {escape_line(entry.citation)}.",
     ]
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")
@@ -88,12 +107,15 @@ def _cite_program(*, bibtex: bool, as_json: bool) -> None:
 
 
 def _split_bibtex(name: str, entry: Split, hashes: Mapping[str, str]) -> str:
-    listing = ", ".join(f"{size} {sha256}" for size, sha256 in hashes.items())
+    note = f"After {entry.citation}"
+    if hashes:
+        listing = ", ".join(f"{size} {sha256}" for size, sha256 in hashes.items())
+        note += f". SHA-256 of the data sets: {listing}"
     fields = {
         "title": f"{entry.title}: split {name} of lagbench",
         "version": entry.version,
         "license": entry.licence,
-        "note": f"After {entry.citation}. SHA-256 of the data sets: {listing}",
+        "note": note,
     }
     return _format_bibtex("misc", f"lagbench-{name}", fields)
 
@@ -103,14 +125,12 @@ def _format_bibtex(kind: str, key: str, fields: Mapping[str, str]) -> str:
 
     Characters that TeX would read as commands are escaped.
     """
-    replacements = {"\\": "/"}
-    for character in "&%$#_{}":
-        replacements[character] = f"\\{character}"
-    escapes = str.maketrans(replacements)
+    escapes = str.maketrans(TEX_ESCAPES)
 
     # The inner braces keep BibTeX from taking the name of the authors apart.
     lines = [f"@{kind}{{{key},", "  author = {{The lagbench authors}},"]
     for name, value in {**fields, "year": str(RELEASE_YEAR)}.items():
-        lines.append(f"  {name} = {{{value.translate(escapes)}}},")
+        line = " ".join(value.split())
+        lines.append(f"  {name} = {{{line.translate(escapes)}}},")
     lines.append("}")
     return "\n".join(lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -86,7 +87,9 @@ def plot_command(
         _refuse_choice_of_one(scenario, frame)
         split_name = choose_split(source, split)
         tier = locate(split_name, size, root=root).size
-        page = output or Path(f"{tier.split}-{tier.name}-sheet.png")
+        page = Path(f"{tier.split}-{tier.name}-sheet.png")
+        if output is not None:
+            page = Path(os.path.expanduser(output))
         require_place(page, overwrite=overwrite)
         path = contact_sheet(split_name, tier.name, page, root=root, kind=kind, dpi=dpi)
     else:

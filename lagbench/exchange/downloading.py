@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,11 +143,15 @@ def download(
         own_url = url_of(data_root)
         if own_url is not None:
             store = stack.enter_context(publish(tier, data_root, own_url))
-        published = set(selected).intersection(store.stored_entries if store else ())
+        stored: set[int] = set()
+        if store:
+            stored.update(store.stored_entries)
+        published = stored.intersection(selected)
         job = DownloadJob(
             tier,
             data_root,
             [scenario for scenario in selected if scenario not in published],
+            stored=stored,
             meter=Meter(progress),
             connections=connections,
         )
@@ -159,8 +163,8 @@ def download(
                 store.put_files(manifest, at_once=True)
         if not job.missing:
             verdict = compare_hashes(tier, manifest)
-            if job.downloaded and tier.simulated:
-                _describe_data(job, description, manifest, store, sorted(published))
+            if tier.simulated and (job.downloaded or job.forgotten):
+                _describe_data(job, description, manifest, store)
 
     if job.missing:
         if not or_generate:
@@ -220,26 +224,22 @@ def _list_stores(mirror: str | None, split: Split, size: Size) -> list[str]:
 
 
 def _describe_data(
-    job: DownloadJob,
-    split: Split,
-    manifest: Manifest,
-    store: Publication | None,
-    published: Sequence[int],
+    job: DownloadJob, split: Split, manifest: Manifest, store: Publication | None
 ) -> None:
     """Write the cards of a data set after a download.
 
     If the root folder is the working copy of a store, the cards go to this store too.
+    Then the files that only the store has are fetched first, because cards are made
+    from files in the root folder.
 
     Args:
         job: what was fetched.
         split: description of the split.
         manifest: manifest of the data.
         store: the store of which the root folder is the working copy; None without one.
-        published: ids of scenarios that this store has already. They are fetched first,
-            because cards are made from files in the root folder.
     """
     if store:
-        store.fetch(published)
+        store.fetch(job.size.scenarios)
     cards = write_cards(job.root, job.size, split, manifest)
     if store:
         store.finish(manifest, cards)
@@ -262,11 +262,14 @@ class DownloadJob:
         root: Path,
         selected: Sequence[int],
         *,
+        stored: Collection[int],
         meter: Meter,
         connections: int,
     ) -> None:
         self.size = size
         self.root = root
+        # ids of files in the store of which the root folder is the working copy
+        self._stored = stored
         self._meter = meter
         self._connections = connections
         self.url: str | None = None  # store that files came from
@@ -280,6 +283,8 @@ class DownloadJob:
         self._entries: list[FileEntry] = []
         self.present: list[int] = []
         self.missing: list[int] = []  # still to fetch
+        # ids that were not selected and whose files are gone
+        self.forgotten: list[int] = []
         meter.begin("checking", total=len(selected), scenarios=len(selected))
         for scenario in selected:
             inspected = inspect_scenario(
@@ -408,7 +413,8 @@ class DownloadJob:
             self.size,
             url,
             requests,
-            self._count,
+            self._count_bytes,
+            meter=self._meter,
             limit=sum(longest_files) + MANIFEST_LIMIT,
             hint=HINT,
         )
@@ -428,7 +434,9 @@ class DownloadJob:
     ) -> NotInStoreError | None:
         """Fetch files side by side; return the error of the last one not there."""
         last_absent = None
-        arrivals = fetch_scenarios(requests, self._count, connections=self._connections)
+        arrivals = fetch_scenarios(
+            requests, self._count_progress, connections=self._connections
+        )
         with closing(arrivals):
             for scenario, absent in arrivals:
                 if absent is None:
@@ -455,21 +463,34 @@ class DownloadJob:
         self.url = hide_user(url)
         self._meter.count(scenarios=1)
 
-    def _count(self, byte_count: int) -> None:
+    def _count_bytes(self, byte_count: int) -> None:
+        """Count bytes that came from a store."""
         self.byte_count += byte_count
+
+    def _count_progress(self, byte_count: int) -> None:
+        """Count bytes that came from a store, all of them of requested files."""
+        self._count_bytes(byte_count)
         self._meter.count(byte_count)
 
     def write_manifest(self) -> Manifest:
-        """Write the manifest of the selected files that are there; return it.
+        """Write the manifest of the files that are there; return it.
 
-        Scenarios that were not selected keep their entries of the old manifest. Without
-        any entry nothing is written.
+        Scenarios that were not selected keep their entries of the old manifest if the
+        folder, or the store of which it is the working copy, has their files. An empty
+        manifest is written only over an older one.
         """
-        record_entry_hashes(self.size.folder(self.root), self._entries)
+        folder = self.size.folder(self.root)
+        record_entry_hashes(folder, self._entries)
         kept_entries = []
+        self.forgotten = []
         for entry in self._old_manifest.files:
-            if entry.scenario not in self.missing:
+            if entry.scenario in self.missing:
+                continue
+            has_file = (folder / entry.path).is_file()
+            if has_file or entry.scenario in self._stored:
                 kept_entries.append(entry)
+            else:
+                self.forgotten.append(entry.scenario)
         update = {"files": tuple(kept_entries)}
         old_manifest = self._old_manifest.model_copy(update=update)
         manifest = merge_entries(self.size, old_manifest, self._entries)
@@ -478,6 +499,6 @@ class DownloadJob:
             for name, row in self.size.measured.statistics.items():
                 statistics[name] = tuple(row)
             manifest = manifest.model_copy(update={"statistics": statistics})
-        if manifest.files:
+        if manifest.files or (folder / MANIFEST_NAME).exists():
             write_manifest(self.root, manifest)
         return manifest

@@ -35,6 +35,7 @@ from .metadata import (
     ENDINGS,
     FORCE,
     NAME,
+    SHORT_NAMES,
     WALL_NUMBERS,
     ExportInfo,
     Format,
@@ -465,7 +466,9 @@ def _recorded_statistics(
     They are those of the registry, else of the manifest.
     """
     if size.measured:
-        return dict(size.measured.statistics), size.measured.dataset_sha256
+        statistics = dict(size.measured.statistics)
+        _check_names_of_statistics(size, statistics)
+        return statistics, size.measured.dataset_sha256
     manifest = read_manifest(root, size.split, size.name, size.major)
     if manifest is None or manifest.dataset_sha256 is None or not manifest.statistics:
         raise DataError(
@@ -486,6 +489,30 @@ def _recorded_statistics(
             fix=suggest_repair(size, root=root),
         )
     return dict(manifest.statistics), manifest.dataset_sha256
+
+
+def _check_names_of_statistics(
+    size: Size, statistics: Mapping[str, Sequence[float]]
+) -> None:
+    """Refuse recorded statistics that lack a quantity which the metadata state.
+
+    Train with two frames for each scenario has velocities, but no acceleration.
+    """
+    missing_names = []
+    for quantity in SHORT_NAMES.values():
+        for name in (f"{quantity}_mean", f"{quantity}_std"):
+            if name not in statistics:
+                missing_names.append(name)
+    if not missing_names:
+        return
+    raise DataError(
+        "the recorded statistics of train lack a quantity",
+        where=f"{size.split} {size.name} in {size.file}, key statistics",
+        expected="mean and standard deviation of velocity and acceleration",
+        got=f"no {', no '.join(missing_names)}",
+        fix="make the split again with three frames or more in a scenario of train: "
+        "an acceleration needs three",
+    )
 
 
 def _count_numbers(statistics: Mapping[str, Sequence[float]]) -> str:

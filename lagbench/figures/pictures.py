@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import operator
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,15 +68,19 @@ def plot(
         UnreadableFileError: the named file is no scenario file.
     """
     check_kind(kind)
+    if _is_file(source):
+        source = os.path.expanduser(source)
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     named_files = [source] if _is_file(source) else []
     with _blame_named_files(*named_files):
         if output is None:
-            output = _frame_path(file, frame)
-        require_place(Path(output), overwrite=overwrite)
-        return plot_frame(file, frame, output, kind=kind, dpi=dpi, registry=registry)
+            path = _frame_path(file, frame)
+        else:
+            path = Path(os.path.expanduser(output))
+        require_place(path, overwrite=overwrite)
+        return plot_frame(file, frame, path, kind=kind, dpi=dpi, registry=registry)
 
 
 @check_arguments
@@ -122,13 +127,15 @@ def animate(
     """
     if output is not None:
         films.check_ending(Path(output))
+    if _is_file(source):
+        source = os.path.expanduser(source)
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     second: Path | None = None
     named_files = [source] if _is_file(source) else []
     if isinstance(beside, str | Path):
-        second = Path(beside)
+        second = Path(os.path.expanduser(beside))
         named_files.append(second)
     elif beside is not None:
         second = find_scenario(
@@ -139,12 +146,14 @@ def animate(
             registry=registry,
         )
     if output is None:
-        output = f"{_data_name(file)}.mp4"
-    require_place(Path(output), overwrite=overwrite)
+        path = Path(f"{_data_name(file)}.mp4")
+    else:
+        path = Path(os.path.expanduser(output))
+    require_place(path, overwrite=overwrite)
     with _blame_named_files(*named_files):
         return films.animate(
             file,
-            output,
+            path,
             beside=second,
             kind=kind,
             frames_per_second=frames_per_second,

@@ -17,6 +17,7 @@ from lagbench.arguments import check_arguments
 from lagbench.atomic import checked_path
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError, check_installed, require
+from lagbench.submission.writer import expand_home
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
@@ -77,7 +78,7 @@ def export_onnx(
         UnreadableFileError: the file holds what an entry may not carry.
         WorkFailedError: the file cannot be written.
     """
-    target = Path(path)
+    target = expand_home(path, "export_onnx, path")
     if target.suffix != SUFFIX:
         raise UsageError(
             "an ONNX file needs its suffix",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,11 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
-from lagbench.submission.writer import PredictionsWriter, check_predictions_output
+from lagbench.submission.writer import (
+    PredictionsWriter,
+    check_predictions_output,
+    expand_home,
+)
 from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress
 
@@ -77,10 +82,12 @@ def predict_onnx(
         WorkFailedError: the model needs more time or memory than allowed, or another
             prediction writes the same output.
     """
-    check_predictions_output(Path(output), overwrite=overwrite)
-    declared = check_onnx(Path(model))
+    model_path = Path(os.path.expanduser(model))
+    output_path = expand_home(output)
+    check_predictions_output(output_path, overwrite=overwrite)
+    declared = check_onnx(model_path)
     named_split = split
-    split, size = _choose_data_set(split, size, declared, Path(model))
+    split, size = _choose_data_set(split, size, declared, model_path)
     try:
         any_tier, folder, known = locate(split, size, root=root, registry=registry)
     except UsageError as error:
@@ -88,19 +95,19 @@ def predict_onnx(
             raise
         raise UsageError(
             error.what,
-            where=f"{model}, the data set that it states",
+            where=f"{model_path}, the data set that it states",
             expected=error.expected,
             got=error.got,
             fix="name the split, or the folder of a local one: --split",
         ) from error
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
-    runner = open_onnx(Path(model), size=tier, root=folder, declared=declared)
-    label = method or Path(model).stem
+    runner = open_onnx(model_path, size=tier, root=folder, declared=declared)
+    label = method or model_path.stem
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
     writer = PredictionsWriter(
-        output,
+        output_path,
         split=tier.split,
         size=tier.name,
         method=label,
@@ -112,9 +119,9 @@ def predict_onnx(
         device=f"{processor_name()}, 1 thread",
     )
     seconds = 0.0
-    with hold_output(Path(output)):
+    with hold_output(output_path):
         # Another prediction may have written it since the first check.
-        check_predictions_output(Path(output), overwrite=overwrite)
+        check_predictions_output(output_path, overwrite=overwrite)
         with writer:
             for scenario, path in paths.items():
                 rollout = runner.roll_out(path)
@@ -129,7 +136,7 @@ def predict_onnx(
             if solver_seconds is not None:
                 writer.label(solver_seconds_per_frame=solver_seconds)
     return OnnxPredictionResult(
-        path=Path(output),
+        path=output_path,
         split=tier.split,
         size=tier.name,
         method=label,

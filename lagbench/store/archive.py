@@ -33,6 +33,7 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
+from lagbench.work.progress import Meter
 
 from .copy import parse_manifest, refuse_foreign_hashes, update_working_copy
 from .fetch import (
@@ -153,6 +154,7 @@ def fetch_archive(
     requests: Mapping[int, FetchRequest],
     report: Callable[[int], None],
     *,
+    meter: Meter,
     limit: int,
     hint: str,
 ) -> Generator[FileEntry, None, None]:
@@ -167,6 +169,8 @@ def fetch_archive(
         requests: files to fetch, by scenario id.
         report: receives the number of bytes that arrived. It counts all members,
             also those that are read only to reach a later one.
+        meter: begins a stage once the manifest tells the lengths of the requested
+            files, and counts their bytes. The caller counts the files.
         limit: most bytes of an archive.
         hint: how the user mends a store with wrong data.
 
@@ -179,6 +183,11 @@ def fetch_archive(
     missing = set(requests)
     with closing(_Stream(address, report, limit=limit, hint=hint)) as stream:
         manifest = _fetch_manifest(size, stream, address, hint)
+        byte_count = 0
+        for entry in manifest.files:
+            if entry.scenario in requests:
+                byte_count += entry.bytes
+        meter.begin("downloading", total=byte_count, scenarios=len(requests))
         for entry in sorted(manifest.files, key=ARCHIVE_ORDER):
             if not missing:
                 return
@@ -189,7 +198,7 @@ def fetch_archive(
             request = replace(
                 requests[entry.scenario], url=address, file_sha256=entry.file_sha256
             )
-            _fetch_member(stream, entry, request)
+            _fetch_member(stream, entry, request, meter)
             missing.remove(entry.scenario)
             yield entry
             stream.skip(padding)
@@ -221,7 +230,9 @@ def _fetch_manifest(size: Size, stream: _Stream, address: str, hint: str) -> Man
     return manifest
 
 
-def _fetch_member(stream: _Stream, entry: FileEntry, request: FetchRequest) -> None:
+def _fetch_member(
+    stream: _Stream, entry: FileEntry, request: FetchRequest, meter: Meter
+) -> None:
     length = stream.member(entry.path)
     if length != entry.bytes or length > request.limit:
         raise stream.error(
@@ -232,7 +243,12 @@ def _fetch_member(stream: _Stream, entry: FileEntry, request: FetchRequest) -> N
     partial = partial_name(request.target)
     with partial_file_errors(partial):
         with partial.open("wb") as file:
-            stream.copy(length, file.write)
+
+            def write(block: bytes) -> None:
+                file.write(block)
+                meter.count(len(block))
+
+            stream.copy(length, write)
         accept(request)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_output_file
-from lagbench.data.layout import format_ids
+from lagbench.data.layout import expand_path, format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.variables import open_netcdf
@@ -577,7 +577,7 @@ def write(
         WorkFailedError: the disk is full or not writable.
     """
     writer = PredictionsWriter(
-        path,
+        expand_home(path, "path"),
         split=split,
         size=size,
         method=method,
@@ -658,6 +658,23 @@ class TemplateResult:
     bytes: int
 
 
+def expand_home(output: str | Path, where: str = "--output") -> Path:
+    """Return the path of a file to write, ~ replaced by the home folder.
+
+    Other relative paths stay relative.
+
+    Args:
+        output: the path that a user gave.
+        where: the option or argument that held it, for the message.
+
+    Raises:
+        UsageError: the user of ``~user`` has no home folder.
+    """
+    if str(output).startswith("~"):
+        return expand_path(output, where)
+    return Path(output)
+
+
 def check_predictions_output(output: Path, *, overwrite: bool) -> None:
     """Refuse, before the work, a file that predictions must not be written to.
 
@@ -712,12 +729,13 @@ def template(
     """
     any_size, folder, splits = locate(split, size, root=root, registry=registry)
     entry = any_size.scored_on(subset)
-    check_predictions_output(Path(output), overwrite=overwrite)
+    output_path = expand_home(output)
+    check_predictions_output(output_path, overwrite=overwrite)
     update_working_copy(entry, folder, entry.subsets[subset])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
-        output,
+        output_path,
         split=entry.split,
         size=entry.name,
         method="persistence",

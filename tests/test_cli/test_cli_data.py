@@ -18,12 +18,14 @@ import pytest
 import yaml
 from conftest import SIZE, SPLIT
 from exchange_readers import straight_runs
+from registry_text import described_splits
 from typer.testing import Result
 
 import lagbench
 from lagbench.cli import doctor
 from lagbench.cli.doctor import REQUIRED_LIBRARIES
-from lagbench.data.registry import load
+from lagbench.data.registry import default_path, load
+from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.references.shipped import shipped
 
@@ -337,6 +339,71 @@ def test_bibtex_of_a_split_has_its_version_and_every_hash(
     assert len(measured) == 3
     for size in measured.values():
         assert size.dataset_sha256 in fields["note"]
+
+
+def write_registry(path: Path, registry: dict[str, Any], **changes: str) -> None:
+    """Write a registry whose split cavity has other values."""
+    cavity = {**registry["splits"]["cavity"], **changes}
+    changed = {**registry, "splits": {"cavity": cavity}}
+    path.write_text(yaml.safe_dump(changed))
+
+
+def test_no_hash_of_an_older_version_is_cited(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The hash says which version it is of; of a new version there is none at first."""
+    registry = yaml.safe_load(default_path().read_text())
+    measured = registry["measured"]["cavity"]
+    registry["measured"] = {"cavity": measured}
+    major = int(registry["splits"]["cavity"]["version"].split(".")[0])
+    path = tmp_path / "datasets.yaml"
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
+    outputs = {}
+    for version in (f"{major}.9.0", f"{major + 1}.0.0"):
+        write_registry(path, registry, version=version)
+        for words in ((), ("--bibtex",), ("--json",)):
+            outputs[version, words] = run("cite", "cavity", *words).stdout
+    for (version, _), output in outputs.items():
+        assert version in output
+        for values in measured.values():
+            is_cited = values["dataset_sha256"] in output
+            assert is_cited == version.startswith(f"{major}.")
+    note = bibtex_fields(outputs[f"{major + 1}.0.0", ("--bibtex",)])["note"]
+    assert "SHA" not in note
+
+
+def test_a_citation_of_a_stranger_s_split_is_well_formed(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """BibTeX counts braces behind a backslash too, and TeX reads ^ and ~."""
+    path = tmp_path / "datasets.yaml"
+    registry = yaml.safe_load(described_splits())
+    write_registry(
+        path, registry, title="A { jet\nData set hash of", citation="x^2 ~ {y"
+    )
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
+    fields = bibtex_fields(run("cite", "cavity", "--bibtex").stdout)
+    assert fields["title"].startswith("A ")
+    for field in fields.values():
+        assert not re.search(r"\\[{}]|[\^~]", field)
+    for line in run("cite", "cavity").stdout.splitlines():
+        assert not line.startswith("Data set hash of")
+
+
+@pytest.mark.parametrize("name", [".", "../own", "split.yaml"])
+def test_an_export_is_named_after_its_split(
+    name: str,
+    run: Run,
+    original: LocalSplit,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A local split may be named by the working folder."""
+    shutil.copytree(original.folder, tmp_path / "own")
+    monkeypatch.chdir(tmp_path / "own")
+    data = printed_data(run, "export", name)
+    assert data["split"] == "own"
+    assert Path(data["folder"]).name == f"own-{data['size']}-gns-npz"
 
 
 def test_without_a_split_lagbench_itself_is_cited(run: Run) -> None:

@@ -95,6 +95,21 @@ def test_a_file_is_replaced_only_on_request(
     assert Path(name).read_bytes()[:3] in {b"\x89PN", b"GIF"}
 
 
+@pytest.mark.slow
+def test_a_sheet_may_go_to_the_home_folder(
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Shells do not expand --output=~/sheet.png."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    words = ("plot", SPLIT, "--size", SIZE, "--root", generated.root, "--sheet")
+    result = run(*words, "--output=~/sheet.png")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
+
+
 def test_a_device_is_no_place_for_a_picture(
     run: Run, generated: GenerationResult
 ) -> None:

@@ -403,6 +403,23 @@ def test_an_option_is_no_value_of_another_one(
 
 
 @pytest.mark.parametrize(
+    "command",
+    [
+        "predict none.pt --method checkpoint",
+        "submit none.nc --name predictions",
+        "score none.nc --split predictions",
+        "plot --split source",
+    ],
+)
+def test_a_value_may_be_a_word_of_the_command_s_own(
+    command: str, type_command: Callable[[str], Result]
+) -> None:
+    """Nobody types the names that arguments have in the code."""
+    result = type_command(command)
+    assert "has no value" not in result.stderr
+
+
+@pytest.mark.parametrize(
     "words", [["-o", ""], ["-qo", ""], ["--output", ""], ["--output="]]
 )
 @pytest.mark.parametrize("command", ["score good.nc", "template curl-noise"])

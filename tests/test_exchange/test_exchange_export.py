@@ -646,6 +646,28 @@ def test_statistics_of_another_form_stop_the_export(
     assert not output.exists()
 
 
+@pytest.mark.parametrize("file_format", ["gns-npz", "lagrangebench-h5"])
+def test_train_without_accelerations_stops_the_export(
+    tmp_path: Path, file_format: str
+) -> None:
+    """Two frames have one velocity, so that statistics of accelerations are missing."""
+    source = tmp_path / "source"
+    for subset, frame_count in (("train", 2), ("valid", 8), ("test", 8)):
+        folder = source / subset
+        folder.mkdir(parents=True)
+        (run,) = straight_runs(1, frames=frame_count, particles=20)
+        np.save(folder / "run.npy", run)
+    own = adopt(
+        source, output=tmp_path / "own", radius=0.1, frame_interval=0.1, spacing=0.05
+    )
+    output = tmp_path / "out"
+    with pytest.raises(DataError) as caught:
+        export(own.folder, format=file_format, output=output)
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+    assert not output.exists()
+
+
 def test_a_folder_below_home_is_that_of_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

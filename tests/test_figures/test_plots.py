@@ -153,6 +153,37 @@ CUTS = {
 }
 
 
+def test_paths_of_pictures_may_begin_with_the_home_folder(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of files that are read, too; a damaged one is still the user's file."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "own.nc").symlink_to(swirl)
+    (home / "text.nc").write_text("no netCDF")
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(home))
+    picture = plot("~/own.nc", kind="speed", output="~/picture.png")
+    assert picture == home / "picture.png"
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    film = animate(
+        Path("~/own.nc"), beside="~/own.nc", every=3, output=Path("~/film.gif")
+    )
+    assert film == home / "film.gif"
+    assert film.read_bytes()[:3] == b"GIF"
+    with pytest.raises(UsageError) as caught:
+        plot("~/own.nc", output="~/picture.png")
+    assert str(picture) in str(caught.value.got)
+    with pytest.raises(UsageError):
+        plot("~/own.nc", output="~no-such-user/picture.png")
+    for draw in (plot, animate):
+        with pytest.raises(UnreadableFileError):
+            draw("~/text.nc")
+    assert list(here.iterdir()) == []
+
+
 @pytest.mark.parametrize("cut", CUTS)
 def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
     """Frames may be missing before, between or behind those that are left."""

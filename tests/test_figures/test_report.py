@@ -13,6 +13,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from board_bench import (
@@ -439,6 +440,33 @@ def test_methods_of_one_name_are_numbered(home: Path, tmp_path: Path) -> None:
     page = scored.report(tmp_path)
     reading = read_html(page.read_text("utf-8"))
     assert title_of(reading) == "gns (1) · gns (2) · persistence (1)"
+
+
+@pytest.mark.parametrize("split", ["curl-noise", "fluid"])
+def test_a_method_may_have_the_name_of_a_row(
+    home: Path, tmp_path: Path, split: str
+) -> None:
+    """Panels of the truth, of the method and of their difference stand in rows."""
+    bench = make_report_bench(home, split)
+    methods = (("truth", damped), ("difference", noisy), ("speed", still))
+    page = score_methods(bench, tmp_path, *methods).report(tmp_path)
+    reading = read_html(page.read_text("utf-8"))
+    assert title_of(reading) == "truth · difference · speed"
+
+
+def test_files_of_another_minor_version_of_the_data_are_reported_together(
+    home: Path, tmp_path: Path
+) -> None:
+    """The hash identifies the data set, and only MAJOR versions change it."""
+    bench = make_report_bench(home, "curl-noise")
+    scored = score_methods(bench, tmp_path, ("a", damped), ("b", noisy))
+    _, second = scored.paths
+    major, _, _ = bench.size.version.partition(".")
+    with h5py.File(second, "r+") as file:
+        file.attrs["dataset_version"] = f"{major}.99.0"
+    scored.cards[1] = bench.card(second)
+    page = scored.report(tmp_path)
+    assert title_of(read_html(page.read_text("utf-8"))) == "a · b"
 
 
 def test_score_reports_must_belong_together(home: Path, tmp_path: Path) -> None:

@@ -464,6 +464,66 @@ def shorter_in_the_file(window: Batch) -> torch.Tensor:
     return now
 
 
+def earlier_frame(window: Batch) -> torch.Tensor:
+    """Return a frame that is not given."""
+    return window.position[:, -1000]
+
+
+def unknown_input(window: Batch) -> torch.Tensor:
+    """Return what a window does not have."""
+    inputs = {"position": window.position}
+    return inputs["density"]
+
+
+def obstacle_needed(window: Batch) -> torch.Tensor:
+    """Return the last positions where there is an obstacle."""
+    assert window.obstacle is not None
+    return window.position[:, -1]
+
+
+def all_frames(window: Batch) -> torch.Tensor:
+    """Return several frames."""
+    return window.position
+
+
+def one_component(window: Batch) -> torch.Tensor:
+    """Return positions along x."""
+    return window.position[:, -1, 0]
+
+
+def fewer_particles(window: Batch) -> torch.Tensor:
+    """Return the positions of all particles but one."""
+    return window.position[1:, -1]
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        earlier_frame,
+        unknown_input,
+        obstacle_needed,
+        all_frames,
+        one_component,
+        fewer_particles,
+    ],
+)
+def test_a_step_that_cannot_predict_the_next_frame_is_refused(
+    step: Callable[[Batch], torch.Tensor], tmp_path: Path, generated: GenerationResult
+) -> None:
+    """The file would be refused only where it predicts."""
+    with pytest.raises(UsageError) as caught:
+        export_onnx(
+            step,
+            tmp_path / "model.onnx",
+            split=SIZE.split,
+            size=SIZE.name,
+            root=generated.root,
+        )
+    error = caught.value
+    assert None not in (error.where, error.expected, error.got, error.fix)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("step", "what"),
     [
@@ -542,6 +602,62 @@ def test_predictions_state_the_seed_that_is_given(
     weights = CliRunner().invoke(app, ["predict", "weights.pt", "--seed", "3"])
     assert weights.exit_code == 2
     assert "--seed" in weights.output
+
+
+def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
+    tmp_path: Path, generated: GenerationResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In Python and on the command line, also of weights."""
+    home = tmp_path / "home"
+    here = tmp_path / "here"
+    for folder in (home, here):
+        folder.mkdir()
+    straight_on(home / "lines.onnx")
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(home))
+    options: dict[str, Any] = {
+        "split": SIZE.split,
+        "size": SIZE.name,
+        "root": generated.root,
+    }
+    result = predict_onnx("~/lines.onnx", "~/predictions.nc", **options)
+    assert result.path == home / "predictions.nc"
+    assert result.path.is_file()
+    with pytest.raises(UsageError) as caught:
+        predict_onnx("~/lines.onnx", "~/predictions.nc", **options)
+    assert "--overwrite" in str(caught.value.fix)
+    with pytest.raises(UsageError):
+        predict_onnx("~/lines.onnx", "~no-such-user/predictions.nc", **options)
+
+    words = ["predict", "~/lines.onnx", "--split", SIZE.split, "--size", SIZE.name]
+    words += ["--root", str(generated.root), "--no-bench"]
+    command = CliRunner().invoke(app, [*words, "--output=~/command.nc"])
+    assert command.exit_code == 0, command.output
+    assert (home / "command.nc").is_file()
+    weights = CliRunner().invoke(app, ["predict", "~/weights.pt"])
+    assert weights.exit_code == 3
+    assert str(home / "weights.pt") in weights.output
+    assert list(here.iterdir()) == []
+
+
+def test_a_model_may_be_exported_to_the_home_folder(
+    tmp_path: Path, generated: GenerationResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+    def step(window: Batch) -> torch.Tensor:
+        return window.position[:, -1]
+
+    path = export_onnx(
+        step,
+        "~/still.onnx",
+        split=SIZE.split,
+        size=SIZE.name,
+        root=generated.root,
+    )
+    assert path == tmp_path / "still.onnx"
+    assert path.is_file()
 
 
 def test_two_predictions_of_onnx_files_do_not_write_one_file_at_a_time(

@@ -24,6 +24,7 @@ from lagbench.exchange.downloading import DownloadResult
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import archive, fetch, objects
+from lagbench.work.progress import Progress
 
 DATA = f"{SPLIT}/{SIZE}/v2"
 
@@ -412,6 +413,24 @@ def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) ->
     with serving(original.folder.parent) as running:
         assert fetch_own(running.url, here).complete
         assert running.count(".tar") == 0
+
+
+@pytest.mark.parametrize("fault", ["", "no ranges", "drops"])
+@pytest.mark.parametrize("subset", ["test", "train", None])
+def test_progress_ends_at_the_bytes_of_the_requested_files(
+    server: Mirror, here: Path, subset: str | None, fault: str
+) -> None:
+    """Bytes of other members, and of the archive's manifest, are no progress."""
+    server.faults = {".tar": fault}
+    states: list[Progress] = []
+    download("own", mirror=server.url, root=here, subset=subset, progress=states.append)
+    length = 0
+    for content in read_scenarios(here).values():
+        length += len(content)
+    last = states[-1]
+    assert last.done == last.total == length
+    for state in states:
+        assert state.done <= state.total
 
 
 def requested_ranges(server: Mirror) -> list[str | None]:

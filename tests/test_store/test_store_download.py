@@ -5,7 +5,7 @@ nothing else.
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +108,52 @@ def test_existing_files_are_not_fetched_again(store: Store, here: Path) -> None:
     assert not result.complete
     if store.server:
         assert store.server.count("0001.nc") == 1
+
+
+def test_the_manifest_forgets_files_that_are_gone(server: Mirror, here: Path) -> None:
+    """Also if only other scenarios are selected."""
+    assert download("own", root=here, mirror=server.url).complete
+    (here / "own/full/v1/test/0003.nc").unlink()
+    result = download("own", root=here, mirror=server.url, subset="train")
+    assert result.kept == (0, 1)
+    assert not result.complete
+    assert result.dataset_sha256 is None
+    manifest = lagbench.load_manifest("own", root=here)
+    assert not manifest.complete
+    assert [entry.scenario for entry in manifest.files] == [0, 1, 2]
+
+
+def test_the_card_forgets_files_that_are_gone(
+    generated: GenerationResult, copied: Callable[[], Path]
+) -> None:
+    """It states the content hash of each scenario that the manifest names."""
+    root = copied()
+    manifest = lagbench.load_manifest(SPLIT, SIZE, root=root)
+    entry = manifest.entry(3)
+    assert entry is not None
+    folder = generated.folder.relative_to(generated.root)
+    card = root / folder / "README.md"
+    assert entry.content_sha256 in card.read_text()
+    (root / folder / entry.path).unlink()
+    with serving(generated.root) as running:
+        result = download(SPLIT, SIZE, root=root, mirror=running.url, subset="train")
+    assert result.downloaded == ()
+    assert entry.content_sha256 not in card.read_text()
+
+
+def test_the_manifest_forgets_all_files_where_all_are_gone(
+    server: Mirror, here: Path
+) -> None:
+    """A store that has nothing cannot bring them back."""
+    assert download("own", root=here, mirror=server.url).complete
+    for path in here.rglob("*.nc"):
+        path.unlink()
+    server.faults = {".nc": "gone", ".json": "gone"}
+    with pytest.raises(objects.NotInStoreError):
+        download("own", root=here, mirror=server.url, or_generate=False)
+    manifest = lagbench.load_manifest("own", root=here)
+    assert not manifest.complete
+    assert manifest.files == ()
 
 
 def test_half_a_file_is_completed(

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import SIZE, SPLIT
+from conftest import PAINT_PICTURES, PICTURE_PAINTER, SIZE, SPLIT
 from object_stores import files, fill, machine, objects, put, remove
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import url_of
 from lagbench.data.local import resolve_root
-from lagbench.data.manifest import read_manifest
+from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange import download
@@ -303,6 +303,68 @@ def test_a_file_that_changed_is_not_put(
     with pytest.raises(DataError):
         run(url, scenarios="3")
     assert f"{FOLDER}/train/0000.nc" not in objects(url)
+
+
+def describe_own_split(original: LocalSplit, url: str) -> None:
+    """Put the description of a local split into the working copy of a store."""
+    folder = resolve_root(url) / "own"
+    folder.mkdir(parents=True)
+    shutil.copy(original.folder / "split.yaml", folder)
+
+
+def read_stored_scenarios(url: str) -> list[int]:
+    """Return the ids that the manifest of a store names."""
+    text = objects(url)["own/full/v1/manifest.json"]
+    manifest = Manifest.model_validate_json(text)
+    return [entry.scenario for entry in manifest.files]
+
+
+def test_a_download_keeps_the_entries_of_files_that_only_the_store_has(
+    original: LocalSplit, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine without files downloads one more subset into the store."""
+    source = original.folder.parent.as_uri()
+    describe_own_split(original, url)
+    download("own", root=url, mirror=source, subset="train")
+    machine(monkeypatch, tmp_path / "second")
+    describe_own_split(original, url)
+    result = download("own", root=url, mirror=source, subset="test")
+    assert result.downloaded == (3,)
+    assert read_stored_scenarios(url) == [0, 1, 3]
+
+
+def test_two_machines_download_simulated_data_into_a_store(
+    generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The card of the second one shows scenarios that only the store holds."""
+    monkeypatch.setattr(PICTURE_PAINTER, PAINT_PICTURES)
+    machine(monkeypatch, tmp_path / "first")
+    url = (tmp_path / "store").as_uri()
+    source = generated.root.as_uri()
+    download(SPLIT, SIZE, root=url, mirror=source, subset="test")
+    machine(monkeypatch, tmp_path / "second")
+    result = download(SPLIT, SIZE, root=url, mirror=source, subset="train,valid")
+    assert result.complete
+    stored = objects(url)
+    for name in ("README.md", "croissant.json"):
+        expected = (generated.root / FOLDER / name).read_bytes()
+        assert stored[f"{FOLDER}/{name}"] == expected
+
+
+def test_a_download_forgets_files_that_neither_store_nor_working_copy_has(
+    original: LocalSplit, url: str
+) -> None:
+    source = original.folder.parent.as_uri()
+    describe_own_split(original, url)
+    download("own", root=url, mirror=source)
+    for path in resolve_root(url).rglob("*.nc"):
+        path.unlink()
+    for name in objects(url):
+        remove(url, name)
+    result = download("own", root=url, mirror=source, subset="test")
+    assert result.downloaded == (3,)
+    assert not result.complete
+    assert read_stored_scenarios(url) == [3]
 
 
 def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:

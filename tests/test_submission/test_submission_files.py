@@ -141,6 +141,38 @@ def test_the_template_is_the_last_given_frame_repeated(
     assert not output.exists()
 
 
+def test_predictions_may_be_written_to_the_home_folder(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As pictures and exports; no folder named ~ appears."""
+    home = tmp_path / "home"
+    here = tmp_path / "here"
+    for folder in (home, here):
+        folder.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(home))
+    location: dict[str, Any] = {
+        "root": bench.root,
+        "registry": bench.registry,
+    }
+    result = template("cavity", "tiny", output="~/t.nc", **location)
+    assert result.path == home / "t.nc"
+    assert bench.validate(result.path).exit_code == 0
+    with pytest.raises(UsageError) as caught:
+        template("cavity", "tiny", output="~/t.nc", **location)
+    assert "--overwrite" in caught.value.fix
+    positions = {}
+    with open_predictions(result.path) as predictions:
+        for scenario in TESTS:
+            positions[scenario] = predictions.frames(scenario, GIVEN, HORIZON)
+    written = write(
+        "~/w.nc", positions, split="cavity", size="tiny", method="dot", **location
+    )
+    assert written == home / "w.nc"
+    assert bench.validate(written).exit_code == 0
+    assert list(here.iterdir()) == []
+
+
 def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
     bench: Bench, tmp_path: Path
 ) -> None:
