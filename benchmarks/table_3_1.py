@@ -201,7 +201,7 @@ def exponents_of_measurements(measurements: Sequence[TimedRow]) -> Exponents:
     return _fit_exponents(rows, measurements)
 
 
-def describe(device: str, machine: str) -> list[str]:
+def describe(device: str, machine: str, repeats: int) -> list[str]:
     """Return the title of the table and the paragraphs that explain it."""
     ours = f"with `--device {device}`"
     if machine:
@@ -215,21 +215,27 @@ def describe(device: str, machine: str) -> list[str]:
         "3.1 of the thesis. q is its quality factor: the number of particles grows "
         "roughly as q^2.",
         "",
-        "All times are in milliseconds; fps is the number of frames per second. "
-        "t/frame is the time of one run with all substeps of a frame. t/substep "
-        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each of the "
-        "two runs ends with one copy of all positions. So t/substep contains a part of "
-        "this copy, and t/frame may be less than t/substep times the substeps.",
+        f"Each time is the shortest of {repeats} runs, in milliseconds: on the CPU "
+        "processor time, on a GPU time on the wall. fps is the number of frames per "
+        "second. t/frame is the time of a run with all substeps of a frame. t/substep "
+        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each run ends "
+        "with one copy of all positions. If a frame has 40 substeps, t/frame is "
+        "therefore a little less than 40 times t/substep. If a frame has "
+        f"{FIXED} substeps, the two runs are the same, and a difference is noise.",
         "",
     ]
 
 
 def markdown(
-    measurements: Sequence[TimedRow], device: str, *, machine: str = ""
+    measurements: Sequence[TimedRow],
+    device: str,
+    *,
+    repeats: int,
+    machine: str = "",
 ) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        *describe(device, machine),
+        *describe(device, machine, repeats),
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame / our t/frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
@@ -351,7 +357,9 @@ def main() -> int:
         measurements.append(measurement)
 
     device = options.device.value
-    table = markdown(measurements, device, machine=options.machine)
+    table = markdown(
+        measurements, device, repeats=options.repeats, machine=options.machine
+    )
     options.output.mkdir(parents=True, exist_ok=True)
     table_path = options.output / f"table_3_1_{device}.md"
     table_path.write_text(table, encoding="utf-8")

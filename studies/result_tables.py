@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
-from typing import Any
 
 from lagbench.board.overview import (
     LearningVerdict,
@@ -25,6 +24,7 @@ from .thesis.published import MEASURES, OPERATORS, TABLE_4_8, TABLE_5_4
 from .thesis.roster import label
 from .thesis.split_results import (
     Method,
+    ScoredTraining,
     SplitResults,
     count_start_steps,
     format_budget,
@@ -501,7 +501,7 @@ def cost_table(results: SplitResults) -> str:
     for name, method in results.models.items():
         recipes = [training.record.get("recipe", {}) for training in method.trainings]
         recipe_names = [recipe.get("name", "-") for recipe in recipes]
-        changes = [_changes(recipe) for recipe in recipes]
+        changes = [_changes(training) for training in method.trainings]
         parameters = "-"
         if method.parameters is not None:
             parameters = f"{method.parameters:,}"
@@ -525,13 +525,23 @@ def cost_table(results: SplitResults) -> str:
     return markdown(heads, rows)
 
 
-def _changes(recipe: Mapping[str, Any]) -> str:
-    """Return the changed options of a recipe; a dash without a recipe."""
+def _changes(training: ScoredTraining) -> str:
+    """Return the options that a training and its prediction changed.
+
+    A dash stands for a training without a recipe.
+    """
     from lagbench.baselines.recipe_changes import describe_changes  # loads torch
 
+    recipe = training.record.get("recipe")
     if not recipe:
-        return "-"
-    return recipe.get("changed") or "; ".join(describe_changes(recipe)) or "none"
+        return "; ".join(training.predicted_with) or "-"
+    changes = []
+    if recipe.get("changed"):
+        changes.append(recipe["changed"])
+    else:
+        changes += describe_changes(recipe)
+    changes += training.predicted_with
+    return "; ".join(changes) or "none"
 
 
 def _frame_costs(method: Method) -> Iterator[str]:

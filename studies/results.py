@@ -160,12 +160,13 @@ trainings."""
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
 from the recipe. `none` means that no option differs. If the seeds of a model have
-different values, slashes separate the values, in the order of the seeds. If there is
-no record of the training, `recipe` and `changed` come from the entry. The speed-up is
-the time of our solver for a frame, on one core, divided by the time of the model on the
-same machine. The times are those of the entry, mostly means over whole rollouts. The
-first table of this page has means over the first ten frames, which were measured in
-another run. So the two can differ. Hours do not include validations."""
+different values, slashes separate the different values. A value that several seeds
+share stands only once. If there is no record of the training, `recipe` and `changed`
+come from the entry. The speed-up is the time of our solver for a frame, on one core,
+divided by the time of the model on the same machine. The times are those of the entry,
+mostly means over whole rollouts. The first table of this page has means over the first
+ten frames, which were measured in another run. So the two can differ. Hours do not
+include validations, except in the first trainings of NeuralMPM."""
 
 COMMANDS = """\
 ## How to make these results again
@@ -182,12 +183,12 @@ lagbench submit predictions.nc --from meta.yaml
 and figures of a size. If you interrupt the command, the same command continues.
 `lagbench submit` makes entries from the trained models.
 
-Some results have no entry. They come from two files in the subfolder `<split>/<size>/`
-of a folder. The option `--studies` or `--runs` names this folder.
-`python -m studies.thesis` writes `mlp_studies.json` into the folder of runs.
-`var_protocol.json` is the output of
-`python -m studies.thesis.var_protocol --size mini --json`. Neither file is committed,
-so this page does not show such results.
+This page shows only results that have an entry. `python -m studies.results` can also
+show the results of two files that are not in the repository. It looks for them in the
+subfolder `<split>/<size>/` of the folder that its option `--studies` or `--runs` names.
+`python -m studies.thesis` writes the first file, `mlp_studies.json`, into the folder of
+runs. The second file, `var_protocol.json`, is the output of
+`python -m studies.thesis.var_protocol --size mini --json`.
 
 A variant is a model with other options, with another recipe, or with another way of
 prediction:"""
@@ -293,8 +294,9 @@ def _chapter(results: SplitResults) -> Iterator[str]:
 
     if size.split in TABLE_4_8:
         yield (
-            "This table has the errors of a rollout for each scene, as Table 4.8 of "
-            "the thesis. A cell is our value / the value of the thesis."
+            "This table has two errors for each scene, as Table 4.8 of the thesis: "
+            "`average` is `mse_avg` of the scenario, and `end` is its `mse_end`. A "
+            "cell is our value / the value of the thesis."
         )
         yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
     elif size.split in EXPECTED:

@@ -53,7 +53,7 @@ def cite_command(
 
     Without a split it prints how to cite lagbench itself.
     """
-    if not (split_argument or split_option):
+    if split_argument is None and split_option is None:
         _cite_program(bibtex=bibtex, as_json=as_json)
         return
 

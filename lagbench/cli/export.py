@@ -67,12 +67,12 @@ def export_command(
 
     The folder holds the subsets train, valid and test, and a file of metadata.
     """
-    size_name = locate(split, size, root=root).size.name
-    folder = output or Path(f"{Path(split).name}-{size_name}-{file_format}")
+    tier = locate(split, size, root=root).size
+    folder = output or Path(f"{tier.split}-{tier.name}-{file_format}")
     with progress_bar(quiet=quiet) as progress:
         result = export(
             split,
-            size_name,
+            tier.name,
             format=file_format,
             output=folder,
             root=root,

@@ -362,7 +362,7 @@ def reproduce_command(
     if not as_json:
         for failure in result.failures:
             print_on_stderr(f"{failure.entry}: {failure.error}")
-    lines = _describe_reproduced(result, with_costs=not no_costs)
+    lines = _describe_reproduced(result, with_scores=not costs, with_costs=not no_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
@@ -375,8 +375,16 @@ def _time_solver(split: str, size: str) -> float | None:
     return solver.seconds_per_frame
 
 
-def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterator[str]:
-    """Yield a text line for each seed and each cost, then the totals."""
+def _describe_reproduced(
+    result: ReproduceResult, *, with_scores: bool, with_costs: bool
+) -> Iterator[str]:
+    """Yield a text line for each seed and each cost, then the totals.
+
+    Args:
+        result: what was run, and what was recorded before.
+        with_scores: whether scores were asked for.
+        with_costs: whether costs were asked for.
+    """
     for path, verification in result.lines.items():
         entry_name = path.removeprefix("submissions/").removesuffix(".yaml")
         for seed_result in verification.reproduced:
@@ -388,7 +396,9 @@ def _describe_reproduced(result: ReproduceResult, *, with_costs: bool) -> Iterat
                 verdict = "NOT reproduced"
             remark = ""
             if name not in result.predicted:
-                remark = f"; recorded on {verification.date}, --again runs it now"
+                remark = f"; recorded on {verification.date}"
+                if with_scores:
+                    remark += ", --again runs it now"
             yield (
                 f"{name}: {verdict}, {seed_result.metric} "
                 f"{seed_result.reproduced:.6g} against {seed_result.submitted:.6g} "

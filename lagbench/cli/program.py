@@ -97,8 +97,8 @@ _LONG_OPTION = re.compile(r"--[a-z][a-z-]*(=.*)?", re.DOTALL)
 SIZE_NAMES = frozenset({"tiny", "mini", "full"})
 """Names of sizes that a user may write behind the split."""
 
-PATH_PLACEHOLDERS = frozenset({"FILE", "FOLDER"})
-"""What the help shows in place of a path."""
+PATH_PLACEHOLDERS = frozenset({"FILE", "FOLDER", "A", "B"})
+"""What the help shows in place of a path; A and B are the two sides of compare."""
 
 NEAR_NAME = 0.8
 """Likeness of two options, of 1, from which one is a misspelt other."""
@@ -116,8 +116,10 @@ class _CheckedCommand(TyperCommand):
 
         names: set[str] = set()
         for parameter in self.get_params(ctx):
-            names.update(parameter.opts)
-            names.update(parameter.secondary_opts)
+            # an argument has no name that a user could type
+            if parameter.param_type_name == "option":
+                names.update(parameter.opts)
+                names.update(parameter.secondary_opts)
         values, _, _ = self.make_parser(ctx).parse_args(args=typed_words)
         for parameter in self.get_params(ctx):
             value = values.get(parameter.name)

@@ -268,16 +268,25 @@ def _describe_budget(result: TrainingResult) -> str:
     windows = ""
     if result.windows_seen:
         windows = f"{result.windows_seen:,} windows, "
-    epochs = f"{_format_number(result.epochs)} epochs"
-    if result.epochs == 1:
-        epochs = "1 epoch"
     validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     return (
-        f"{windows}{epochs}; "
+        f"{windows}{_describe_epochs(result.epochs)}; "
         f"{validation_share:.0%} of the processor time for validations; "
         f"{result.device}, {format_count(result.threads, 'thread')}; "
         f"{_describe_track(result)}"
     )
+
+
+def _describe_epochs(epochs: float) -> str:
+    """Return a number of epochs in words.
+
+    >>> _describe_epochs(1.0004), _describe_epochs(1.5)
+    ('1 epoch', '1.5 epochs')
+    """
+    number = _format_number(epochs)
+    if number == "1":
+        return "1 epoch"
+    return f"{number} epochs"
 
 
 def _format_number(value: float) -> str:

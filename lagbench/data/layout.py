@@ -264,6 +264,23 @@ def expand_path(path: str | Path, where: str) -> Path:
         ) from error
 
 
+def expand_home(output: str | Path, where: str = "--output") -> Path:
+    """Return the path of a file to write, ~ replaced by the home folder.
+
+    Other relative paths stay relative.
+
+    Args:
+        output: the path that a user gave.
+        where: the option or argument that held it, for the message.
+
+    Raises:
+        UsageError: the user of ``~user`` has no home folder.
+    """
+    if str(output).startswith("~"):
+        return expand_path(output, where)
+    return Path(output)
+
+
 def no_home_error(where: str) -> UsageError:
     """Return the error for a user without a home folder, as in some containers.
 

@@ -177,7 +177,7 @@ class Task(_RegistryModel):
     input_frames: int = Field(gt=1)  # frames given at the start of a test scenario
     horizon: int = Field(gt=0)  # frames to predict after them
     # absolute frames at which the scorer reports
-    frames_of_interest: tuple[int, ...] = Field(strict=False)
+    frames_of_interest: tuple[int, ...] = Field(strict=False, min_length=1)
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
@@ -457,8 +457,13 @@ class Size(BaseModel):
         return self.dimension == 2
 
     def file_bytes(self, scenario: int) -> int:
-        """Return the most bytes of a scenario's file, on average over a data set."""
-        moving_variables = 2 if self.stores_velocity else 1
+        """Return the most bytes of a scenario's file, on average over a data set.
+
+        Files of local splits may hold velocities.
+        """
+        moving_variables = 1
+        if self.stores_velocity or not self.simulated:
+            moving_variables = 2
         return self._value_bytes(scenario, moving_variables) + HEADER_BYTES
 
     def data_set_bytes(self, scenarios: Collection[int]) -> int:

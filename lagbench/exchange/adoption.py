@@ -186,8 +186,9 @@ def _notes_of_counts(counts: Mapping[str, int]) -> Iterator[str]:
     """Yield what a user should know of the number of test trajectories."""
     if counts["test"] < FEWEST_SCENARIOS:
         yield (
-            f"{counts['test']} trajectories for test: under {FEWEST_SCENARIOS} no "
-            "difference between methods can be significant; --test takes more"
+            f"{format_count(counts['test'], 'trajectory')} for test: under "
+            f"{FEWEST_SCENARIOS} no difference between methods can be significant; "
+            "--test takes more"
         )
 
 

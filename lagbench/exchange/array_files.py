@@ -402,5 +402,5 @@ def _reading(path: Path) -> Iterator[None]:
             where=str(path),
             expected="arrays of numbers",
             got=f"{type(error).__name__}: {error}",
-            fix="save it as .npy, .npz, .h5 or .nc again",
+            fix=f"save it again, as a file {', '.join(READABLE)}",
         ) from error

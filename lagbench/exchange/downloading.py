@@ -253,6 +253,16 @@ def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:
     return f"{reason.what}{place}: simulating scenarios {format_ids(scenarios)}"
 
 
+def _total_length(requests: Iterable[FetchRequest]) -> int:
+    """Return the bytes of all files; 0 where the store does not state each length."""
+    total = 0
+    for request in requests:
+        if request.length is None:
+            return 0
+        total += request.length
+    return total
+
+
 class DownloadJob:
     """Find out what is missing, fetch it, and record what is there."""
 
@@ -268,8 +278,6 @@ class DownloadJob:
     ) -> None:
         self.size = size
         self.root = root
-        # ids of files in the store of which the root folder is the working copy
-        self._stored = stored
         self._meter = meter
         self._connections = connections
         self.url: str | None = None  # store that files came from
@@ -283,19 +291,47 @@ class DownloadJob:
         self._entries: list[FileEntry] = []
         self.present: list[int] = []
         self.missing: list[int] = []  # still to fetch
-        # ids that were not selected and whose files are gone
+        # ids that were not selected and whose files are gone or wrong
         self.forgotten: list[int] = []
         meter.begin("checking", total=len(selected), scenarios=len(selected))
         for scenario in selected:
-            inspected = inspect_scenario(
-                root, size, scenario, manifest=self._old_manifest, quick=True
-            )
-            if inspected.entry:
-                self._entries.append(inspected.entry)
-            if inspected.state is DataSetState.GOOD:
+            if self._inspect(scenario):
                 self.present.append(scenario)
             else:
                 self.missing.append(scenario)
+        for scenario in self._list_changed(selected, stored):
+            if not self._inspect(scenario):
+                self.forgotten.append(scenario)
+
+    def _inspect(self, scenario: int) -> bool:
+        """Return whether a file is there and right; note the entry of a right one."""
+        inspected = inspect_scenario(
+            self.root, self.size, scenario, manifest=self._old_manifest, quick=True
+        )
+        if inspected.entry:
+            self._entries.append(inspected.entry)
+        return inspected.state is DataSetState.GOOD
+
+    def _list_changed(
+        self, selected: Collection[int], stored: Collection[int]
+    ) -> list[int]:
+        """Return the ids of other files that are not as the old manifest states.
+
+        They have vanished, or have another length. Files in the store are right.
+        """
+        changed_ids = []
+        for entry in self._old_manifest.files:
+            scenario = entry.scenario
+            is_other = scenario not in selected and scenario not in stored
+            if not is_other or scenario not in self.size.scenarios:
+                continue
+            length = None
+            path = self.size.path(self.root, scenario)
+            if path.is_file():
+                length = path.stat().st_size
+            if length != entry.bytes:
+                changed_ids.append(scenario)
+        return changed_ids
 
     def run(self, urls: Iterable[str]) -> Reason:
         """Fetch what is missing from stores in turn, unless one lies.
@@ -343,11 +379,8 @@ class DownloadJob:
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
         claims = self._read_claims(url)
         requests = self._list_requests(url, claims or {})
-        lengths = []
-        for scenario, item in requests.items():
-            lengths.append(item.length or self.size.file_bytes(scenario))
-        byte_count = sum(lengths)
-        self._meter.begin("downloading", total=byte_count, scenarios=len(requests))
+        total = _total_length(requests.values())
+        self._meter.begin("downloading", total=total, scenarios=len(requests))
         try:
             if claims is None:
                 # A store without a manifest may have the archive of the data set.
@@ -473,24 +506,17 @@ class DownloadJob:
         self._meter.count(byte_count)
 
     def write_manifest(self) -> Manifest:
-        """Write the manifest of the files that are there; return it.
+        """Write the manifest of the files that are there and right; return it.
 
-        Scenarios that were not selected keep their entries of the old manifest if the
-        folder, or the store of which it is the working copy, has their files. An empty
-        manifest is written only over an older one.
+        An empty manifest is written only over an older one.
         """
         folder = self.size.folder(self.root)
         record_entry_hashes(folder, self._entries)
+        absent = {*self.missing, *self.forgotten}
         kept_entries = []
-        self.forgotten = []
         for entry in self._old_manifest.files:
-            if entry.scenario in self.missing:
-                continue
-            has_file = (folder / entry.path).is_file()
-            if has_file or entry.scenario in self._stored:
+            if entry.scenario not in absent:
                 kept_entries.append(entry)
-            else:
-                self.forgotten.append(entry.scenario)
         update = {"files": tuple(kept_entries)}
         old_manifest = self._old_manifest.model_copy(update=update)
         manifest = merge_entries(self.size, old_manifest, self._entries)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import operator
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from lagbench.data.registry import Registry
 
 SCENARIO_ENDING = ".nc"  # of a source that is a file, not a split
+
+VERSION_FOLDER = re.compile(r"v[0-9]+")
+"""Name of the folder of one MAJOR version of a data set."""
 
 
 @check_arguments
@@ -265,6 +269,6 @@ def _data_name(file: Path) -> str:
     """Return split-size-scenario where the path names them, else the file's name."""
     parts = file.absolute().parts
     # A file of a data set lies at ROOT/SPLIT/SIZE/v1/SUBSET/SCENARIO.nc.
-    if len(parts) > 5 and parts[-3].startswith("v"):
+    if len(parts) > 5 and VERSION_FOLDER.fullmatch(parts[-3]):
         return f"{parts[-5]}-{parts[-4]}-{file.stem}"
     return file.stem

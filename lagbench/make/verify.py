@@ -164,7 +164,8 @@ def verify(
     Raises:
         UsageError: unknown split, size, subset or scenario, fewer than one worker, or a
             negative number for ``regenerate``.
-        WorkFailedError: simulating anew failed.
+        DataError: the root folder is the working copy of a store that holds wrong data.
+        WorkFailedError: simulating anew failed, or the store does not answer.
     """
     tier, data_root, _ = locate(split, size, root=root, registry=registry)
     ids = select(tier, subset=subset, scenarios=scenarios)

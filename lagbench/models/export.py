@@ -15,9 +15,9 @@ from torch.onnx import symbolic_helper
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import checked_path
+from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import UsageError, check_installed, require
-from lagbench.submission.writer import expand_home
+from lagbench.errors import LagbenchError, UsageError, check_installed, require
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
@@ -150,6 +150,11 @@ def _one_frame_more(forcing: Tensor, frames: int) -> Tensor:
 
 
 def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
+    """Trace a model on some inputs and write it as an ONNX file.
+
+    Raises:
+        UsageError: the step fails, or the exporter does.
+    """
     with warnings.catch_warnings(), _sums_of_index_add():
         # the newer exporter needs a package more and writes data beside the file
         warnings.simplefilter("ignore")
@@ -164,7 +169,9 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
                 opset_version=LEAST_OPSET,
                 dynamo=False,
             )
-        except (RuntimeError, ValueError, TypeError, AttributeError) as error:
+        except (LagbenchError, MemoryError):
+            raise
+        except Exception as error:  # the exporter and the step raise any kind
             reason = str(error).split("\n")[0][:200]
             names = ", ".join(inputs)
             raise UsageError(
@@ -228,6 +235,15 @@ def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> 
     """
     with torch.no_grad():
         expected = wrapped(*inputs.values()).numpy()
+    frame_shape = (1, *inputs["position"].shape[1:])
+    if expected.shape != frame_shape:
+        raise UsageError(
+            "the model does not predict the positions of the next frame",
+            where="export_onnx, step",
+            expected=f"shape {frame_shape[1:]}: particle, component",
+            got=f"shape {expected.shape[1:]}",
+            fix="return one position of every particle",
+        )
     try:
         session, names = open_session(str(path))
         values = {}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.data.layout import expand_home
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -14,7 +15,6 @@ from lagbench.store.copy import scenario_files
 from lagbench.submission.writer import (
     PredictionsWriter,
     check_predictions_output,
-    expand_home,
 )
 from lagbench.work.machine import processor_name
 from lagbench.work.progress import Meter, Progress

@@ -245,18 +245,25 @@ class ScoreCard:
 def number_methods(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
     """Return the methods; those that occur twice, or have a taken name, get a number.
 
+    No two names are equal.
+
     >>> number_methods(["gns", "gat", "gns"])
     ['gns (1)', 'gat', 'gns (2)']
+    >>> number_methods(["gns", "gns", "gns (1)"])
+    ['gns (2)', 'gns (3)', 'gns (1)']
     """
     count = Counter([*methods, *taken])
-    seen = Counter[str]()
+    used = {*methods, *taken}
+    numbers = Counter[str]()
     names = []
     for method in methods:
-        seen[method] += 1
+        name = method
         if count[method] > 1:
-            names.append(f"{method} ({seen[method]})")
-        else:
-            names.append(method)
+            while name in used:
+                numbers[method] += 1
+                name = f"{method} ({numbers[method]})"
+            used.add(name)
+        names.append(name)
     return names
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_output_file
-from lagbench.data.layout import expand_path, format_ids
+from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.variables import open_netcdf
@@ -656,23 +656,6 @@ class TemplateResult:
     # least and greatest number of particles of a predicted scenario
     particle_range: tuple[int, int]
     bytes: int
-
-
-def expand_home(output: str | Path, where: str = "--output") -> Path:
-    """Return the path of a file to write, ~ replaced by the home folder.
-
-    Other relative paths stay relative.
-
-    Args:
-        output: the path that a user gave.
-        where: the option or argument that held it, for the message.
-
-    Raises:
-        UsageError: the user of ``~user`` has no home folder.
-    """
-    if str(output).startswith("~"):
-        return expand_path(output, where)
-    return Path(output)
 
 
 def check_predictions_output(output: Path, *, overwrite: bool) -> None:

@@ -112,7 +112,7 @@ _CLAIMS = {
     "the forecast of VAR(1) diverges.)": Claim(
         "persistence", ("var",), metrics=("mse_end",)
     ),
-    "Is the best naive baseline better than the learned models?": Claim(""),
+    "Is the best naive baseline better than the learned and hybrid models?": Claim(""),
 }
 
 CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())

@@ -68,6 +68,8 @@ class ScoredTraining:
     scores: Mapping[str, Score]  # by metric
     record: Mapping[str, Any]  # training.json, or what the entry says; else empty
     path: Path  # file of the scores
+    # options that the prediction changed, as in "model.average=true"
+    predicted_with: tuple[str, ...] = ()
 
     @property
     def cpu_hours(self) -> float | None:
@@ -309,6 +311,7 @@ class SplitResults:
                     seed,
                     path=board / score_path,
                     record=record,
+                    predicted_with=_prediction_changes(entry, prediction),
                     cost=entry.cost,
                     measured=measured,
                     parameters=entry.parameters,
@@ -358,6 +361,7 @@ class SplitResults:
         path: Path,
         record: Mapping[str, Any],
         cost: EntryCost | None,
+        predicted_with: tuple[str, ...] = (),
         measured: MeasuredCost | None = None,
         parameters: int | None = None,
         kind: Kind = Kind.LEARNED,
@@ -370,7 +374,11 @@ class SplitResults:
             return
 
         training = ScoredTraining(
-            seed=seed, scores=stored.scores(), record=record, path=path
+            seed=seed,
+            scores=stored.scores(),
+            record=record,
+            path=path,
+            predicted_with=predicted_with,
         )
         earlier = self.methods.get(name, Method(name=name, trainings=()))
         self.methods[name] = Method(
@@ -524,6 +532,14 @@ class SplitResults:
         return any(folder.glob(f"{name}_[0-9]*.json"))
 
 
+def _prediction_changes(entry: Entry, prediction: Prediction) -> tuple[str, ...]:
+    """Return the options that a prediction of an entry changed."""
+    provenance = prediction.provenance or entry.provenance
+    if provenance is None:
+        return ()
+    return provenance.prediction_overrides
+
+
 def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
     """Return what an entry says of a training, with the keys of training.json.
 
@@ -538,7 +554,7 @@ def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
     if not budget.steps or budget.cpu_hours is None:
         return {}
 
-    changes = provenance.describe_changes().removeprefix("predicted with ")
+    changes = provenance.training_only().describe_changes()
     validations = []
     if budget.metric is not None:
         for step, value in budget.validations:

@@ -403,6 +403,18 @@ def test_an_option_is_no_value_of_another_one(
 
 
 @pytest.mark.parametrize(
+    "words", [("cite", ""), ("cite", "--split="), ("compare", "", "other")]
+)
+def test_an_empty_word_is_not_taken_for_no_word(
+    words: tuple[str, ...], run: Callable[..., Result]
+) -> None:
+    """It comes from a variable of the shell that is not set."""
+    result = run(*words)
+    assert result.exit_code == 2, result.output
+    assert has_all_parts(result.stderr), result.stderr
+
+
+@pytest.mark.parametrize(
     "command",
     [
         "predict none.pt --method checkpoint",

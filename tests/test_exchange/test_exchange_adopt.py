@@ -378,7 +378,8 @@ def test_test_has_enough_trajectories_for_a_p_value(
     path = tmp_path / "runs.npy"
     np.save(path, np.stack(straight_runs(count)))
     own_split = adopt_here(path)
-    has_note = any("trajectories for test" in note for note in own_split.notes)
+    noun = "trajectory" if test_count == 1 else "trajectories"
+    has_note = any(f"{test_count} {noun} for" in note for note in own_split.notes)
     assert own_split.scenarios["test"] == test_count
     assert has_note == (test_count < 6)
 

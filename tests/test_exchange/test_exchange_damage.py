@@ -8,6 +8,7 @@ import codecs
 import contextlib
 import json
 import os
+import re
 import resource
 import zipfile
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from typer.testing import CliRunner
 from lagbench.cli.program import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
 from lagbench.exchange import adopt, import_split, trajectory
+from lagbench.exchange.array_files import READABLE
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.metadata import parse_kinds
 
@@ -230,6 +232,20 @@ def test_an_npz_file_that_unpacks_to_far_more_is_refused(
     with pytest.raises(UnreadableFileError) as caught:
         imported(gns)
     assert caught.value.where.endswith("in/train.npz, key 'simulation_0'")
+
+
+@pytest.mark.parametrize("suffix", READABLE)
+def test_the_message_names_only_formats_that_are_adopted(
+    tmp_path: Path, suffix: str
+) -> None:
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"{number}{suffix}").write_bytes(b"no array")
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(folder, output=tmp_path / "own", **BASIC)
+    suffixes = re.findall(r"\.[a-z]\w*", str(caught.value.fix))
+    assert set(suffixes) <= set(READABLE)
 
 
 def test_the_message_has_the_bound_of_an_array_that_unpacks_to_more() -> None:

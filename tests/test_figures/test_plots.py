@@ -153,6 +153,18 @@ CUTS = {
 }
 
 
+def test_a_picture_of_a_file_elsewhere_has_the_name_of_the_file(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that begins with v is not yet a version of a data set."""
+    folder = tmp_path / "study" / "vortices" / "first"
+    folder.mkdir(parents=True)
+    (folder / "own.nc").symlink_to(swirl)
+    monkeypatch.chdir(tmp_path)
+    picture = plot(folder / "own.nc", kind="speed", frame=2)
+    assert picture == Path("own-frame2.png")
+
+
 def test_paths_of_pictures_may_begin_with_the_home_folder(
     swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -442,12 +442,9 @@ def test_methods_of_one_name_are_numbered(home: Path, tmp_path: Path) -> None:
     assert title_of(reading) == "gns (1) · gns (2) · persistence (1)"
 
 
-@pytest.mark.parametrize("split", ["curl-noise", "fluid"])
-def test_a_method_may_have_the_name_of_a_row(
-    home: Path, tmp_path: Path, split: str
-) -> None:
+def test_a_method_may_have_the_name_of_a_row(home: Path, tmp_path: Path) -> None:
     """Panels of the truth, of the method and of their difference stand in rows."""
-    bench = make_report_bench(home, split)
+    bench = make_report_bench(home, "curl-noise")
     methods = (("truth", damped), ("difference", noisy), ("speed", still))
     page = score_methods(bench, tmp_path, *methods).report(tmp_path)
     reading = read_html(page.read_text("utf-8"))
@@ -633,14 +630,23 @@ def report_on_adopted(folder: Path, *, counts: Sequence[int], interval: float) -
 
     The last two scenarios are its test.
     """
+    runs = []
+    for scenario, count in enumerate(counts):
+        runs += straight_runs(1, frames=8, particles=count, seed=scenario)
+    return report_on_runs(folder, runs, interval=interval)
+
+
+def report_on_runs(
+    folder: Path, runs: Sequence[NDArray[np.float32]], *, interval: float
+) -> str:
+    """Return a report on a local split of trajectories, predicted without error."""
     paths = []
     predictions = {}
-    for scenario, count in enumerate(counts):
-        (run,) = straight_runs(1, frames=8, particles=count, seed=scenario)
+    for scenario, run in enumerate(runs):
         path = folder / f"run{scenario}.npz"
         np.savez(path, position=run)
         paths.append(path)
-        if scenario >= len(counts) - 2:
+        if scenario >= len(runs) - 2:
             predictions[scenario] = run[2:]
     adopted = adopt(
         paths,
@@ -682,6 +688,29 @@ def test_each_picture_over_time_states_another_time(tmp_path: Path) -> None:
     times = set(re.findall(r"frame (\d+)\u2002([0-9.]+) s", page))
     assert ("3", "0.006") in times
     assert len({seconds for _, seconds in times}) == len(times) >= 2
+
+
+@pytest.mark.slow
+def test_histograms_of_three_dimensions_count_components(tmp_path: Path) -> None:
+    """Each node has three; in two dimensions it has one vorticity."""
+    side = np.linspace(-0.2, 0.2, 12)
+    grid = np.meshgrid(side, side, side, indexing="ij")
+    x, y, z = np.stack(grid).reshape(3, -1)
+    spin = np.stack([-y, x, 0.5 * x], axis=-1)
+    place = np.stack([x, y, z], axis=-1) + 0.4
+    runs = []
+    for scenario in range(4):
+        pace = 0.02 + 0.002 * scenario
+        frames = [place + pace * frame * spin for frame in range(8)]
+        runs.append(np.array(frames, np.float32))
+    solid = report_on_runs(tmp_path, runs, interval=0.1)
+    assert "share of nodes" not in solid
+    assert "share of components" in solid
+    flat_folder = tmp_path / "flat"
+    flat_folder.mkdir()
+    flat = report_on_adopted(flat_folder, counts=(40, 40, 40, 40), interval=0.1)
+    assert "share of nodes" in flat
+    assert "share of components" not in flat
 
 
 def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:

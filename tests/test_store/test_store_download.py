@@ -4,6 +4,7 @@ nothing else.
 
 from __future__ import annotations
 
+import shutil
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -110,10 +111,17 @@ def test_existing_files_are_not_fetched_again(store: Store, here: Path) -> None:
         assert store.server.count("0001.nc") == 1
 
 
-def test_the_manifest_forgets_files_that_are_gone(server: Mirror, here: Path) -> None:
+@pytest.mark.parametrize("fault", ["gone", "cut"])
+def test_the_manifest_forgets_files_that_are_gone_or_cut(
+    server: Mirror, here: Path, fault: str
+) -> None:
     """Also if only other scenarios are selected."""
     assert download("own", root=here, mirror=server.url).complete
-    (here / "own/full/v1/test/0003.nc").unlink()
+    path = here / "own/full/v1/test/0003.nc"
+    content = path.read_bytes()
+    path.unlink()
+    if fault == "cut":
+        path.write_bytes(content[:-100])
     result = download("own", root=here, mirror=server.url, subset="train")
     assert result.kept == (0, 1)
     assert not result.complete
@@ -121,6 +129,24 @@ def test_the_manifest_forgets_files_that_are_gone(server: Mirror, here: Path) ->
     manifest = lagbench.load_manifest("own", root=here)
     assert not manifest.complete
     assert [entry.scenario for entry in manifest.files] == [0, 1, 2]
+
+
+def test_the_manifest_keeps_files_that_are_packed_anew(
+    server: Mirror, here: Path
+) -> None:
+    """Another length does not make a file wrong; its values count."""
+    before = download("own", root=here, mirror=server.url)
+    path = here / "own/full/v1/test/0003.nc"
+    # HDF5 ignores what follows the file that its header describes.
+    content = path.read_bytes()
+    path.unlink()
+    path.write_bytes(content + bytes(8))
+    result = download("own", root=here, mirror=server.url, subset="train")
+    assert result.complete
+    assert result.dataset_sha256 == before.dataset_sha256
+    entry = lagbench.load_manifest("own", root=here).entry(3)
+    assert entry is not None
+    assert entry.bytes == len(content) + 8
 
 
 def test_the_card_forgets_files_that_are_gone(
@@ -296,6 +322,35 @@ def test_bytes_that_are_thrown_away_are_no_progress(
     assert result.bytes == length
     assert states[-1].done == states[-1].total == length
     assert all(0 <= state.done <= length for state in states)
+
+
+@pytest.mark.parametrize("has_manifest", [True, False])
+def test_progress_in_three_dimensions_has_the_true_total_or_none(
+    tmp_path: Path, has_manifest: bool
+) -> None:
+    """A store without a manifest states no lengths before it sends a file."""
+    rng = np.random.default_rng(0)
+    runs = 0.4 + 0.2 * rng.random((3, 40, 500, 3))
+    np.save(tmp_path / "runs.npy", runs.astype(np.float32))
+    own = adopt(
+        tmp_path / "runs.npy",
+        output=tmp_path / "source" / "own",
+        radius=0.1,
+        spacing=0.05,
+        frame_interval=0.1,
+    )
+    root = tmp_path / "root"
+    (root / "own").mkdir(parents=True)
+    shutil.copy(own.folder / "split.yaml", root / "own")
+    states: list[Progress] = []
+    with serving(tmp_path / "source") as running:
+        if not has_manifest:
+            running.faults = {LIST: "gone"}
+        result = download("own", root=root, mirror=running.url, progress=states.append)
+    last = states[-1]
+    assert last.scenarios_done == last.scenarios == 3
+    assert last.done == result.bytes
+    assert last.total == (result.bytes if has_manifest else 0)
 
 
 def test_a_part_that_is_fetched_anew_is_counted_once(

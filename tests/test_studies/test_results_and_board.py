@@ -17,6 +17,7 @@ from lagbench.board.overview import LearningVerdict, judge, verdict_of_interval
 from lagbench.data.yamlfile import read_yaml
 from lagbench.references.predictor import Kind
 from studies.result_tables import (
+    cost_table,
     deciding_model,
     slower_than_simulator,
     summary_table,
@@ -203,6 +204,25 @@ def test_a_chain_of_trainings_counts_as_a_whole(
     assert row["validation at 1/4"] == row["1/2"] == "-"
     assert float(row["1"]) == pytest.approx(0.0634, rel=1e-2)
     assert row["last doubling"] == "-"
+
+
+@pytest.mark.parametrize("has_records", [True, False])
+def test_an_option_of_the_prediction_counts_for_all_seeds(
+    has_records: bool, tmp_path: Path
+) -> None:
+    """All three seeds of the entry are averaged; only seed 0 has a record of training
+    of its own.
+    """
+    weights = WEIGHTS if has_records else tmp_path
+    results = SplitResults(Sources(weights=weights), "cavity", "mini")
+    (row,) = (
+        row
+        for row in markdown_rows(cost_table(results), "CPU hours per seed")
+        if row["model"] == "NeuralMPM, mirror-averaged"
+    )
+    assert row["seeds"] == "0, 1, 2"
+    for changes in row["changed"].split(" / "):
+        assert "model.average=true" in changes
 
 
 def test_a_curve_begins_after_the_windows_of_earlier_trainings() -> None:

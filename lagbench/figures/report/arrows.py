@@ -57,13 +57,18 @@ def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigure]:
     ramp = draw_ramp("flow", limit, "speed [length/frame]")
 
     for entry in subject.entries[:MOST_ENTRIES]:
-        rows: dict[str, list[Markup]] = {"truth": [], entry.name: [], "difference": []}
+        # a method may have the name of another row
+        rows: list[tuple[str, list[Markup]]] = [
+            ("truth", []),
+            (entry.name, []),
+            ("difference", []),
+        ]
         for moment in moments:
             panels = _draw_panels(subject, gallery, moment, entry, limit=limit)
-            for row, panel in zip(rows.values(), panels, strict=True):
+            for (_, row), panel in zip(rows, panels, strict=True):
                 row.append(panel)
         columns = [moment.title for moment in moments]
-        panel_grid = draw_panel_grid(columns, list(rows.items()), width=7.4)
+        panel_grid = draw_panel_grid(columns, rows, width=7.4)
         yield ReportFigure(
             name=f"arrows-{entry.number}",
             title=f"Velocity over time: {entry.name}",

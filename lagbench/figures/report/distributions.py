@@ -161,12 +161,15 @@ def histogram_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     """Return the distribution of vorticity at the key frame (Fig. 5.12)."""
     scenario = subject.scenarios[0]
     moment = gallery.moments[scenario, subject.key_frame]
+    values = "grid nodes"
+    if subject.task.config.box.dimension == 3:
+        values = "components of the vorticity at the grid nodes"
     return ReportFigure(
         name="histogram",
         title=f"Vorticity distribution at frame {subject.key_frame}",
         thesis="Fig. 5.12",
         body=join([_method_key(subject), _draw_histogram(subject, moment)]),
-        caption="Share of the grid nodes per bin of vorticity [1/frame], scenario "
+        caption=f"Share of the {values} per bin of vorticity [1/frame], scenario "
         f"{scenario}. The range of the truth sets the bins; the first and the last bin "
         "hold all that lies beyond.",
     )
@@ -212,7 +215,7 @@ def _draw_histogram(subject: Subject, moment: Moment) -> Markup:
         linear(float(edges[0]), float(edges[-1]), tight=True),
         linear(0.0, float(all_shares.max())),
         x_label="vorticity [1/frame]",
-        y_label="share of nodes [%]",
+        y_label=f"share of {_name_values(moment.pairs[0])} [%]",
         height=SMALL_HEIGHT,
     )
     for name, kind, shares in lines:

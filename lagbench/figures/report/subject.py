@@ -39,8 +39,12 @@ TIMES = 6  # columns of the pictures over time
 
 TOP_PERCENTILE = 99.5  # full colour is this percentile of the truth's magnitudes
 
-SAME_FIELDS = ("split", "size", "subset", "dataset_version", "dataset_sha256")
-"""Fields of the header that all entries of a report share."""
+SAME_FIELDS = ("split", "size", "subset", "dataset_sha256")
+"""Fields of the header that all entries of a report share.
+
+Versions may differ in MINOR and PATCH, which change no data; the hash tells MAJOR ones
+apart.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
