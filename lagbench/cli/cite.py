@@ -27,6 +27,13 @@ TITLE = (
 )
 RELEASE_YEAR = 2026
 
+RELEASE_FIELDS = {"author": "The lagbench authors", "year": str(RELEASE_YEAR)}
+"""Fields of BibTeX entries of lagbench and of its splits."""
+
+UNKNOWN_LICENCE = "unknown"
+NO_CITATION = "none"
+"""What the description of a local split has where nothing is stated."""
+
 # BibTeX counts braces, also those behind a backslash, so that none may stand alone.
 TEX_ESCAPES = {
     "\\": "/",
@@ -51,7 +58,8 @@ def cite_command(
 ) -> None:
     """Print how to cite a split: version, hashes and original works.
 
-    Without a split it prints how to cite lagbench itself.
+    Without a split it prints how to cite lagbench itself. The authors of a local split
+    are those who made its data, so no author is printed.
     """
     if split_argument is None and split_option is None:
         _cite_program(bibtex=bibtex, as_json=as_json)
@@ -65,8 +73,9 @@ def cite_command(
         measured = registry.size(name, size).measured
         if measured is not None:
             hashes[size] = measured.dataset_sha256
+    is_local = name not in load().splits
     if bibtex:
-        text = _split_bibtex(name, entry, hashes)
+        text = _split_bibtex(name, entry, hashes, is_local=is_local)
         print_result({"bibtex": text}, [text], as_json=as_json)
         return
 
@@ -80,11 +89,20 @@ def cite_command(
     }
     # strangers describe local splits
     title = escape_line(entry.title)
-    licence = escape_line(entry.licence)
-    lines = [
-        f"lagbench, split {name!r} ({title}), version {entry.version}, {licence}.",
-        f"After: {escape_line(entry.citation)}.",
-    ]
+    of_lagbench = f"lagbench, split {name!r} ({title})"
+    if is_local:
+        of_lagbench = f"local split {name!r} ({title})"
+    words = [of_lagbench, f"version {entry.version}"]
+    if entry.licence != UNKNOWN_LICENCE:
+        words.append(escape_line(entry.licence))
+    lines = [", ".join(words) + "."]
+    if entry.citation != NO_CITATION:
+        lines.append(f"After: {escape_line(entry.citation)}.")
+    if is_local and len(lines) == 1:
+        lines.append(
+            "Its description names no work to cite: see `citation` and `licence` of "
+            "`lagbench adopt --describe`."
+        )
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")
     print_result(citation, lines, as_json=as_json)
@@ -94,7 +112,7 @@ def _cite_program(*, bibtex: bool, as_json: bool) -> None:
     """Print how to cite lagbench itself."""
     version = lagbench.__version__
     if bibtex:
-        fields = {"title": TITLE, "version": version}
+        fields = {"title": TITLE, "version": version, **RELEASE_FIELDS}
         text = _format_bibtex("software", "lagbench", fields)
         print_result({"bibtex": text}, [text], as_json=as_json)
         return
@@ -106,30 +124,39 @@ def _cite_program(*, bibtex: bool, as_json: bool) -> None:
     print_result(citation, lines, as_json=as_json)
 
 
-def _split_bibtex(name: str, entry: Split, hashes: Mapping[str, str]) -> str:
-    note = f"After {entry.citation}"
+def _split_bibtex(
+    name: str, entry: Split, hashes: Mapping[str, str], *, is_local: bool
+) -> str:
+    title = f"{entry.title}: split {name} of lagbench"
+    if is_local:
+        title = entry.title
+    fields = {"title": title, "version": entry.version}
+    if entry.licence != UNKNOWN_LICENCE:
+        fields["license"] = entry.licence
+    notes = []
+    if entry.citation != NO_CITATION:
+        notes.append(f"After {entry.citation}")
     if hashes:
         listing = ", ".join(f"{size} {sha256}" for size, sha256 in hashes.items())
-        note += f". SHA-256 of the data sets: {listing}"
-    fields = {
-        "title": f"{entry.title}: split {name} of lagbench",
-        "version": entry.version,
-        "license": entry.licence,
-        "note": note,
-    }
-    return _format_bibtex("misc", f"lagbench-{name}", fields)
+        notes.append(f"SHA-256 of the data sets: {listing}")
+    if notes:
+        fields["note"] = ". ".join(notes)
+    if is_local:
+        return _format_bibtex("misc", name, fields)
+    return _format_bibtex("misc", f"lagbench-{name}", {**fields, **RELEASE_FIELDS})
 
 
 def _format_bibtex(kind: str, key: str, fields: Mapping[str, str]) -> str:
-    """Return a BibTeX entry by the authors of lagbench.
-
-    Characters that TeX would read as commands are escaped.
-    """
+    """Return a BibTeX entry; characters that TeX would read as commands are escaped."""
     escapes = str.maketrans(TEX_ESCAPES)
 
-    # The inner braces keep BibTeX from taking the name of the authors apart.
-    lines = [f"@{kind}{{{key},", "  author = {{The lagbench authors}},"]
-    for name, value in {**fields, "year": str(RELEASE_YEAR)}.items():
+    lines = [f"@{kind}{{{key},"]
+    if "author" in fields:
+        # The inner braces keep BibTeX from taking the name of the authors apart.
+        lines.append(f"  author = {{{{{fields['author']}}}}},")
+    for name, value in fields.items():
+        if name == "author":
+            continue
         line = " ".join(value.split())
         lines.append(f"  {name} = {{{line.translate(escapes)}}},")
     lines.append("}")

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import typer
@@ -127,7 +128,22 @@ class _CheckedCommand(TyperCommand):
             for word in words:
                 if isinstance(word, str):
                     _check_typed_word(ctx, parameter, word, names)
+            if parameter.metavar in PATH_PLACEHOLDERS:
+                typed_value = ctx.params.get(parameter.name)
+                ctx.params[parameter.name] = _expand_home(typed_value)
         return rest
+
+
+def _expand_home(value: Any) -> Any:  # noqa: ANN401 (values of any option)
+    """Return a path, or paths, with ~ at the beginning replaced by the home folder.
+
+    A shell does this, except in ``--output=~/p.nc``. A value of another type stays.
+    """
+    if isinstance(value, list | tuple):
+        return type(value)(_expand_home(item) for item in value)
+    if isinstance(value, str | Path) and str(value).startswith("~"):
+        return type(value)(os.path.expanduser(value))
+    return value
 
 
 def _check_typed_word(

@@ -390,6 +390,31 @@ def test_a_citation_of_a_stranger_s_split_is_well_formed(
         assert not line.startswith("Data set hash of")
 
 
+def test_a_local_split_is_not_cited_as_ours(
+    run: Run, original: LocalSplit, tmp_path: Path
+) -> None:
+    """Its authors are not those of lagbench; what nobody stated is not printed."""
+    folder = tmp_path / "own"
+    shutil.copytree(original.folder, folder)
+    description = yaml.safe_load((folder / "split.yaml").read_text())
+    (split,) = description["splits"].values()
+    split["licence"] = "unknown"
+    split["citation"] = "none"
+    (folder / "split.yaml").write_text(yaml.safe_dump(description))
+    fields = bibtex_fields(run("cite", f"{folder}/", "--bibtex").stdout)
+    assert "author" not in fields
+    assert "license" not in fields
+    assert "none" not in fields.get("note", "")
+    text = run("cite", f"{folder}/").stdout
+    assert "unknown" not in text
+    split["licence"] = "CC0-1.0"
+    split["citation"] = "Doe (2020)"
+    (folder / "split.yaml").write_text(yaml.safe_dump(description))
+    fields = bibtex_fields(run("cite", f"{folder}/", "--bibtex").stdout)
+    assert fields["license"] == "CC0-1.0"
+    assert "Doe (2020)" in fields["note"]
+
+
 @pytest.mark.parametrize("name", [".", "../own", "split.yaml"])
 def test_an_export_is_named_after_its_split(
     name: str,
