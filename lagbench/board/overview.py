@@ -47,7 +47,8 @@ OTHER_VERDICTS = {
     LearningVerdict.DOES_NOT_PAY: "Learning does not pay on",
     LearningVerdict.OPEN: "Whether learning pays is open on",
     LearningVerdict.NO_SOLVER: (
-        "No classical solver is as cheap as the most accurate model on"
+        "Every classical solver takes more time per frame than the most accurate "
+        "model, so there is no verdict, on"
     ),
 }
 """Beginnings of the sentences about data sets where learning does not clearly pay."""
