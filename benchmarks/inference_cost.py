@@ -193,9 +193,9 @@ def main() -> int:
         "`neuralmpm`. They are untrained, because the weights do not change the time. "
         f"Their options come from the recipes for {SPLIT} {SIZE}.\n\n"
         f"The box holds {PARTICLES:,} q^2 particles: q multiplies the number of "
-        "particles along each axis. (Table 3.1 has another q.) A power of the number "
-        "of particles was fitted to the times of each model. The last row shows its "
-        "exponent; 1 means that the time grows linearly."
+        "particles along each axis. A power of the number of particles was fitted to "
+        "the times of each model. The last row shows its exponent; 1 means that the "
+        "time grows linearly."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)
