@@ -32,11 +32,11 @@ from .columns import cost_of
 from .entry import EntryCost
 from .model import Board, Tab
 
-HEIGHT = 330  # of the chart without its key [pixel]
+HEIGHT = 400  # of the chart without its key [pixel]
 
 # The axis of time reaches so many times the dearest, so that its name has a place
 # beside it.
-NAME_ROOM = 8.0
+NAME_ROOM = 40.0
 
 STYLE = """
 .chart{background:#fff;font-family:system-ui,sans-serif}
@@ -67,13 +67,15 @@ DESCRIPTIONS = {
     "classical": ", a classical solver",
 }
 
+# kinds of methods at the left, lines and what lies on them at the right
 KEY = (
     KeyItem("dot learned", "learned model"),
+    KeyItem("line front", "no faster method is as accurate"),
     KeyItem("dot hybrid", "hybrid"),
-    KeyItem("line front", "best per cost"),
+    KeyItem("dot naive best", "dark rim: on the dashed line"),
     KeyItem("dot classical", "classical solver"),
+    KeyItem("line classical-front", "no faster solver is as accurate"),
     KeyItem("dot naive", "naive predictor"),
-    KeyItem("line classical-front", "best solver per cost"),
 )
 
 
@@ -181,20 +183,36 @@ def draw(
     front = find_front(points)
     front_times = [point.seconds for point in front]
     front_errors = [point.error for point in front]
-    plot.line(front_times, front_errors, "front")
+    plot.line(front_times, front_errors, "front", is_free=True)
     solvers = find_front(point for point in points if point.kind == "classical")
     solver_times = [point.seconds for point in solvers]
     solver_errors = [point.error for point in solvers]
-    plot.line(solver_times, solver_errors, "classical-front")
+    plot.line(solver_times, solver_errors, "classical-front", is_free=True)
     spots = []
-    for point in points:
+    for point in _by_need_of_label(points, front):
         spots.append(_spot_of(point, ranking, is_best=point in front))
-    plot.spots(spots)
+    plot.spots(spots, joined=True)
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:
         description += f"; the simulator takes {text(solver)} s per frame"
     return plot.svg(title, f"{description}.")
+
+
+def _by_need_of_label(
+    points: Sequence[CostPoint], front: Sequence[CostPoint]
+) -> list[CostPoint]:
+    """Return the best points, then the untrained predictors, then the others."""
+    untrained = []
+    others = []
+    for point in points:
+        if point in front:
+            continue
+        if point.kind in ("classical", "naive"):
+            untrained.append(point)
+        else:
+            others.append(point)
+    return [*front, *untrained, *others]
 
 
 def _label_of(ranking: str) -> str:
@@ -226,10 +244,10 @@ def cost_figure(tab: Tab) -> Markup:
     points = points_of(tab)
     caption = (
         "Further left is cheaper, further down more accurate. The dashed line joins "
-        "the methods that are more accurate than every cheaper method. The grey line "
-        "joins the classical solvers that are more accurate than every cheaper one: "
-        "an entry below it is more accurate than every solver that costs no more per "
-        "frame. "
+        "the methods that are more accurate than every cheaper method. Their dots have "
+        "a dark rim. The grey line joins the classical solvers that are more accurate "
+        "than every cheaper one: an entry below it is more accurate than every solver "
+        "that costs no more per frame. "
         "The upright line is the time of the simulator that made the data. Costs of "
         "entries are measured or self-reported, as the table says, and brought to the "
         "machine of the reference predictors by the simulator's time on both."

@@ -10,6 +10,7 @@ import typer
 
 from lagbench.data.local import locate
 from lagbench.errors import UsageError
+from lagbench.figures.animate import FASTEST, SLOWEST
 from lagbench.figures.canvas import COARSEST, DPI, FINEST
 from lagbench.figures.pictures import (
     SCENARIO_ENDING,
@@ -54,7 +55,11 @@ def plot_command(
     scenario: ScenarioOption = None,
     frame: Annotated[
         int | None,
-        option("--frame", "Frame number; -1, the default, is the last frame."),
+        option(
+            "--frame",
+            "Frame number. Negative numbers count from the end: -1, the default, is "
+            "the last frame.",
+        ),
     ] = None,
     kind: Annotated[
         str,
@@ -140,9 +145,17 @@ def animate_command(
         option("--beside ID", "Second scenario of the split, shown beside the first."),
     ] = None,
     kind: Annotated[
-        str | None, option("--kind", "speed, material or vorticity.")
+        str | None,
+        option(
+            "--kind NAME",
+            "speed, material or vorticity; by default material where there are "
+            "several, else speed.",
+        ),
     ] = None,
-    fps: Annotated[float, option("--fps", "Frames shown per second.")] = 30.0,
+    fps: Annotated[
+        float,
+        option("--fps", "Frames shown per second.", min=SLOWEST, max=FASTEST),
+    ] = 30.0,
     every: Annotated[int, option("--every", "Show every n-th frame.", min=1)] = 1,
     output: OutputOption = None,
     overwrite: OverwriteFlag = False,

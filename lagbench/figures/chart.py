@@ -7,6 +7,7 @@ description for readers who do not see it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .html import Markup, clipped, format_multiples, format_power, join, path_data, tag
-from .labels import ANCHORS, Label, LabelBox, place_labels
+from .labels import (
+    ANCHORS,
+    LINE_HEIGHT,
+    Label,
+    LabelBox,
+    place_joined_labels,
+    place_labels,
+    wrap_name,
+)
 
 Floats = NDArray[np.float64]
 Point = tuple[float, float]
@@ -214,8 +223,10 @@ BOTTOM = 40
 MARGIN = 3  # marks may reach so far over the rim of the plot
 DOT_RADIUS = 5
 REACH_RADIUS = 14  # of the disc around a dot that the pointer meets
+LINE_REACH = 2.0  # from the middle of a line to labels
 LABEL_ROOM = 26  # letters of a dot's label
-KEY_COLUMNS = 3
+JOINED_LABEL_ROOM = 40  # of a label in two lines
+KEY_COLUMNS = 2
 KEY_GAP = 8  # above the key
 KEY_ROW = 17  # height of a row of the key
 KEY_MARK = 22  # width of a mark of the key
@@ -287,10 +298,23 @@ class Plot:
         self._notes: list[LabelBox] = []  # text that labels of dots must not cover
         self._is_interactive = False
 
-    def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
-        """Draw a line through points; NaN leaves a gap."""
-        data = path_data(self._points(x, y))
-        self._add_path(data, f"line {kind}", title)
+    def line(
+        self,
+        x: ArrayLike,
+        y: ArrayLike,
+        kind: str,
+        title: str = "",
+        *,
+        is_free: bool = False,
+    ) -> None:
+        """Draw a line through points; NaN leaves a gap.
+
+        Labels of dots do not cover a free line.
+        """
+        points = self._points(x, y)
+        self._add_path(path_data(points), f"line {kind}", title)
+        if is_free:
+            self._notes += _boxes_along(points)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
         """Fill between two lines where both are numbers."""
@@ -336,17 +360,23 @@ class Plot:
         self._marks.append(_draw_label(note, "note"))
         self._notes.append(note.box)
 
-    def spots(self, spots: Sequence[Spot]) -> None:
+    def spots(self, spots: Sequence[Spot], *, joined: bool = False) -> None:
         """Draw dots that the keyboard reaches, with labels where there is room.
 
-        Spots that come first have the choice.
+        Spots that come first have the choice. If labels are joined, a line leads from a
+        dot to a label that does not stand beside it.
         """
         self._is_interactive = True
-        names = [clipped(spot.name, LABEL_ROOM) for spot in spots]
         x = [spot.x for spot in spots]
         y = [spot.y for spot in spots]
         points = self._points(x, y)
-        labels = place_labels(
+        if joined:
+            place = place_joined_labels
+            names = [wrap_name(clipped(spot.name, JOINED_LABEL_ROOM)) for spot in spots]
+        else:
+            place = place_labels
+            names = [clipped(spot.name, LABEL_ROOM) for spot in spots]
+        labels = place(
             names,
             points,
             plot=LabelBox(0, 0, self._plot_width, self._plot_height),
@@ -471,6 +501,8 @@ def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:
         tag("circle", **place, r=DOT_RADIUS),
     ]
     if label is not None:
+        if label.line_end is not None:
+            parts.insert(1, _draw_line(point, label.line_end, "mark"))
         parts.append(_draw_label(label, "name"))
     kind = f"dot {spot.kind}".strip()
     if spot.href is None:
@@ -573,11 +605,32 @@ def draw_text(text: str, x: float, y: float, kind: str) -> Markup:
 
 def _draw_label(label: Label, kind: str) -> Markup:
     classes = f"{kind} {ANCHORS[label.left_share]}".strip()
-    return draw_text(label.text, label.x, label.y, classes)
+    lines = []
+    for number, line in enumerate(label.text.split("\n")):
+        base_line = label.y + number * LINE_HEIGHT
+        lines.append(draw_text(line, label.x, base_line, classes))
+    return join(lines)
 
 
 def _draw_line(start: Point, end: Point, kind: str) -> Markup:
     return tag("path", d=path_data([start, end]), class_=kind)
+
+
+def _boxes_along(points: Sequence[Point]) -> list[LabelBox]:
+    """Return small squares side by side along a line through points."""
+    boxes = []
+    half = LINE_REACH
+    for (x, y), (next_x, next_y) in itertools.pairwise(points):
+        length = math.hypot(next_x - x, next_y - y)
+        if not math.isfinite(length):
+            continue
+        count = max(math.ceil(length / (2 * half)), 1)
+        for number in range(count + 1):
+            share = number / count
+            column = x + share * (next_x - x)
+            row = y + share * (next_y - y)
+            boxes.append(LabelBox(column - half, row - half, column + half, row + half))
+    return boxes
 
 
 def _dot_data(points: Iterable[Point]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
+from lagbench.data.grid import Grid
 from lagbench.errors import require
 
 from .canvas import build_speed_map, build_vorticity_map
@@ -451,26 +452,53 @@ def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) 
 
 
 def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
-    """Draw white streamlines of the velocity at the nodes that count."""
+    """Draw white streamlines of the velocity at the nodes that count.
+
+    Along a periodic axis images of the nodes carry them on to the edges of the box.
+    """
     fields = scene.fields
     if fields.differentiable.sum() < FEW_NODES:
         return
+    grid = fields.grid
+    x_images, y_images = map(int, grid.box.periodic[:2])  # at each end of an axis
+    x = _places_with_images(grid, 0, x_images)
+    y = _places_with_images(grid, 1, y_images)
+    # lines stay as close to each other on an axis that has images
+    density = 0.7 + 0.7 * detail
+    x_density = density * (len(x) / grid.shape[0])
+    y_density = density * (len(y) / grid.shape[1])
+    images = [(x_images, x_images), (y_images, y_images)]
     u, v = np.moveaxis(fields.velocity, -1, 0)
-    is_missing = ~fields.counted
-    u = np.ma.masked_array(u, is_missing)
-    v = np.ma.masked_array(v, is_missing)
-    axes.streamplot(
-        fields.grid.places(0),
-        fields.grid.places(1),
+    is_missing = np.pad(~fields.counted, images, mode="wrap")
+    u = np.ma.masked_array(np.pad(u, images, mode="wrap"), is_missing)
+    v = np.ma.masked_array(np.pad(v, images, mode="wrap"), is_missing)
+    patch_count = len(axes.patches)
+    stream = axes.streamplot(
+        x,
+        y,
         u.T,
         v.T,
-        density=0.7 + 0.7 * detail,
+        density=(x_density, y_density),
         color=PAPER,
         linewidth=0.35 + 0.45 * detail,
         arrowsize=0.3 + 0.4 * detail,
         maxlength=2.0,
         zorder=2,
     )
+    if grid.box.is_periodic:
+        inside = _box_patch(axes, scene.recording)
+        stream.lines.set_clip_path(inside)
+        for arrowhead in axes.patches[patch_count:]:
+            arrowhead.set_clip_path(inside)
+
+
+def _places_with_images(grid: Grid, axis: int, images: int) -> Floats:
+    """Return the positions of nodes and of so many images at each end of an axis."""
+    places = grid.places(axis)
+    steps = np.arange(1, images + 1) * grid.spacing
+    before = places[0] - steps[::-1]
+    after = places[-1] + steps
+    return np.concatenate([before, places, after])
 
 
 def _grid_speed(scene: Scene) -> Floats:

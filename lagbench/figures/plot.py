@@ -37,7 +37,7 @@ from .panels import (
     strongest_limit,
     title_of,
 )
-from .recording import Recording, Scene, open_recording
+from .recording import Recording, Scene, name_start, open_recording
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -206,7 +206,7 @@ def describe(recording: Recording) -> str:
     parts = [
         f"{recording.size.split} {recording.size.name}",
         f"scenario {recording.scenario}",
-        *_describe_parameters(recording, (*KIND_PARAMETERS, "frequency")),
+        *_describe_parameters(recording),
     ]
     return SEPARATOR.join(parts)
 
@@ -235,14 +235,17 @@ def _name_direction(velocity: NDArray[np.float64]) -> str:
     return " and ".join(names)
 
 
-def _describe_parameters(recording: Recording, names: Sequence[str]) -> list[str]:
-    """Return the Reynolds number and further parameters, those that there are."""
+def _describe_parameters(recording: Recording) -> list[str]:
+    """Return Reynolds number, kind and start of the flow, those that there are."""
     parts = []
     if recording.reynolds is not None:
         parts.append(f"Re {recording.reynolds:.0f}")
-    for name in names:
+    for name in KIND_PARAMETERS:
         if name in recording.parameters:
             parts.append(f"{name} {recording.parameters[name]}")
+    start = name_start(recording.parameters)
+    if start:
+        parts.append(start)
     return parts
 
 
@@ -466,7 +469,7 @@ def _arrange_table(
         is_first_of_scenario = number % len(frames) == 0
         if is_first_of_scenario:
             recording = scene.recording
-            marks = _describe_parameters(recording, ("frequency",))[:1]
+            marks = _describe_parameters(recording)[:1]
             label = "   ".join([str(recording.scenario), *marks])
         else:
             label = f"frame {scene.frame}"

@@ -252,9 +252,10 @@ class Recording:
         return UsageError(
             what,
             where=f"scenario {self.scenario}",
-            expected=f"0 to {self.frames - 1}",
+            expected=f"0 to {self.frames - 1}, or -{self.frames} to -1",
             got=got,
-            fix="name a frame in this range; -1 is the last one",
+            fix="name a frame in this range; negative numbers count from the end, "
+            "and -1 is the last frame",
         )
 
     def scene(self, frame: int) -> Scene:
@@ -291,6 +292,18 @@ class Recording:
 
     def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:
         return self._read(name, frame)[self._is_present].astype(np.float64)
+
+
+def name_start(parameters: Mapping[str, Any]) -> str:
+    """Return how a flow starts, as in "frequency 3"; empty where nothing says so.
+
+    A flow of vortex rings has no frequency: its files state 0.
+    """
+    if parameters.get("kind") == "rings":
+        return "vortex rings"
+    if "frequency" in parameters:
+        return f"frequency {parameters['frequency']}"
+    return ""
 
 
 @contextmanager

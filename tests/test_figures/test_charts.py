@@ -26,7 +26,7 @@ from lagbench.figures.chart import (
     spanning,
 )
 from lagbench.figures.html import interval, text
-from lagbench.figures.labels import LabelBox, place_labels
+from lagbench.figures.labels import LabelBox, place_joined_labels, place_labels
 
 PLOT_BOX = LabelBox(0.0, 0.0, 400.0, 200.0)
 
@@ -290,6 +290,64 @@ def test_a_long_label_near_the_rim_ends_there() -> None:
     assert first.box.right == PLOT_BOX.right
 
 
+@given(st.lists(coordinates, max_size=8, unique=True))
+def test_joined_labels_cover_nothing_and_belong_to_one_dot(
+    dots: list[tuple[float, float]],
+) -> None:
+    """A label without a line is nearest to its own dot. A line ends at its label."""
+    note = LabelBox(0.0, 0.0, 90.0, 14.0)
+    names = [f"method {number}\nof two lines" for number in range(len(dots))]
+    placed = place_joined_labels(names, dots, plot=PLOT_BOX, taken=[note])
+    assert len(placed) == len(dots)
+    boxes = [note]
+    for x, y in dots:
+        boxes.append(LabelBox(x - 5, y - 5, x + 5, y + 5))
+    for label, dot in zip(placed, dots, strict=True):
+        if label is None:
+            continue
+        assert PLOT_BOX.contains(label.box)
+        for box in boxes:
+            assert not label.box.overlaps(box)
+        boxes.append(label.box)
+        if label.line_end is None:
+            distances = [label.box.distance(other) for other in dots]
+            assert min(distances) == label.box.distance(dot)
+        else:
+            assert label.box.distance(label.line_end) < 5.0
+
+
+def test_a_joined_label_of_a_crowded_dot_has_a_line() -> None:
+    """The row of dots leaves no room beside the middle one. Its line meets no dot."""
+    dots = [(200.0, 100.0), (180.0, 100.0), (220.0, 100.0)]
+    names = ["constant-velocity", "persistence", "frozen-field"]
+    labels = place_joined_labels(names, dots, plot=PLOT_BOX)
+    assert None not in labels
+    middle = labels[0]
+    assert middle is not None
+    assert middle.line_end is not None
+    end_x, end_y = middle.line_end
+    for x, y in dots[1:]:
+        for share in np.linspace(0.0, 1.0, 50):
+            point_x = 200.0 + share * (end_x - 200.0)
+            point_y = 100.0 + share * (end_y - 100.0)
+            assert np.hypot(point_x - x, point_y - y) > 5.0
+
+
+def test_joined_labels_leave_a_free_line_alone() -> None:
+    """A lonely dot at the left end of a line has its label to the left."""
+    axis = linear(0, 10)
+    spot = Spot(x=2, y=5, name="a method", description="a method", kind="entry")
+    for is_free in (False, True):
+        plot = Plot(axis, axis, x_label="x", y_label="y")
+        plot.line([2, 9], [5, 5], "front", is_free=is_free)
+        plot.spots([spot], joined=True)
+        reading = read_plot(plot)
+        (name,) = reading.of_class("name")
+        dot, *_ = reading.named("circle")
+        is_left = float(name.attributes["x"]) < float(dot.attributes["cx"])
+        assert is_left == is_free
+
+
 def test_a_label_at_the_end_of_an_axis_stays_in_the_chart() -> None:
     """5×10⁴ is the last tick, at the right rim of the plot; a letter is 6 pixels."""
     x = close_logarithmic(250.0, 4e4)
@@ -301,7 +359,7 @@ def test_a_label_at_the_end_of_an_axis_stays_in_the_chart() -> None:
 
 
 def test_a_key_lies_below_the_chart() -> None:
-    """Five marks in rows of three: every name is below the plot and in the picture."""
+    """Five marks in rows of two: every name is below the plot and in the picture."""
     names = ["first", "second", "third", "fourth", "fifth"]
     items = [KeyItem("dot naive", name) for name in names]
     axis = linear(0, 1)
@@ -313,7 +371,7 @@ def test_a_key_lies_below_the_chart() -> None:
     assert [element.text for element in reading.of_class("note")] == names
     assert min(bases) > 200
     assert max(bases) < 200 + key_height(items)
-    assert len(set(bases)) == 2
+    assert len(set(bases)) == 3
     assert len(reading.named("circle")) == len(names)
 
 

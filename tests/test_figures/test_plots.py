@@ -48,6 +48,7 @@ from lagbench.figures.colours import (
 from lagbench.figures.panels import (
     VIEWS,
     Panel,
+    draw,
     draw_walls,
     limit_of,
     median_limit,
@@ -190,9 +191,9 @@ def test_paths_of_pictures_may_begin_with_the_home_folder(
     assert str(picture) in str(caught.value.got)
     with pytest.raises(UsageError):
         plot("~/own.nc", output="~no-such-user/picture.png")
-    for draw in (plot, animate):
+    for make_picture in (plot, animate):
         with pytest.raises(UnreadableFileError):
-            draw("~/text.nc")
+            make_picture("~/text.nc")
     assert list(here.iterdir()) == []
 
 
@@ -385,10 +386,77 @@ def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) ->
         assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
 
 
+def build_uniform_flow(velocity: tuple[float, float], *, lattice: int) -> xr.Dataset:
+    """Return decaying vortices without vortices: all particles have one velocity."""
+    axis = (np.arange(lattice) + 0.5) / lattice
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    start = np.stack([x.ravel(), y.ravel()], axis=-1)
+    step = np.array(velocity)
+    frames = [(start + frame * step) % 1.0 for frame in range(3)]
+    position = np.stack(frames).astype(np.float32)
+    particle_count = len(start)
+    return xr.Dataset(
+        {
+            "position": (("frame", "particle", "axis"), position),
+            "material": ("particle", np.zeros(particle_count, np.int8)),
+            "particle_mass": ((), 1e-4 / particle_count),
+        },
+        coords={"frame": np.arange(3)},
+        attrs={"split": "decaying-vortices", "size": "tiny", "scenario": 3},
+    )
+
+
+def test_streamlines_of_a_periodic_box_reach_its_edges() -> None:
+    """The field goes on beyond an edge of the box, so no line ends there."""
+    data = build_uniform_flow((0.01, 0.004), lattice=40)
+    with open_recording(data) as recording:
+        scene = recording.scene(1)
+        spacing = scene.fields.grid.spacing
+    with figure(3, 3) as drawn:
+        axes = drawn.add_axes((0, 0, 1, 1))
+        draw(axes, Panel.STREAMLINES, scene, limit=1.0)
+        (lines,) = axes.collections
+        points = np.concatenate([path.vertices for path in lines.get_paths()])
+        shown_low, shown_high = axes.get_xlim()
+    assert spacing == pytest.approx(0.1)
+    assert_allclose((shown_low, shown_high), (0.0, 1.0))
+    for axis in range(2):
+        assert points[:, axis].min() <= 0.0
+        assert points[:, axis].max() >= 1.0
+
+
+def test_streamlines_between_walls_stay_between_them(swirl: Path) -> None:
+    """What lies beyond a wall is no fluid."""
+    with open_recording(swirl) as recording:
+        scene = recording.scene(1)
+    with figure(3, 3) as drawn:
+        axes = drawn.add_axes((0, 0, 1, 1))
+        draw(axes, Panel.STREAMLINES, scene, limit=1.0)
+        (lines,) = axes.collections
+        points = np.concatenate([path.vertices for path in lines.get_paths()])
+    assert points.min() >= 0.0
+    assert points.max() <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "frequency", "expected"),
+    [("rings", 0, "vortex rings"), ("noise", 2, "frequency 2")],
+)
+def test_a_caption_names_vortex_rings_which_have_no_frequency(
+    tmp_path: Path, kind: str, frequency: int, expected: str
+) -> None:
+    """Their files state the frequency 0."""
+    parameters = {"kind": kind, "frequency": frequency}
+    path = write_swirl(tmp_path, "curl-noise", 3, walls=None, parameters=parameters)
+    with open_recording(path) as recording:
+        assert describe(recording) == f"curl-noise tiny  ·  scenario 3  ·  {expected}"
+
+
 def test_a_frame_counts_from_the_end(swirl: Path) -> None:
     """Frame -1 is the last; integers of NumPy are frame numbers too."""
     with open_recording(swirl) as recording:
         assert recording.scene(-1).frame == 5
+        assert recording.scene(-6).frame == 0
         assert recording.scene(np.int64(1)).frame == 1
 
 
@@ -400,7 +468,7 @@ def test_a_frame_that_does_not_exist_is_refused(
     with pytest.raises(UsageError) as caught:
         plot_frame(swirl, frame, tmp_path / "x.png")
     assert caught.value.where == "scenario 0"
-    assert caught.value.expected == "0 to 5"
+    assert caught.value.expected == "0 to 5, or -6 to -1"
     assert not (tmp_path / "x.png").exists()
 
 

@@ -428,6 +428,18 @@ def test_reference_predictors_have_no_rank(home: Path, tmp_path: Path) -> None:
     assert set(ranks[2:]) == {""}
 
 
+def test_no_submission_is_called_a_leader_below_a_better_reference(
+    home: Path, tmp_path: Path
+) -> None:
+    """A sentence above the table says that only submissions have a rank."""
+    bench = make_report_bench(home, "curl-noise")
+    page = reported(bench, tmp_path, {"m0": noisy})
+    above, _, below = page.partition('aria-label="Comparison"')
+    assert "leader" not in below.partition("</table>")[0]
+    _, _, lead = above.rpartition("<h4>")
+    assert "only submissions have a rank" in lead.lower()
+
+
 def test_methods_of_one_name_are_numbered(home: Path, tmp_path: Path) -> None:
     """Two files of one method get numbers, and so does a reference predictor's name."""
     bench = make_report_bench(home, "curl-noise")

@@ -15,6 +15,7 @@ from lagbench.data.box import WALL_NAMES
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
+from lagbench.figures.recording import name_start
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
@@ -272,7 +273,7 @@ class ScenarioLabel:
 
     moving: tuple[str, ...]  # names of the walls that slide
     reynolds: float | None  # Reynolds number, None where there is none
-    mark: str  # family, pair or frequency, as in "falling circle", or empty
+    mark: str  # family, pair or start, as in "falling circle", or empty
     is_slice: bool = False  # whether maps are slices of three dimensions
     # centre and radius of a fixed obstacle [length]; None without one
     obstacle: NDArray[np.float32] | None = None
@@ -408,8 +409,9 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
     for name in ("family", "pair"):
         if name in parameters:
             marks.append(str(parameters[name]))
-    if "frequency" in parameters:
-        marks.append(f"frequency {parameters['frequency']}")
+    start = name_start(parameters)
+    if start:
+        marks.append(start)
     reynolds = None
     value = parameters.get("reynolds_number")
     if isinstance(value, (int, float)):

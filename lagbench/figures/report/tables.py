@@ -239,9 +239,10 @@ def scenario_table(subject: Subject) -> Markup:
 
 
 def ranking_table(subject: Subject) -> Markup:
-    """Return the ranking of entries, each tested against the leader.
+    """Return the ranking of entries, each tested against the best entry.
 
     Tests are sign-flip tests, corrected by Holm. Reference predictors follow, unranked.
+    A reference predictor may be better than the best entry.
     """
     name = subject.ranking.name
     entries = {}
@@ -251,21 +252,21 @@ def ranking_table(subject: Subject) -> Markup:
             entries[row.name] = row
             scores[row.name] = row.scores[name]
     ranked = standings(scores)
-    leader = next(iter(ranked))
-    leader_score = scores[leader]
+    best_entry = next(iter(ranked))
+    best_score = scores[best_entry]
 
     lines: list[list[object]] = []
     for method, standing in ranked.items():
         row = entries[method]
         score = row.scores[name]
-        comparison = compare(score, leader_score)
+        comparison = compare(score, best_score)
         cells = _draw_standing(standing, comparison)
         rank = str(standing.rank)
         lines.append([_draw_heading(row), rank, wrap_number(score.mean), *cells])
     for row in subject.rows:
         if row.entry is None:
             score = row.scores[name]
-            comparison = compare(score, leader_score)
+            comparison = compare(score, best_score)
             cells = _draw_difference(comparison)
             mean_cell = wrap_number(score.mean)
             lines.append([_draw_heading(row), "", mean_cell, *cells, "", ""])
@@ -273,13 +274,19 @@ def ranking_table(subject: Subject) -> Markup:
         "method",
         "rank",
         words(name),
-        "loss above leader",
+        "loss − loss of the best submission",
         "95 % interval",
         "p",
-        "told from the leader",
+        "differs from the best submission",
     ]
+    lead = paragraph(
+        "Only submissions have a rank. Reference predictors stand below them for "
+        "comparison. A method with a negative difference of the losses is better than "
+        "the best submission."
+    )
     note = tag("small", _explain_test(subject), class_="muted")
-    return join([draw_table(head, lines, label="Comparison"), paragraph(note)])
+    table = draw_table(head, lines, label="Comparison")
+    return join([lead, table, paragraph(note)])
 
 
 def _draw_difference(comparison: Comparison) -> list[object]:
@@ -287,9 +294,9 @@ def _draw_difference(comparison: Comparison) -> list[object]:
 
 
 def _draw_standing(standing: Standing, comparison: Comparison) -> list[object]:
-    """Return difference from the leader, interval, p, and whether they differ."""
+    """Return difference from the best entry, interval, p, and whether they differ."""
     if standing.rank == 1:
-        return [tag("span", "leader", class_="muted"), "", "", ""]
+        return [tag("span", "best submission", class_="muted"), "", "", ""]
     verdict: object = "yes"
     if standing.tied:
         verdict = tag("span", "no", class_="muted")
@@ -300,8 +307,8 @@ def _explain_test(subject: Subject) -> str:
     count = len(subject.scenarios)
     note = (
         f"p: exact two-sided sign-flip test over {count} scenarios, corrected by Holm "
-        "for the comparisons with the leader. It is about these weights: other seeds "
-        "may stand otherwise."
+        "for the comparisons with the best submission. It is about these weights: "
+        "other seeds may stand otherwise."
     )
     if count < FEWEST_SCENARIOS:
         note += f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed."
