@@ -37,7 +37,11 @@ DescribeOption = Annotated[
     ),
 ]
 RadiusOption = Annotated[
-    float | None, option("--radius LENGTH", "Connectivity radius of graph models.")
+    float | None,
+    option(
+        "--radius LENGTH",
+        "Connectivity radius of graph models; at most half a period of the box.",
+    ),
 ]
 IntervalOption = Annotated[
     float | None, option("--frame-interval SECONDS", "Time between two frames.")
@@ -77,7 +81,12 @@ InterestOption = Annotated[
     ),
 ]
 CellsOption = Annotated[
-    int | None, option("--cells N", "Cells of the score grid along an axis.")
+    int | None,
+    option(
+        "--cells N",
+        "Cells of the score grid across a length of 1: 4 to 4096, in a unit cube to "
+        "270.",
+    ),
 ]
 FullBoxFlag = Annotated[
     bool | None,
@@ -152,14 +161,17 @@ def adopt_command(
     frame_interval: IntervalOption = None,
     valid: Annotated[
         int | None,
-        option("--valid N", "Number of trajectories for valid; a tenth by default."),
+        option(
+            "--valid N",
+            "Number of trajectories for valid; by default a tenth, and at least one.",
+        ),
     ] = None,
     test: Annotated[
         int | None,
         option(
             "--test N",
-            "Number of trajectories for test; by default a tenth, and six or more if "
-            "there are enough.",
+            "Number of trajectories for test; by default a tenth, and at least six; of "
+            "fewer than 18 trajectories a third, and at least one.",
         ),
     ] = None,
     bounds: BoundsOption = None,

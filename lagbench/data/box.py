@@ -176,7 +176,8 @@ class Box:
     def wrap(self, position: ArrayLike) -> Floats:
         """Return positions moved by whole periods into [low, high) of periodic axes.
 
-        Components along axes with walls stay as they are, even beyond a wall.
+        Components along axes with walls stay as they are, even beyond a wall. Infinity
+        along a periodic axis becomes NaN.
 
         Args:
             position: points [length], shape [..., axis].

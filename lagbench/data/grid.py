@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import enum
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,12 +38,38 @@ COUNTED_SHARE = 0.35
 Nodes at walls (1/2) count, nodes at corners (1/4) do not.
 """
 
+MOST_CELLS = 4096
+"""Cells across a score grid."""
+
+MOST_NODES = 20_000_000
+"""Nodes of a score grid: 4096 cells across a square, 270 across a cube of side 1.
+
+A field of float64 has 160 MB then, and a score needs several of them.
+"""
+
 EMPTY_SHARE = 1e-3
 """Below this share of a full node's weight a node is empty and its velocity is 0."""
 
 # Rows by which the stencil of a particle in the unit box can reach past the grid.
 _ROWS_BELOW = 1
 _ROWS_ABOVE = 2
+
+
+def most_cells(box: Box) -> int:
+    """Return the most cells across a length of 1 of a score grid in a box.
+
+    The grid has at most :data:`MOST_NODES` nodes. In a box with very long periods the
+    result may be small, or not positive.
+
+    >>> from lagbench.data.box import unit_box
+    >>> most_cells(unit_box(2)), most_cells(unit_box(3))
+    (4096, 270)
+    """
+    # volume of the grid, which ends at 0 and 1 along axes with walls
+    volume = float(np.prod(np.where(box.periodic, box.lengths, 1.0)))
+    # the largest c with volume (c + 1)^d nodes; the one is the last node of an axis
+    nodes_across = math.pow(MOST_NODES / volume, 1.0 / box.dimension)
+    return min(MOST_CELLS, math.floor(nodes_across) - 1)
 
 
 class Placement(enum.StrEnum):

@@ -44,7 +44,7 @@ from lagbench.errors import (
 from .box import Box, parse_periodic
 from .checksums import HASHED_SUBSETS, dataset_hash
 from .field_errors import describe_expectation, describe_input, is_own_sentence
-from .grid import Grid, Placement
+from .grid import MOST_NODES, Grid, Placement, most_cells
 from .layout import (
     ScenarioKey,
     dataset_folder,
@@ -215,14 +215,29 @@ class _SizeEntry(_RegistryModel):
     draw_seed: Hash | None = None
 
     @model_validator(mode="after")
-    def _check_periodic(self) -> _SizeEntry:
-        if not self.periodic:
-            return self
+    def _check_box(self) -> _SizeEntry:
         try:
-            parse_periodic(self.periodic, len(self.bounds))
+            periodic = parse_periodic(self.periodic, len(self.bounds))
         except UsageError as error:
             text = f"{error.what}: expected {error.expected}, got {error.got}"
             raise ValueError(text) from None
+        box = Box.from_bounds(self.bounds, periodic)
+
+        cells = self.task.score_grid.cells
+        most = most_cells(box)
+        if cells > most:
+            raise ValueError(
+                f"task.score_grid.cells: expected at most {most}, which gives at most "
+                f"{MOST_NODES} nodes in this box, got {cells}"
+            )
+        for period in box.lengths[list(box.periodic)]:
+            # A particle would be a neighbour by two of its images. A radius of half a
+            # period may be rounded up.
+            if self.task.radius > 0.5 * period * (1.0 + 1e-6):
+                raise ValueError(
+                    f"task.radius: expected at most half of each period, "
+                    f"{0.5 * period:g}, got {self.task.radius:g}"
+                )
         return self
 
 

@@ -216,23 +216,20 @@ def _divide_into_subsets(
     rows = []
     for path in paths:
         rows += list_trajectories(path)
-    valid_count = valid
-    if valid_count is None:
-        valid_count = max(1, len(rows) // 10)
-    test_count = test
-    if test_count is None:
-        # enough for a p-value, but no more than train can spare
-        test_count = max(1, len(rows) // 10, min(FEWEST_SCENARIOS, len(rows) // 3))
+    _require_one("--valid", valid)
+    _require_one("--test", test)
+    valid_count, test_count = _count_held_out(len(rows), valid=valid, test=test)
     train_count = len(rows) - valid_count - test_count
-    if min(train_count, valid_count, test_count) < 1:
+    if train_count < 1:
+        fewest = _fewest_trajectories(valid=valid, test=test)
         raise UsageError(
             "each subset needs a trajectory",
             where="--valid and --test",
-            expected="at least 3 trajectories: one each, and one left for train",
+            expected=f"at least {fewest} trajectories, so that one is left for train",
             got=f"{format_count(len(rows), 'trajectory')}, {valid_count} for valid, "
             f"{test_count} for test",
             fix="name more files, or a .npy of shape [trajectory, frame, particle, "
-            "axis]",
+            "axis]; or ask for fewer with --valid and --test",
         )
     first_test = train_count + valid_count
     return {
@@ -240,6 +237,42 @@ def _divide_into_subsets(
         "valid": rows[train_count:first_test],
         "test": rows[first_test:],
     }
+
+
+def _require_one(option: str, count: int | None) -> None:
+    """Refuse a stated subset without trajectories."""
+    if count is None or count >= 1:
+        return
+    raise UsageError(
+        "each subset needs a trajectory",
+        where=option,
+        expected="at least 1",
+        got=count,
+        fix="give a larger number, or leave the option out",
+    )
+
+
+def _count_held_out(
+    total: int, *, valid: int | None, test: int | None
+) -> tuple[int, int]:
+    """Return the numbers of trajectories for valid and test; train has the others."""
+    if valid is None:
+        valid = max(1, total // 10)
+    if test is None:
+        # enough for a p-value, but no more than train can spare
+        test = max(1, total // 10, min(FEWEST_SCENARIOS, total // 3))
+    return valid, test
+
+
+def _fewest_trajectories(*, valid: int | None, test: int | None) -> int:
+    """Return the fewest trajectories of which one is left for train."""
+    fewest = 1
+    while True:
+        held_out_count = sum(_count_held_out(fewest, valid=valid, test=test))
+        if held_out_count < fewest:
+            return fewest
+        # With more trajectories no fewer are held out, so the result is no smaller.
+        fewest = held_out_count + 1
 
 
 def _refuse_duplicates(rows: Sequence[Row]) -> None:

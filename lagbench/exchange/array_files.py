@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
@@ -32,11 +33,16 @@ from .trajectory import (
     check_array,
     check_inflation,
     check_names,
+    describe_archive,
+    guess_format,
     read_header,
 )
 
 READABLE = (".npy", ".npz", ".nc")
 """Files that are adopted: an array, named arrays, netCDF."""
+
+SAVE_AGAIN = f"save it again, as a file {', '.join(READABLE)}"
+"""What to do about a file that cannot be read."""
 
 POSITION = "position"
 VELOCITY = "velocity"
@@ -306,6 +312,15 @@ def _dtype_of(array: Any) -> np.dtype[Any]:  # noqa: ANN401
 def _read_npy(path: Path) -> NDArray[Any]:
     with _reading(path):
         with path.open("rb") as stream:
+            if stream.read(len(MAGIC_PREFIX)) != MAGIC_PREFIX:
+                raise UnreadableFileError(
+                    "not a .npy file of NumPy",
+                    where=str(path),
+                    expected="an array, written by np.save",
+                    got=guess_format(path),
+                    fix=SAVE_AGAIN,
+                )
+            stream.seek(0)
             _check_header(str(path), stream, path.stat().st_size)
         array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
     return array
@@ -339,8 +354,22 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
         )
 
 
+def _open_archive(path: Path) -> zipfile.ZipFile:
+    """Return a zip archive; refuse a file that is none."""
+    try:
+        return zipfile.ZipFile(path)
+    except zipfile.BadZipFile as error:
+        raise UnreadableFileError(
+            "cannot read an npz file",
+            where=str(path),
+            expected="named arrays, written by np.savez",
+            got=describe_archive(path, error),
+            fix=SAVE_AGAIN,
+        ) from error
+
+
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(path) as archive:
+    with _open_archive(path) as archive:
         check_names(path, archive)
         for member in archive.infolist():
             if member.filename.removesuffix(".npy") not in ARRAYS:
@@ -402,5 +431,5 @@ def _reading(path: Path) -> Iterator[None]:
             where=str(path),
             expected="arrays of numbers",
             got=f"{type(error).__name__}: {error}",
-            fix=f"save it again, as a file {', '.join(READABLE)}",
+            fix=SAVE_AGAIN,
         ) from error

@@ -34,6 +34,7 @@ from .trajectory import (
     check_array,
     check_inflation,
     check_names,
+    describe_archive,
     read_header,
 )
 
@@ -116,7 +117,7 @@ def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajecto
             "cannot read an npz file",
             where=str(path),
             expected="a file of numpy.savez",
-            got=f"{type(error).__name__}: {error}",
+            got=describe_archive(path, error),
             fix="fetch it again, or name the format that it has: --format",
         ) from error
     with archive:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from lagbench.atomic import SUFFIX, check_writable, temporary_name, write_atomically
 from lagbench.data.box import AXES, SMALL_SIDE, Box, parse_periodic, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
-from lagbench.data.grid import Placement
+from lagbench.data.grid import MOST_NODES, Placement, most_cells
 from lagbench.data.layout import (
     MAX_ID,
     ScenarioKey,
@@ -52,14 +52,13 @@ from lagbench.errors import (
     UsageError,
     WorkFailedError,
 )
-from lagbench.metrics.coverage import Cloud, fitting_cells
+from lagbench.metrics.coverage import CELLS, Cloud, fitting_cells
 from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
 
 from .crossings import CrossingCheck
 from .trajectory import (
     FEWEST_CELLS,
-    MOST_CELLS,
     Bounds,
     Description,
     Trajectory,
@@ -160,7 +159,8 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
             frame_low = position.min(axis=0).astype(np.float64)
             frame_high = position.max(axis=0).astype(np.float64)
             if not (np.isfinite(frame_low).all() and np.isfinite(frame_high).all()):
-                raise _not_finite(position, f"{trajectory.name}, frame {number}")
+                where = f"{trajectory.name}, frame {number}"
+                raise _not_finite(position, position, where)
             if low is None or high is None or len(low) != len(frame_low):
                 low = frame_low
                 high = frame_high
@@ -171,15 +171,23 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
     return tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 
-def _not_finite(position: NDArray[np.floating], where: str) -> DataError:
-    """Return the error for a frame in which a position is not finite."""
+def _not_finite(
+    position: NDArray[np.floating], raw_position: NDArray[np.floating], where: str
+) -> DataError:
+    """Return the error for a frame in which a position is not finite.
+
+    Args:
+        position: positions [length], shape [particle, axis].
+        raw_position: the same ones as the file has them, for the message.
+        where: trajectory and frame.
+    """
     is_finite = np.isfinite(position).all(axis=1)
     particle = int(np.argmin(is_finite))
     return DataError(
         "a position is not finite",
         where=f"{where}, particle {particle}",
         expected="finite numbers, no larger than those of float32",
-        got=position[particle].tolist(),
+        got=np.asarray(raw_position)[particle].tolist(),
         fix="leave the particle out, or end the trajectory before this frame",
     )
 
@@ -241,7 +249,10 @@ def _check_cells(description: Description) -> None:
     """Refuse a stated score grid that does not fit the periods of the box."""
     cells = description.cells
     box = description.box
-    if cells is None or box is None or box.has_whole_cells(cells):
+    if cells is None or box is None:
+        return
+    _check_nodes(cells, box)
+    if box.has_whole_cells(cells):
         return
     raise UsageError(
         "the score grid has no whole cells along the periodic axes",
@@ -249,6 +260,37 @@ def _check_cells(description: Description) -> None:
         expected="cells that divide each period into three or more of them",
         got=f"{cells} across a length of 1, in the box {format_bounds(box.bounds)}",
         fix="leave --cells out, and add --rescale if the periods need it",
+    )
+
+
+def _check_nodes(cells: int, box: Box) -> None:
+    """Refuse a stated score grid whose fields would fill the memory."""
+    most = most_cells(box)
+    if cells <= most:
+        return
+    if most < FEWEST_CELLS:
+        raise _period_error(box)
+    proposal = most
+    while proposal > FEWEST_CELLS and not box.has_whole_cells(proposal):
+        proposal -= 1
+    raise UsageError(
+        "the score grid has too many nodes",
+        where="--cells",
+        expected=f"{FEWEST_CELLS} to {most} in this box, which are at most "
+        f"{MOST_NODES} nodes",
+        got=f"{cells} across a length of 1, in the box {format_bounds(box.bounds)}",
+        fix=f"give fewer, as in --cells {proposal}; or leave --cells out",
+    )
+
+
+def _period_error(box: Box) -> UsageError:
+    """Return the error for periods so long that score grids have too many nodes."""
+    return UsageError(
+        "the periods are far longer than the unit box",
+        where="--bounds, or bounds of the metadata",
+        expected=f"periods near 1, for a score grid of at most {MOST_NODES} nodes",
+        got=format_bounds(box.bounds),
+        fix="add --rescale, which fits the box into the unit box; or correct --bounds",
     )
 
 
@@ -449,6 +491,8 @@ class SplitBuilder:
                 fix="leave some out, or make two splits",
             )
         self._check_dimension(trajectory)
+        if not self.entries and self.description.cells is not None:
+            _check_nodes(self.description.cells, self._box)
         self._check_walls(trajectory)
         if not self.spacing:
             self.spacing = self._measure_spacing(trajectory)
@@ -534,7 +578,8 @@ class SplitBuilder:
         raw_position, _ = next(trajectory.read())
         raw_position = np.asarray(raw_position)
         position = self._transform_positions(raw_position)
-        self._check_positions(position, trajectory, where=f"{trajectory.name}, frame 0")
+        where = f"{trajectory.name}, frame 0"
+        self._check_positions(position, raw_position, trajectory, where=where)
         spacing = description.spacing
         if not spacing:
             spacing = estimate_spacing(
@@ -566,7 +611,7 @@ class SplitBuilder:
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
             position = self._transform_positions(raw_position)
-            self._check_positions(position, trajectory, where=where)
+            self._check_positions(position, raw_position, trajectory, where=where)
             if before is not None:
                 step = self._box.displacement(before, position.astype(np.float64))
                 crossings.add(step, self._lengths, frame=number)
@@ -625,16 +670,21 @@ class SplitBuilder:
         return velocity
 
     def _check_positions(
-        self, position: NDArray[np.float32], trajectory: Trajectory, *, where: str
+        self,
+        position: NDArray[np.float32],
+        raw_position: NDArray[np.floating],
+        trajectory: Trajectory,
+        *,
+        where: str,
     ) -> None:
         """Refuse positions not finite, outside the unit box, or far outside the bounds.
 
-        Their extent is noted.
+        Their extent is noted. The raw positions are those of the file.
         """
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise _not_finite(position, where)
+            raise _not_finite(position, raw_position, where)
         if (low < 0.0).any() or (high > 1.0).any():
             raise DataError(
                 "particles lie outside the unit box",
@@ -947,10 +997,13 @@ class SplitBuilder:
         Where test scenarios cover too few nodes in these frames, it is the nearest
         number by which they cover enough.
         """
-        cells = round(1.0 / (SPACINGS_PER_CELL * self.spacing))
-        cells = min(MOST_CELLS, max(FEWEST_CELLS, cells))
-        clouds = partial(self._read_clouds, frames)
         box = self._box
+        most = most_cells(box)
+        if most < max(CELLS):
+            raise _period_error(box)
+        cells = round(1.0 / (SPACINGS_PER_CELL * self.spacing))
+        cells = min(most, max(FEWEST_CELLS, cells))
+        clouds = partial(self._read_clouds, frames)
         suitable_cells = fitting_cells(clouds, placement, near=cells, box=box)
         if suitable_cells is not None:
             return suitable_cells

@@ -27,9 +27,11 @@ from pydantic_core import ErrorDetails
 # pydantic reads the TypedDict of Python 3.12 and later only
 from typing_extensions import TypedDict
 
-from lagbench.data.box import SMALL_SIDE, Box, parse_periodic, unit_box
+from lagbench.data.box import AXES, SMALL_SIDE, Box, parse_periodic, unit_box
 from lagbench.data.checksums import round_digits
 from lagbench.data.field_errors import describe_expectation, describe_input
+from lagbench.data.grid import MOST_CELLS
+from lagbench.data.hdf5 import OTHER_FORMATS, SIGNATURE
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
@@ -61,8 +63,17 @@ Bounds = tuple[tuple[float, float], ...]
 DIMENSIONS = (2, 3)
 """Numbers of components that positions may have."""
 
+ARCHIVE = b"PK"
+"""First bytes of a zip archive, which an npz file is."""
+
 HARMLESS_BYTES = 1 << 28
 """Length that an array may always unpack to [bytes]."""
+
+FORMATS: Mapping[bytes, str] = {SIGNATURE: "an HDF5 file", **OTHER_FORMATS}
+"""Names of formats by the first bytes of their files."""
+
+FIRST_BYTES = 64
+"""Bytes by which a text is told from other files."""
 
 MOST_INFLATION = 200
 """Times its own length that a larger array may unpack to.
@@ -82,9 +93,6 @@ MOST_MISTAKES = 10
 """Mistakes of a description that one message tells."""
 
 FEWEST_CELLS = 4
-MOST_CELLS = 4096
-"""Cells across a score grid."""
-
 MOST_CELLS_OF_PERIODS = 64
 """Cells across a length of 1 of which one number must fit the periods."""
 
@@ -409,6 +417,7 @@ class Description:
                 )
             transform = BoxTransform.fit(self.bounds, self.periodic)
             object.__setattr__(self, "transform", transform)
+        self._check_radius()
 
     def _check_quantities(self, mistakes: UsageErrorCollector) -> None:
         for option, value, least in (
@@ -457,13 +466,13 @@ class Description:
 
     def _check_bounds(self) -> None:
         bounds = self.bounds or ()
-        for low, high in bounds:
+        for axis, (low, high) in zip(AXES, bounds, strict=False):
             if not -MOST <= low < high <= MOST:
                 raise UsageError(
                     "bounds run from low to high",
                     where="--bounds",
                     expected=f"low < high along each axis, from {-MOST:g} to {MOST:g}",
-                    got=bounds,
+                    got=f"from {low} to {high} along {axis}",
                     fix=f"give them as in {bounds_example(len(bounds))}",
                 )
 
@@ -489,6 +498,28 @@ class Description:
                 got=error.got,
                 fix=f"{error.fix}; a box of three axes has three pairs of --bounds",
             ) from None
+
+    def _check_radius(self) -> None:
+        """Refuse a radius above half a period.
+
+        A particle would be a neighbour by two of its images, and models see the nearest
+        image only.
+        """
+        box = self.source_box
+        if box is None or not box.is_periodic:
+            return
+        shortest_period = float(box.lengths[np.asarray(box.periodic)].min())
+        most = 0.5 * shortest_period
+        # A period is a difference of two bounds, so it is rounded.
+        if self.radius <= most * (1.0 + 1e-9):
+            return
+        raise UsageError(
+            "the radius is above half of the shortest period",
+            where="--radius, or the radius of the metadata",
+            expected=f"at most {most:.6g}, half of the period {shortest_period:.6g}",
+            got=self.radius,
+            fix="give a smaller --radius: a few spacings of the particles are enough",
+        )
 
     @cached_property
     def box(self) -> Box | None:
@@ -646,6 +677,33 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
                 got=count,
                 fix=f"give fewer {kind}",
             )
+
+
+def guess_format(path: Path) -> str:
+    """Return in plain words what a file is, by its first bytes."""
+    with path.open("rb") as stream:
+        first_bytes = stream.read(FIRST_BYTES)
+    if not first_bytes:
+        return "an empty file"
+    for signature, format_name in FORMATS.items():
+        if first_bytes.startswith(signature):
+            return format_name
+    if first_bytes.isascii():
+        words = first_bytes.decode("ascii").split()
+        if "".join(words).isprintable():
+            return "a text file"
+    return "bytes of another format"
+
+
+def describe_archive(path: Path, error: Exception) -> str:
+    """Return in plain words why a file is no readable npz archive."""
+    if not isinstance(error, zipfile.BadZipFile):
+        return f"{type(error).__name__}: {error}"
+    with path.open("rb") as stream:
+        is_archive = stream.read(len(ARCHIVE)) == ARCHIVE
+    if is_archive:
+        return f"a zip archive that is cut or damaged ({error})"
+    return guess_format(path)
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:

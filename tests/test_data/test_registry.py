@@ -354,6 +354,20 @@ def lead_out(splits: dict[str, Any]) -> None:
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
         (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
         (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),
+        (
+            within(
+                "cavity",
+                *("sizes", "full", "task", "score_grid"),
+                cells=5000,
+                placement="nodes",
+            ),
+            ("task.score_grid.cells", "got 5000"),
+        ),
+        (within("cavity", "sizes", "full", "task", frames_of_interest=[]), ("task",)),
+        (
+            within("decaying-vortices", "sizes", "tiny", "task", radius=0.51),
+            ("task.radius", "half of each period", "got 0.51"),
+        ),
         (within("cavity", version="1.0"), ("cavity.version", "a version, as in 1.0.0")),
         (lead_out, ("cavity.sizes", "../x", "a letter first")),
         (

@@ -1583,3 +1583,160 @@ def test_options_of_a_wrong_kind_are_refused(
         adopt(tmp_path / "in", output=tmp_path / "mine", **options)
     assert caught.value.where == option
     assert expected in str(caught.value.expected)
+
+
+def save_periodic_runs(folder: Path, dimension: int) -> list[Path]:
+    """Write four trajectories in the periodic unit box."""
+    generator = np.random.default_rng(3)
+    runs = []
+    for _ in range(4):
+        first = generator.uniform(0.2, 0.8, (60, dimension))
+        velocity = generator.uniform(-0.01, 0.01, (60, dimension))
+        steps = np.arange(12)[:, None, None]
+        runs.append((first + steps * velocity).astype(np.float32))
+    return save_runs(folder, runs)
+
+
+@pytest.mark.parametrize("walls", ["unknown", "stated", "periodic"])
+def test_a_score_grid_that_fills_the_memory_is_refused(
+    tmp_path: Path, walls: str, adopt_here: Adopt
+) -> None:
+    """1000 cells across a cube are 8 GB for each quantity; across a square they fit."""
+    for dimension in (3, 2):
+        paths = save_periodic_runs(tmp_path / f"in{dimension}", dimension)
+        options: dict[str, Any] = {"cells": 1000}
+        if walls != "unknown":
+            options["bounds"] = ((0.0, 1.0),) * dimension
+        if walls == "periodic":
+            options["periodic"] = ("x", "y", "z")[:dimension]
+        if dimension == 2:
+            assert locate(adopt_here(paths, **options).folder)
+            continue
+        with pytest.raises(UsageError) as caught:
+            adopt_here(paths, **options)
+        assert "--cells" in str(caught.value.where)
+        assert not (tmp_path / "mine").exists()
+        # the fix is a command that works
+        proposal = re.search(r"--cells (\d+)", str(caught.value.fix))
+        assert proposal is not None
+        assert int(proposal[1]) >= 128
+
+
+def test_a_long_period_makes_no_large_grid(tmp_path: Path, adopt_here: Adopt) -> None:
+    """A period of 1e6 has 64e6 cells of 1/64, whether or not the cells are stated."""
+    paths = save_periodic_runs(tmp_path / "in", 2)
+    options: dict[str, Any] = {"bounds": ((0.0, 1e6), (0.0, 1.0)), "periodic": ("x",)}
+    for changes in ({}, {"cells": 64}):
+        with pytest.raises(UsageError) as caught:
+            adopt_here(paths, **options, **changes)
+        assert "--rescale" in str(caught.value.fix)
+    assert not (tmp_path / "mine").exists()
+
+
+def test_the_cells_of_a_tiny_drop_in_a_cube_are_few(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """The spacing would have 4,000 cells across: 64e9 nodes."""
+    axis = 0.5 + 1e-4 * np.arange(6)
+    first = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    run = first + 1e-5 * np.arange(12)[:, None, None]
+    paths = save_runs(tmp_path / "in", [run.astype(np.float32)] * 4)
+    box = ((0.0, 1.0),) * 3
+    size = locate(adopt_here(paths, bounds=box, spacing=1e-4).folder).size
+    assert math.prod(size.field_grid.shape) <= 20_000_000
+
+
+@pytest.mark.parametrize("radius", [0.2, 0.21])
+def test_the_radius_is_at_most_half_a_period(
+    tmp_path: Path, radius: float, adopt_here: Adopt
+) -> None:
+    """Beyond it a particle would be a neighbour twice, which minimum images cannot be.
+
+    Walls have no images, so the height of 1/4 of the box does not count.
+    """
+    paths = save_periodic_runs(tmp_path / "in", 2)
+    runs = [np.load(path) * 0.25 + 0.3 for path in paths]
+    paths = save_runs(tmp_path / "in", runs)
+    options: dict[str, Any] = {
+        "radius": radius,
+        # the difference is below 0.4 by rounding
+        "bounds": ((0.3, 0.7), (0.25, 0.65)),
+        "cells": 20,
+    }
+    with_walls = adopt_here(paths, output=tmp_path / "walls", **options)
+    assert locate(with_walls.folder).size.task.radius == radius
+    if radius == 0.2:
+        periodic = adopt_here(paths, periodic=("x",), **options)
+        assert locate(periodic.folder).size.task.radius == radius
+        return
+    with pytest.raises(UsageError) as caught:
+        adopt_here(paths, periodic=("x",), **options)
+    assert "--radius" in str(caught.value.where)
+    assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize(
+    ("counts", "least"),
+    [
+        ({}, 3),
+        ({"test": 5}, 7),
+        ({"valid": 4}, 7),
+        ({"test": 5, "valid": 4}, 10),
+    ],
+)
+def test_the_least_number_of_trajectories_is_told(
+    tmp_path: Path, counts: dict[str, int], least: int, adopt_here: Adopt
+) -> None:
+    """One less is refused, and the number of the message is enough."""
+    runs = straight_runs(least)
+    with pytest.raises(UsageError) as caught:
+        adopt_here(save_runs(tmp_path / "few", runs[:-1]), **counts)
+    assert f"at least {least} trajectories" in str(caught.value.expected)
+    own_split = adopt_here(save_runs(tmp_path / "enough", runs), **counts)
+    assert own_split.scenarios["train"] == 1
+
+
+@pytest.mark.parametrize("count", [0, -1])
+@pytest.mark.parametrize("option", ["valid", "test"])
+def test_valid_and_test_have_a_trajectory(
+    tmp_path: Path, option: str, count: int, adopt_here: Adopt
+) -> None:
+    """More files would not help, so the message names the option."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    with pytest.raises(UsageError) as caught:
+        adopt_here(paths, **{option: count})
+    assert caught.value.where == f"--{option}"
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 1e300])
+@pytest.mark.parametrize("frame", [0, 3])
+def test_the_error_has_the_position_of_the_file(
+    tmp_path: Path, frame: int, value: float, adopt_here: Adopt
+) -> None:
+    """In periodic and in scaled boxes too."""
+    paths = save_periodic_runs(tmp_path / "in", 2)
+    run = np.load(paths[0]).astype(np.float64)
+    run[frame, 5, 1] = value
+    np.save(paths[0], run)
+    with pytest.raises(DataError) as caught:
+        adopt_here(
+            paths,
+            bounds=((-2.0, 2.0), (-2.0, 2.0)),
+            periodic=("x", "y"),
+            rescale=True,
+        )
+    assert "run0.npy" in str(caught.value.where)
+    assert_array_equal(np.array(caught.value.got, np.float64), run[frame, 5])
+
+
+def test_the_error_of_exchanged_bounds_names_the_axis(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """It has no brackets of Python, and the numbers as the user gave them."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    with pytest.raises(UsageError) as caught:
+        adopt_here(paths, bounds=((0.0, 1.0), (0.75, 0.25)))
+    got = str(caught.value.got)
+    assert "y" in got
+    assert "0.75" in got
+    assert "(" not in got

@@ -809,3 +809,51 @@ def test_kinds_that_are_no_numbers(text: str) -> None:
     with pytest.raises(UsageError) as caught:
         parse_kinds(text)
     assert caught.value.where == "--kinds"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"position, velocity\n0.5, 0.25\n", "text"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(100), "HDF5"),
+        (b"\x80\x04]\x94.", "pickle"),
+    ],
+)
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_a_file_of_another_format_is_named(
+    tmp_path: Path, ending: str, content: bytes, words: str
+) -> None:
+    """The name of its suffix does not hide what it is, nor does an error of Python."""
+    paths = []
+    for number in range(3):
+        path = tmp_path / f"own{number}.{ending}"
+        path.write_bytes(content)
+        paths.append(path)
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    assert "own" in str(caught.value.where)
+    assert words in str(caught.value.got)
+    assert "Error" not in str(caught.value.got)
+    assert "BadZip" not in str(caught.value.got)
+
+
+def test_a_text_in_place_of_an_imported_npz_file_is_named(gns: Path) -> None:
+    """So the user sees that the download was a page."""
+    (gns / "train.npz").write_text("<html>not found</html>")
+    with pytest.raises(UnreadableFileError) as caught:
+        imported(gns)
+    assert "text" in str(caught.value.got)
+
+
+def test_a_cut_npz_file_is_called_cut(tmp_path: Path) -> None:
+    """Its first bytes are those of a zip archive."""
+    paths = []
+    for number, run in enumerate(straight_runs(3)):
+        path = tmp_path / f"run{number}.npz"
+        np.savez(path, position=run)
+        paths.append(path)
+    whole = paths[1].read_bytes()
+    paths[1].write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    assert "cut" in str(caught.value.got)
