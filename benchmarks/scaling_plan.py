@@ -416,10 +416,10 @@ def main() -> int:
         *parts_table(measured),
         "",
         "A *whole generation* makes one scenario of train and one of test, and repeats "
-        "the scenario of test as its perturbed run. So the sum of the parts counts "
-        "three runs of the solver and two written scenarios. A whole generation takes "
-        "longer: it also imports and compiles, and it writes the manifest and draws "
-        "the pictures.",
+        "the scenario of test as its perturbed run. In this measurement all three runs "
+        "have the same number of frames. So the sum of the parts counts three runs of "
+        "the solver and two written scenarios. A whole generation takes longer: it "
+        "also imports and compiles, and it writes the manifest and draws the pictures.",
         "",
         *whole_table(measured),
         "",
