@@ -240,6 +240,10 @@ class ParticleGrid(nn.Module):
         if self.dimension == 3:
             # Products with 27 nodes would fill the memory: this sums at once.
             node = stencil.node.view(-1, nodes_around)
+            # It takes one type only, and a product takes two.
+            dtype = torch.promote_types(by_node.dtype, weight.dtype)
+            by_node = by_node.to(dtype)
+            weight = weight.to(dtype)
             return embedding_bag(node, by_node, per_sample_weights=weight, mode="sum")
         nearby = by_node.index_select(0, stencil.node)
         nearby = nearby.view(-1, nodes_around, channels)

@@ -107,9 +107,12 @@ def check_settings_in_child(
 ) -> list[dict[str, Any]]:
     """Return what `check_settings` returns for each request.
 
-    All files are read in one child process, which has :data:`SECONDS` for each. Where
-    it is stopped, the settings of the file that stopped it, and of those after it, are
-    returned as they are written.
+    One child process reads all files. Its processor time is :data:`SECONDS` times the
+    number of requests. Where it is stopped, the settings of the file that stopped it,
+    and of those after it, are returned as they are written.
+
+    Raises:
+        WorkFailedError: the machine is too busy.
     """
     answers = run_in_child(
         f"{__name__}.{check_settings.__name__}",
@@ -119,6 +122,9 @@ def check_settings_in_child(
         memory=MEMORY,
     )
     checked = list(answers.values)
+    if len(checked) < len(requests):
+        stopping_path = requests[len(checked)][0]
+        answers.require_in_time(stopping_path)
     for request in requests[len(checked) :]:
         checked.append(_as_written(request[1:]))
     return checked

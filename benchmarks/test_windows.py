@@ -302,7 +302,7 @@ def test_npz_in_memory(tmp_path: Path) -> None:
 def test_hdf5_of_trajectories(tmp_path: Path) -> None:
     """How LagrangeBench reads: seven frames of a group of an HDF5 file."""
     write_lagrangebench_h5(tmp_path / "train.h5", TRAJECTORIES)
-    windows_in_each = FRAMES - HISTORY - 1
+    windows_in_each = FRAMES - HISTORY
     with h5py.File(tmp_path / "train.h5") as file:
 
         def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -74,13 +74,15 @@ def measure_costs(
 ) -> list[tuple[Entry, MeasuredCost]]:
     """Return the cost of a frame for entries of one data set.
 
-    An entry whose model fails has no cost.
+    An entry whose model fails has no cost. The solver has no time unless it ran in
+    every repeat.
 
     Args:
         timed: entries of one split and size, with their models.
         task: the test subset of that data set; its first scenario is predicted.
         root: folder of all data sets.
-        time_solver: function that returns the solver's time; None leaves it out.
+        time_solver: function that returns the solver's time, None where the solver
+            cannot run; None leaves it out.
         meter: counts the rows that are timed.
         keep_failure: receives an entry whose model fails, and the error.
         repeats: turns of every row.
@@ -128,7 +130,9 @@ def measure_costs(
 
     least = {}
     for name in rounds[-1]:
-        least[name] = round_digits(min(row[name] for row in rounds), DIGITS)
+        times = [seconds[name] for seconds in rounds if name in seconds]
+        if len(times) == len(rounds):
+            least[name] = round_digits(min(times), DIGITS)
     kinds: dict[Kind, dict[str, float]] = {Kind.CLASSICAL: {}, Kind.NAIVE: {}}
     for reference in references:
         kinds[reference.kind][reference.name] = max(

@@ -322,11 +322,15 @@ def _source_of(content: str) -> str:
 def draw_intro(board: Board) -> Markup:
     """Return the paragraphs under the title: question, answer, what is verified.
 
-    They count active entries only.
+    They count active entries only, and the data sets that have one.
     """
     rows: list[BoardRow] = []
+    data_set_count = 0
     for tab in board.tabs:
-        rows += [row for row in tab.rows if row.active]
+        active_rows = [row for row in tab.rows if row.active]
+        rows += active_rows
+        if active_rows:
+            data_set_count += 1
     question = (
         "Which neural surrogate predicts how fluids and soft bodies move, and is it "
         "better than a classical solver of the same cost?"
@@ -338,7 +342,7 @@ def draw_intro(board: Board) -> Markup:
         details = " ".join(["", *verdicts[1:]])
         paragraphs.append(tag("p", answer, details, class_="lede"))
     entries = _count(len(rows), "entry", "entries")
-    data_sets = _count(len(board.tabs), "data set", "data sets")
+    data_sets = _count(data_set_count, "data set", "data sets")
     evidence = escaped(
         f"{entries} on {data_sets} that every x86-64 Linux CPU regenerates bit for "
         "bit. Every score follows from committed score files. "

@@ -26,6 +26,7 @@ from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.submission.other_files import MODEL_ENDINGS
 
 from .draft import Draft, PredictionsFile, require_valid
 from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
@@ -372,7 +373,7 @@ def _find_files_to_remove(
         stale_paths = set(previous.files) - set(entry.files)
     for path in moves:
         log = path.with_suffix(".json")
-        if path.suffix in (".pt", ".safetensors") and log not in moves:
+        if path.suffix in MODEL_ENDINGS and log not in moves:
             stale_paths.add(log)
     whole_paths = []
     for path in sorted(stale_paths):

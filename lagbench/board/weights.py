@@ -429,17 +429,16 @@ def copy_weights(
 def _find_training_log(path: Path) -> Path | None:
     """Return the log of a training, None where weights have none.
 
-    It is training.json in the folder of a run, or has the name of the weights, as on a
-    board.
+    It has the name of the weights, as on a board. Without such a file it is
+    training.json, as in the folder of a run.
     """
-    training_log = None
     for candidate in (path.with_suffix(".json"), path.with_name(TRAINING_LOG)):
         if not candidate.is_file() or reason_unfit_log(candidate) is not None:
             continue
         # the JSON file that `lagbench predict` writes about costs has no step
         if "step" in json.loads(candidate.read_bytes()):
-            training_log = candidate
-    return training_log
+            return candidate
+    return None
 
 
 def reason_unfit_log(path: Path) -> str | None:

@@ -259,7 +259,11 @@ class Box:
         points = np.asarray(position)
         if not self.is_periodic:
             return points
-        return np.asarray(self.wrap(points) - self.low)
+        from_low = np.asarray(self.wrap(points) - self.low)
+        # The difference can round to the period, which is the lower end again.
+        is_at_end = np.asarray(self.periodic) & (from_low >= self.lengths)
+        from_low[is_at_end] = 0.0
+        return from_low
 
     def contains(
         self, position: ArrayLike, *, tolerance: float = 0.0

@@ -215,6 +215,22 @@ def test_spread_is_the_scorers_transfer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["square", "cube", "duct"])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_fields_of_another_type_are_gathered(name: str, dtype: torch.dtype) -> None:
+    """The result has the type of a product: networks may give bfloat16 or float64."""
+    grid = make_grid(name)
+    generator = torch.Generator().manual_seed(0)
+    place = torch.from_numpy(draw_places(name, 20))
+    stencil = grid.stencil(place.float(), one_layer(20))
+    field = torch.randn(1, 2, *grid.shape, generator=generator)
+    field = field.to(dtype)
+    gathered = grid.gather(stencil, field)
+    assert gathered.dtype == torch.promote_types(dtype, torch.float32)
+    expected = grid.gather(stencil, field.float())
+    assert_close(gathered.float(), expected)
+
+
+@pytest.mark.parametrize("name", ["square", "cube", "duct"])
 def test_gather_is_the_adjoint_of_spread(name: str) -> None:
     """<spread(v), g> = <v, gather(g)>, and so for gradients to positions."""
     grid = make_grid(name)

@@ -1144,6 +1144,18 @@ def test_score_files_without_a_skill_leave_no_gap() -> None:
     assert read_html(page).faults == []
 
 
+def test_the_introduction_counts_data_sets_of_active_entries(board: Board) -> None:
+    """A data set all of whose entries are withdrawn is not one of them."""
+    first, second = board.tabs
+    withdrawn = []
+    for row in second.rows:
+        inactive_row = with_entry(row, status=Status.WITHDRAWN)
+        withdrawn.append(replace(inactive_row, rank=None))
+    inactive = replace(second, rows=tuple(withdrawn))
+    count = sum(row.active for row in first.rows)
+    assert f"{count} entries on 1 data set that" in page_of(board, first, inactive)
+
+
 def test_the_introduction_leads_to_taking_part(page: str) -> None:
     """The link is above the tables; what it leads to is on the page."""
     parsed = read_html(page)

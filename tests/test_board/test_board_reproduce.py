@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -224,6 +224,25 @@ def test_a_model_that_fails_has_no_cost_and_the_others_have(own: ModelBoard) -> 
     assert [entry.method for entry, _ in costs] == ["other"]
     assert [cost.seconds_per_frame for _, cost in costs] == [0.5]
     assert kept == ["gns"]
+
+
+@pytest.mark.slow
+def test_a_solver_that_fails_in_one_round_has_no_time(own: ModelBoard) -> None:
+    """The models have their costs all the same."""
+    seconds: Iterator[float | None] = iter([None, 0.25])
+    size = load().size("curl-noise", "tiny")
+    entry = read_entry(own.folder / PATH)
+    ((_, cost),) = measure_costs(
+        [TimedEntry(entry=entry, runner=SteadyRunner())],
+        load_scored_task(size, own.root),
+        root=own.root,
+        time_solver=lambda *_: next(seconds),
+        meter=Meter(None),
+        keep_failure=lambda *_: None,
+        repeats=2,
+    )
+    assert cost.seconds_per_frame == 0.5
+    assert cost.solver is None
 
 
 @pytest.mark.slow

@@ -15,8 +15,10 @@ import netCDF4
 import pytest
 from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
+from hostile_onnx import straight_on
 from simple_models import INFO, Drift, install
 
+from lagbench.baselines import weights_check
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
 from lagbench.baselines.weights_check import check_settings_in_child
 from lagbench.board import submit as submitting
@@ -292,6 +294,29 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> No
     assert later.removed == (file,)
     assert kept_files(own) == {}
     assert_sound(own)
+
+
+@pytest.mark.slow
+def test_an_onnx_file_without_a_record_leaves_no_old_record(own: BoardBench) -> None:
+    """The record of the file before does not stay beside the new one."""
+    run = trained(own, 0, training=None)
+    model = straight_on(run / "lines.onnx")
+    submitted(own, run, weights=(model,))
+    assert sorted(kept_files(own)) == ["drift_0.json", "drift_0.onnx"]
+    (run / "training.json").unlink()
+    submitted(own, run, weights=(model,), replace=True)
+    assert list(kept_files(own)) == ["drift_0.onnx"]
+    assert_sound(own)
+
+
+@pytest.mark.slow
+def test_a_record_with_the_name_of_the_weights_comes_first(own: BoardBench) -> None:
+    """Weights of several seeds may lie in one folder, beside the record of a run."""
+    run = trained(own, 0)
+    weights = (run / "weights.pt").rename(run / "drift_0.pt")
+    (run / "drift_0.json").write_text(json.dumps({"step": 7}))
+    submitted(own, run, weights=(weights,))
+    assert json.loads(kept_files(own)["drift_0.json"]) == {"step": 7}
 
 
 @pytest.mark.parametrize("damage", ["lost", "edited", "linked"])
@@ -630,6 +655,17 @@ def test_a_child_process_reads_the_options_of_weights(
     ]
     is_refused = [answer["refused"] is not None for answer in answers]
     assert is_refused == [False, False, True, True, True, False]
+
+
+def test_options_are_not_taken_as_written_on_a_busy_machine(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Settings that nobody could compare do not pass as settings that differ."""
+    monkeypatch.setattr(weights_check, "WALL_SECONDS", 0.01)
+    path = tmp_path / "weights.pt"
+    with pytest.raises(WorkFailedError) as caught:
+        check_settings_in_child([(str(path), "model.a=1")])
+    assert caught.value.where == str(path)
 
 
 @pytest.mark.parametrize(

@@ -159,3 +159,13 @@ def test_what_is_no_box_is_refused(
 ) -> None:
     with pytest.raises(UsageError):
         Box.from_bounds(bounds, periodic)
+
+
+def test_a_point_just_below_the_upper_end_stands_in_a_tree() -> None:
+    """Its distance from the lower end rounds to the period: it stands at that end."""
+    box = Box.from_bounds([(-1.0, 0.1), (0.0, 1.0)], periodic=[True, False])
+    below_end = np.nextafter(0.1, 0.0)
+    points = np.array([[below_end, 0.5], [-0.99, 0.5], [-0.5, 0.5]])
+    tree = box.tree(points)
+    neighbours = tree.query_ball_point(box.tree_points(points[:1]), 0.02)
+    assert sorted(neighbours[0]) == [0, 1]
