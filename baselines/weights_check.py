@@ -118,7 +118,7 @@ def check_settings_in_child(
         f"{__name__}.{check_settings.__name__}",
         requests,
         seconds=SECONDS * max(1, len(requests)),
-        wall=WALL_SECONDS,
+        wall=WALL_SECONDS * max(1, len(requests)),
         memory=MEMORY,
     )
     checked = list(answers.values)

@@ -44,14 +44,14 @@ ANSWERS = {
 """Whether learning pays, in the table of the data sets of a size."""
 
 OTHER_VERDICTS = {
-    LearningVerdict.DOES_NOT_PAY: "Learning does not pay on",
-    LearningVerdict.OPEN: "Whether learning pays is open on",
+    LearningVerdict.DOES_NOT_PAY: "Learning does not pay on {}.",
+    LearningVerdict.OPEN: "Whether learning pays is open on {}.",
     LearningVerdict.NO_SOLVER: (
-        "Every classical solver takes more time per frame than the most accurate "
-        "model, so there is no verdict, on"
+        "There is no verdict on {}: there every classical solver takes more time per "
+        "frame than the most accurate model."
     ),
 }
-"""Beginnings of the sentences about data sets where learning does not clearly pay."""
+"""Sentences about data sets where learning does not clearly pay; {} stands for them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -601,7 +601,8 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
     for verdict, statement in OTHER_VERDICTS.items():
         count = verdicts.count(verdict)
         if count:
-            sentences.append(f"{statement} {_share(count, total)}.")
+            data_sets = _share(count, total)
+            sentences.append(statement.format(data_sets))
 
     learned_verdicts = []
     for conclusion in conclusions:

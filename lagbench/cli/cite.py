@@ -7,7 +7,7 @@ from typing import Annotated
 
 import lagbench
 from lagbench.data.local import locate_split
-from lagbench.data.registry import Split, load
+from lagbench.data.registry import Registry, Split, default_path, load
 from lagbench.errors import escape_line
 
 from .options import (
@@ -58,8 +58,8 @@ def cite_command(
 ) -> None:
     """Print how to cite a split: version, hashes and original works.
 
-    Without a split it prints how to cite lagbench itself. The authors of a local split
-    are those who made its data, so no author is printed.
+    Without a split it prints how to cite lagbench itself. The authors of other people's
+    splits are those who made the data, so no author is printed for them.
     """
     if split_argument is None and split_option is None:
         _cite_program(bibtex=bibtex, as_json=as_json)
@@ -73,9 +73,9 @@ def cite_command(
         measured = registry.size(name, size).measured
         if measured is not None:
             hashes[size] = measured.dataset_sha256
-    is_local = name not in load().splits
+    is_foreign = not _is_ours(name, registry)
     if bibtex:
-        text = _split_bibtex(name, entry, hashes, is_local=is_local)
+        text = _split_bibtex(name, entry, hashes, is_foreign=is_foreign)
         print_result({"bibtex": text}, [text], as_json=as_json)
         return
 
@@ -90,15 +90,15 @@ def cite_command(
     # strangers describe local splits
     title = escape_line(entry.title)
     of_lagbench = f"lagbench, split {name!r} ({title})"
-    if is_local:
-        of_lagbench = f"local split {name!r} ({title})"
+    if is_foreign:
+        of_lagbench = f"split {name!r} ({title})"
     words = [of_lagbench, f"version {entry.version}"]
     if entry.licence != UNKNOWN_LICENCE:
         words.append(escape_line(entry.licence))
     lines = [", ".join(words) + "."]
     if entry.citation != NO_CITATION:
         lines.append(f"After: {escape_line(entry.citation)}.")
-    if is_local and len(lines) == 1:
+    if is_foreign and len(lines) == 1:
         lines.append(
             "Its description names no work to cite: see `citation` and `licence` of "
             "`lagbench adopt --describe`."
@@ -106,6 +106,12 @@ def cite_command(
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")
     print_result(citation, lines, as_json=as_json)
+
+
+def _is_ours(split: str, registry: Registry) -> bool:
+    """Return whether a split is one of lagbench, not of a user or another package."""
+    path = registry.files.get(split)
+    return path is not None and path.resolve() == default_path().resolve()
 
 
 def _cite_program(*, bibtex: bool, as_json: bool) -> None:
@@ -125,10 +131,10 @@ def _cite_program(*, bibtex: bool, as_json: bool) -> None:
 
 
 def _split_bibtex(
-    name: str, entry: Split, hashes: Mapping[str, str], *, is_local: bool
+    name: str, entry: Split, hashes: Mapping[str, str], *, is_foreign: bool
 ) -> str:
     title = f"{entry.title}: split {name} of lagbench"
-    if is_local:
+    if is_foreign:
         title = entry.title
     fields = {"title": title, "version": entry.version}
     if entry.licence != UNKNOWN_LICENCE:
@@ -141,7 +147,7 @@ def _split_bibtex(
         notes.append(f"SHA-256 of the data sets: {listing}")
     if notes:
         fields["note"] = ". ".join(notes)
-    if is_local:
+    if is_foreign:
         return _format_bibtex("misc", name, fields)
     return _format_bibtex("misc", f"lagbench-{name}", {**fields, **RELEASE_FIELDS})
 

@@ -135,13 +135,14 @@ class _CheckedCommand(TyperCommand):
 
 
 def _expand_home(value: Any) -> Any:  # noqa: ANN401 (values of any option)
-    """Return a path, or paths, with ~ at the beginning replaced by the home folder.
+    """Return a path, or paths, with a first part ~ replaced by the home folder.
 
-    A shell does this, except in ``--output=~/p.nc``. A value of another type stays.
+    A shell does this, except in ``--output=~/p.nc``. A value of another type stays, and
+    so does a name that begins with ~.
     """
     if isinstance(value, list | tuple):
         return type(value)(_expand_home(item) for item in value)
-    if isinstance(value, str | Path) and str(value).startswith("~"):
+    if isinstance(value, str | Path) and Path(value).parts[:1] == ("~",):
         return type(value)(os.path.expanduser(value))
     return value
 

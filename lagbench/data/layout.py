@@ -265,9 +265,9 @@ def expand_path(path: str | Path, where: str) -> Path:
 
 
 def expand_home(output: str | Path, where: str = "--output") -> Path:
-    """Return the path of a file to write, ~ replaced by the home folder.
+    """Return the path of a file to write, a first part ~ replaced by the home folder.
 
-    Other relative paths stay relative.
+    Other paths stay as they are, also names that begin with ~.
 
     Args:
         output: the path that a user gave.
@@ -276,7 +276,7 @@ def expand_home(output: str | Path, where: str = "--output") -> Path:
     Raises:
         UsageError: the user of ``~user`` has no home folder.
     """
-    if str(output).startswith("~"):
+    if Path(output).parts[:1] == ("~",):
         return expand_path(output, where)
     return Path(output)
 

@@ -199,6 +199,10 @@ class Measured(_RegistryModel):
     twin_floor: tuple[float, ...] = Field(strict=False)
 
 
+LARGEST_END = 1e6  # greatest distance of an end of a box from 0 [length]
+SHORTEST_SIDE = 1e-6  # of a box, which is about the unit box [length]
+
+
 class _SizeEntry(_RegistryModel):
     """A size as written in datasets.yaml; :class:`Size` adds the split's fields."""
 
@@ -216,12 +220,22 @@ class _SizeEntry(_RegistryModel):
 
     @model_validator(mode="after")
     def _check_box(self) -> _SizeEntry:
+        ends = [abs(end) for side in self.bounds for end in side]
+        if max(ends) > LARGEST_END:
+            raise ValueError(
+                f"bounds: expected ends within {LARGEST_END:g} of 0, got {self.bounds}"
+            )
         try:
             periodic = parse_periodic(self.periodic, len(self.bounds))
+            box = Box.from_bounds(self.bounds, periodic)
         except UsageError as error:
             text = f"{error.what}: expected {error.expected}, got {error.got}"
             raise ValueError(text) from None
-        box = Box.from_bounds(self.bounds, periodic)
+        if box.lengths.min() < SHORTEST_SIDE:
+            raise ValueError(
+                f"bounds: expected sides of at least {SHORTEST_SIDE:g}, got "
+                f"{self.bounds}"
+            )
 
         cells = self.task.score_grid.cells
         most = most_cells(box)

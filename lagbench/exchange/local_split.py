@@ -902,6 +902,16 @@ class SplitBuilder:
         sides: Bounds = tuple(zip(self.low, self.high, strict=True))
         if description.bounds:
             sides = description.transform.transform_box(description.bounds)
+        for axis, (low, high) in zip(AXES, sides, strict=False):
+            if low < high:
+                continue
+            raise UsageError(
+                "the box has no extent along an axis",
+                where=f"--bounds, {axis}",
+                expected="two different ends",
+                got=f"all particles at {float(low):g}",
+                fix="state the walls or the period of the box with --bounds",
+            )
         return [[float(low), float(high)] for low, high in sides]
 
     def _describe_periodic(self) -> dict[str, object]:

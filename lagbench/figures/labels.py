@@ -58,6 +58,7 @@ DIRECTIONS = 48
 STEEP = 0.7  # cosine up to which a line ends above or below its label
 STEP = 2.0  # between points of a line that must be free
 DOT_RADIUS = 5.0
+MOST_JOINED = 25  # labels that may have a line: the search for its place takes long
 
 ANCHORS = {0.0: "", 0.5: "middle", 1.0: "end"}
 """Class of the style sheet by the share of a text that lies left of its place."""
@@ -196,7 +197,8 @@ def place_joined_labels(
 
     A label that stands beside its dot is clearly nearer to it than to other dots. Other
     labels have a line. It crosses neither other labels nor lines of other labels nor
-    other dots. Labels that come first have the choice.
+    other dots. Labels that come first have the choice. Only the first
+    :data:`MOST_JOINED` may have a line.
 
     Args:
         names: text of each label.
@@ -216,6 +218,8 @@ def place_joined_labels(
         other_dots = [other for other in dots if other != dot]
         label = None
         for candidate in _propose_labels(name, dot):
+            if candidate.line_end is not None and number >= MOST_JOINED:
+                break
             box = candidate.box
             if not plot.contains(box):
                 continue

@@ -162,7 +162,7 @@ def angular_momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_scale(pair: FramePair) -> float:
-    """Sum of true distance from the box centre times speed, for
+    """Sum of true speed times distance from the box centre; divides the error in
     angular_momentum_error.
     """
     return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)

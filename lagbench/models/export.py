@@ -17,7 +17,13 @@ from lagbench.arguments import check_arguments
 from lagbench.atomic import checked_path
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import LagbenchError, UsageError, check_installed, require
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    check_installed,
+    require,
+)
 from lagbench.tensors import Batch
 from lagbench.torch import WindowDataset, check_history, collate
 
@@ -154,6 +160,7 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
 
     Raises:
         UsageError: the step fails, or the exporter does.
+        WorkFailedError: the operating system refused.
     """
     with warnings.catch_warnings(), _sums_of_index_add():
         # the newer exporter needs a package more and writes data beside the file
@@ -171,6 +178,15 @@ def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
             )
         except (LagbenchError, MemoryError):
             raise
+        except OSError as error:
+            raise WorkFailedError(
+                "the model cannot be written",
+                where=str(path),
+                expected="a temporary folder with room",
+                got=error,
+                fix="free disk space, or set TMPDIR to another folder; where the step "
+                "opens files, correct it",
+            ) from error
         except Exception as error:  # the exporter and the step raise any kind
             reason = str(error).split("\n")[0][:200]
             names = ", ".join(inputs)

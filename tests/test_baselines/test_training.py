@@ -744,6 +744,21 @@ def test_a_folder_that_vanishes_ends_the_training_without_a_traceback(
     assert "Traceback" not in capfd.readouterr().err
 
 
+def test_an_error_of_the_training_is_not_hidden_by_a_vanished_folder(
+    run: Run, tmp_path: Path
+) -> None:
+    """Neither TensorBoard nor the log can be written any more."""
+
+    def fail(progress: Progress) -> None:
+        if progress.done == 3:
+            (tmp_path / "run").rename(tmp_path / "elsewhere")
+            (tmp_path / "run").touch()
+            raise RuntimeError("an error of the training")
+
+    with pytest.raises(RuntimeError, match="an error of the training"):
+        run("drift", "steps=40", "log_every=1", progress=fail)
+
+
 @pytest.mark.parametrize(
     ("baseline", "setting", "lower"),
     [

@@ -675,7 +675,7 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
     assert "cavityno solver is as cheapModellearned1.5×‡ (1.2 to 1.9)" in shown
-    statement = "so there is no verdict, on the only"
+    statement = "There is no verdict on the only data set"
     assert statement in shown
     assert "Learning" not in shown
 

@@ -415,19 +415,24 @@ def test_an_empty_word_is_not_taken_for_no_word(
 
 
 @pytest.mark.parametrize(
-    "command",
+    ("command", "missing"),
     [
-        "predict none.pt --method checkpoint",
-        "submit none.nc --name predictions",
-        "score none.nc --split predictions",
-        "plot --split source",
+        ("predict none.pt --method checkpoint", "none.pt"),
+        ("submit none.nc --method predictions", "none.nc"),
+        ("score none.nc --split predictions", "'predictions'"),
+        ("plot --split source", "'source'"),
     ],
 )
 def test_a_value_may_be_a_word_of_the_command_s_own(
-    command: str, type_command: Callable[[str], Result]
+    command: str, missing: str, type_command: Callable[[str], Result]
 ) -> None:
-    """Nobody types the names that arguments have in the code."""
+    """Nobody types the names that arguments have in the code.
+
+    So the error is about the missing file or split.
+    """
     result = type_command(command)
+    assert result.exit_code in (2, 3), result.output
+    assert missing in result.stderr
     assert "has no value" not in result.stderr
 
 

@@ -354,6 +354,10 @@ def lead_out(splits: dict[str, Any]) -> None:
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
         (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
         (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),
+        (cavity(bounds=[[1.0, 0.0], [0.0, 1.0]]), ("cavity.sizes.full", "1.0 and 0.0")),
+        (cavity(bounds=[[0.5, 0.5], [0.0, 1.0]]), ("cavity.sizes.full", "0.5 and 0.5")),
+        (cavity(bounds=[[0.0, 1e-200], [0.0, 1e-200]]), ("bounds", "1e-200")),
+        (cavity(bounds=[[-1e308, 1e308], [0.0, 1.0]]), ("bounds", "1e+308")),
         (
             within(
                 "cavity",

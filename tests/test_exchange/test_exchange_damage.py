@@ -234,7 +234,7 @@ def test_an_npz_file_that_unpacks_to_far_more_is_refused(
     assert caught.value.where.endswith("in/train.npz, key 'simulation_0'")
 
 
-@pytest.mark.parametrize("suffix", READABLE)
+@pytest.mark.parametrize("suffix", [".npy", ".npz"])
 def test_the_message_names_only_formats_that_are_adopted(
     tmp_path: Path, suffix: str
 ) -> None:
@@ -245,6 +245,7 @@ def test_the_message_names_only_formats_that_are_adopted(
     with pytest.raises(UnreadableFileError) as caught:
         adopt(folder, output=tmp_path / "own", **BASIC)
     suffixes = re.findall(r"\.[a-z]\w*", str(caught.value.fix))
+    assert suffixes
     assert set(suffixes) <= set(READABLE)
 
 

@@ -626,8 +626,6 @@ def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
     with pytest.raises(UsageError) as caught:
         predict_onnx("~/lines.onnx", "~/predictions.nc", **options)
     assert "--overwrite" in str(caught.value.fix)
-    with pytest.raises(UsageError):
-        predict_onnx("~/lines.onnx", "~no-such-user/predictions.nc", **options)
 
     words = ["predict", "~/lines.onnx", "--split", SIZE.split, "--size", SIZE.name]
     words += ["--root", str(generated.root), "--no-bench"]
