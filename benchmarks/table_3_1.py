@@ -201,7 +201,7 @@ def exponents_of_measurements(measurements: Sequence[TimedRow]) -> Exponents:
     return _fit_exponents(rows, measurements)
 
 
-def describe(device: str, machine: str, repeats: int) -> list[str]:
+def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     """Return the title of the table and the paragraphs that explain it."""
     ours = f"with `--device {device}`"
     if machine:
@@ -235,7 +235,7 @@ def markdown(
 ) -> str:
     """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
-        *describe(device, machine, repeats),
+        *describe(device, machine=machine, repeats=repeats),
         "| q | q^2 | particles | grid | substeps | t/substep | t/frame | fps "
         "| thesis t/substep | thesis t/frame | thesis t/frame / our t/frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
