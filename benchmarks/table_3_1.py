@@ -215,13 +215,14 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "3.1 of the thesis. q is its quality factor: the number of particles grows "
         "roughly as q^2.",
         "",
-        f"Each time is the shortest of {repeats} runs, in milliseconds: on the CPU "
-        "processor time, on a GPU time on the wall. fps is the number of frames per "
-        "second. t/frame is the time of a run with all substeps of a frame. t/substep "
-        f"is the time of a run of {FIXED} substeps, divided by {FIXED}. Each run ends "
-        "with one copy of all positions. If a frame has 40 substeps, t/frame is "
-        "therefore a little less than 40 times t/substep. If a frame has "
-        f"{FIXED} substeps, the two runs are the same, and a difference is noise.",
+        f"Each time is the shortest of {repeats} runs, in milliseconds. For a CPU it is "
+        "processor time. For a GPU it is wall-clock time. fps is the number of frames "
+        "per second. t/frame is the time of a run with all substeps of a frame. "
+        f"t/substep is the time of a run of {FIXED} substeps, divided by {FIXED}. Each "
+        "run ends with one copy of all positions, also a run of 40 substeps. So "
+        f"without noise t/frame would be equal to {FIXED} times t/substep if a frame "
+        f"has {FIXED} substeps, and a little less than 40 times t/substep if it has "
+        "40. The noise of the measurement can be larger than this difference.",
         "",
     ]
 
