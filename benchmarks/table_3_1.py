@@ -215,8 +215,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "3.1 of the thesis. q is its quality factor: the number of particles grows "
         "roughly as q^2.",
         "",
-        f"Each time is the shortest of {repeats} runs, in milliseconds. For a CPU it is "
-        "processor time. For a GPU it is wall-clock time. fps is the number of frames "
+        f"Each time is the shortest of {repeats} runs, in milliseconds. For a CPU it "
+        "is processor time. For a GPU it is wall-clock time. fps is the number of frames "
         "per second. t/frame is the time of a run with all substeps of a frame. "
         f"t/substep is the time of a run of {FIXED} substeps, divided by {FIXED}. Each "
         "run ends with one copy of all positions, also a run of 40 substeps. So "
