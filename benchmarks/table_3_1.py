@@ -216,13 +216,14 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "roughly as q^2.",
         "",
         f"Each time is the shortest of {repeats} runs, in milliseconds. For a CPU it "
-        "is processor time. For a GPU it is wall-clock time. fps is the number of frames "
-        "per second. t/frame is the time of a run with all substeps of a frame. "
-        f"t/substep is the time of a run of {FIXED} substeps, divided by {FIXED}. Each "
-        "run ends with one copy of all positions, also a run of 40 substeps. So "
-        f"without noise t/frame would be equal to {FIXED} times t/substep if a frame "
-        f"has {FIXED} substeps, and a little less than 40 times t/substep if it has "
-        "40. The noise of the measurement can be larger than this difference.",
+        "is processor time. For a GPU it is wall-clock time. fps is the number of "
+        "frames per second. t/frame is the time of a run with all substeps of a "
+        f"frame. t/substep is the time of a run of {FIXED} substeps, divided by "
+        f"{FIXED}. Each run ends with one copy of all positions, also a run of 40 "
+        f"substeps. So without noise t/frame would be equal to {FIXED} times t/substep "
+        f"if a frame has {FIXED} substeps, and a little less than 40 times t/substep "
+        "if it has 40. The noise of the measurement can be larger than this "
+        "difference.",
         "",
     ]
 
