@@ -219,11 +219,12 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "is processor time. For a GPU it is wall-clock time. fps is the number of "
         "frames per second. t/frame is the time of a run with all substeps of a "
         f"frame. t/substep is the time of a run of {FIXED} substeps, divided by "
-        f"{FIXED}. Each run ends with one copy of all positions, also a run of 40 "
-        f"substeps. So without noise t/frame would be equal to {FIXED} times t/substep "
-        f"if a frame has {FIXED} substeps, and a little less than 40 times t/substep "
-        "if it has 40. The noise of the measurement can be larger than this "
-        "difference.",
+        f"{FIXED}. Each run ends with one copy of all positions. So t/substep contains "
+        "a twentieth of the time of a copy. If a frame has more than "
+        f"{FIXED} substeps, t/frame is therefore less than the number of substeps "
+        "times t/substep. On a CPU the difference is small, often smaller than the "
+        "noise. On a GPU the copy takes long: there t/frame can be half of this "
+        "product.",
         "",
     ]
 
