@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -94,7 +93,7 @@ def plot_command(
         tier = locate(split_name, size, root=root).size
         page = Path(f"{tier.split}-{tier.name}-sheet.png")
         if output is not None:
-            page = Path(os.path.expanduser(output))
+            page = output
         require_place(page, overwrite=overwrite)
         path = contact_sheet(split_name, tier.name, page, root=root, kind=kind, dpi=dpi)
     else:

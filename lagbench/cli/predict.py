@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -114,8 +113,6 @@ def predict_command(
     """
     solver_clock = _SolverClock(quiet=quiet)
     time_solver = solver_clock if bench else None
-    checkpoint = Path(os.path.expanduser(checkpoint))
-    output = Path(os.path.expanduser(output))
     if checkpoint.suffix == ".onnx":
         check_regular(checkpoint)
         _refuse_options_of_weights(

@@ -23,6 +23,9 @@ MAX_LINKS = 1000
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
+FIRST_BYTES = 64
+"""Bytes by which the format of a file is told."""
+
 OTHER_FORMATS: Mapping[bytes, str] = {
     b"CDF": "netCDF-3, the old format",
     b"PK\x03\x04": "a zip archive, perhaps .npz",
@@ -68,7 +71,7 @@ def check_file(
     check_regular(path, longest=longest, fix=fix)
     try:
         with path.open("rb") as stream:
-            first_bytes = stream.read(len(SIGNATURE))
+            first_bytes = stream.read(FIRST_BYTES)
     except OSError as error:
         raise UnreadableFileError(
             "cannot open the file",
@@ -77,17 +80,24 @@ def check_file(
             got=error.strerror or error,
             fix="check the path and that you may read the file",
         ) from error
-    if first_bytes != SIGNATURE:
+    if not first_bytes.startswith(SIGNATURE):
         raise UnreadableFileError(
             "not an HDF5 file",
             where=str(path),
             expected="HDF5, as netCDF4 is",
-            got=_guess_format(first_bytes),
+            got=guess_format(first_bytes),
             fix=fix,
         )
 
 
-def _guess_format(first_bytes: bytes) -> str:
+def guess_format(first_bytes: bytes) -> str:
+    """Return in plain words what a file is.
+
+    Args:
+        first_bytes: its first :data:`FIRST_BYTES` bytes, or all of a shorter file.
+    """
+    if first_bytes.startswith(SIGNATURE):
+        return "an HDF5 file"
     for signature, format_name in OTHER_FORMATS.items():
         if first_bytes.startswith(signature):
             return format_name
@@ -96,7 +106,7 @@ def _guess_format(first_bytes: bytes) -> str:
     if first_bytes.isascii():
         words = first_bytes.decode("ascii").split()
         if "".join(words).isprintable():
-            return "text"
+            return "a text file"
     return "bytes of another format"
 
 

@@ -34,7 +34,7 @@ from .trajectory import (
     check_inflation,
     check_names,
     describe_archive,
-    guess_format,
+    describe_file,
     read_header,
 )
 
@@ -317,7 +317,7 @@ def _read_npy(path: Path) -> NDArray[Any]:
                     "not a .npy file of NumPy",
                     where=str(path),
                     expected="an array, written by np.save",
-                    got=guess_format(path),
+                    got=describe_file(path),
                     fix=SAVE_AGAIN,
                 )
             stream.seek(0)

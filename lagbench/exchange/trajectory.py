@@ -31,7 +31,7 @@ from lagbench.data.box import AXES, SMALL_SIDE, Box, parse_periodic, unit_box
 from lagbench.data.checksums import round_digits
 from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.grid import MOST_CELLS
-from lagbench.data.hdf5 import OTHER_FORMATS, SIGNATURE
+from lagbench.data.hdf5 import FIRST_BYTES, guess_format
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
@@ -68,12 +68,6 @@ ARCHIVE = b"PK"
 
 HARMLESS_BYTES = 1 << 28
 """Length that an array may always unpack to [bytes]."""
-
-FORMATS: Mapping[bytes, str] = {SIGNATURE: "an HDF5 file", **OTHER_FORMATS}
-"""Names of formats by the first bytes of their files."""
-
-FIRST_BYTES = 64
-"""Bytes by which a text is told from other files."""
 
 MOST_INFLATION = 200
 """Times its own length that a larger array may unpack to.
@@ -679,20 +673,10 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             )
 
 
-def guess_format(path: Path) -> str:
+def describe_file(path: Path) -> str:
     """Return in plain words what a file is, by its first bytes."""
     with path.open("rb") as stream:
-        first_bytes = stream.read(FIRST_BYTES)
-    if not first_bytes:
-        return "an empty file"
-    for signature, format_name in FORMATS.items():
-        if first_bytes.startswith(signature):
-            return format_name
-    if first_bytes.isascii():
-        words = first_bytes.decode("ascii").split()
-        if "".join(words).isprintable():
-            return "a text file"
-    return "bytes of another format"
+        return guess_format(stream.read(FIRST_BYTES))
 
 
 def describe_archive(path: Path, error: Exception) -> str:
@@ -703,7 +687,7 @@ def describe_archive(path: Path, error: Exception) -> str:
         is_archive = stream.read(len(ARCHIVE)) == ARCHIVE
     if is_archive:
         return f"a zip archive that is cut or damaged ({error})"
-    return guess_format(path)
+    return describe_file(path)
 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:

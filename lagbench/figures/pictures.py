@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import operator
-import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import check_output_file
+from lagbench.data.layout import expand_home
 from lagbench.data.local import locate, suggest_repair
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
@@ -73,7 +73,7 @@ def plot(
     """
     check_kind(kind)
     if _is_file(source):
-        source = os.path.expanduser(source)
+        source = expand_home(source, "source")
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
@@ -82,7 +82,7 @@ def plot(
         if output is None:
             path = _frame_path(file, frame)
         else:
-            path = Path(os.path.expanduser(output))
+            path = expand_home(output, "output")
         require_place(path, overwrite=overwrite)
         return plot_frame(file, frame, path, kind=kind, dpi=dpi, registry=registry)
 
@@ -132,14 +132,14 @@ def animate(
     if output is not None:
         films.check_ending(Path(output))
     if _is_file(source):
-        source = os.path.expanduser(source)
+        source = expand_home(source, "source")
     file = find_scenario(
         source, size=size, scenario=scenario, root=root, registry=registry
     )
     second: Path | None = None
     named_files = [source] if _is_file(source) else []
     if isinstance(beside, str | Path):
-        second = Path(os.path.expanduser(beside))
+        second = expand_home(beside, "beside")
         named_files.append(second)
     elif beside is not None:
         second = find_scenario(
@@ -152,7 +152,7 @@ def animate(
     if output is None:
         path = Path(f"{_data_name(file)}.mp4")
     else:
-        path = Path(os.path.expanduser(output))
+        path = expand_home(output, "output")
     require_place(path, overwrite=overwrite)
     with _blame_named_files(*named_files):
         return films.animate(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +81,7 @@ def predict_onnx(
         WorkFailedError: the model needs more time or memory than allowed, or another
             prediction writes the same output.
     """
-    model_path = Path(os.path.expanduser(model))
+    model_path = expand_home(model, "model")
     output_path = expand_home(output)
     check_predictions_output(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)

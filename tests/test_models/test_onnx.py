@@ -537,7 +537,7 @@ def test_a_file_that_cannot_stand_for_the_model_is_refused(
     tmp_path: Path,
     generated: GenerationResult,
 ) -> None:
-    """The errors of onnxruntime and of NumPy were raised as they came."""
+    """Errors of onnxruntime and of NumPy become errors of lagbench."""
     with pytest.raises(UsageError, match=what) as caught:
         export_onnx(
             step,
