@@ -420,6 +420,7 @@ class GraphNetwork(Baseline):
         """
         options = self.options
         check_moving_walls(options.wall_velocity, self.info)
+        self._check_radius()
         if options.noise_spread and options.noise_std == 0.0:
             raise UsageError(
                 "there is no noise to spread",
@@ -453,6 +454,25 @@ class GraphNetwork(Baseline):
                 got=options.link_weight,
                 fix="leave the option out, or train supergat",
             )
+
+    def _check_radius(self) -> None:
+        """Refuse a radius within which a particle has two images.
+
+        Raises:
+            UsageError: the radius is above half a period of the box.
+        """
+        radius = self.options.radius
+        largest_radius = self.info.box.largest_radius
+        # half a period may be rounded
+        if radius is None or radius <= largest_radius * (1.0 + 1e-6):
+            return
+        raise UsageError(
+            "the radius is above half of the shortest period",
+            where="model.radius",
+            expected=f"at most {largest_radius:g}",
+            got=radius,
+            fix=f"set a smaller one; the data set has {self.info.radius:g}",
+        )
 
     def _check_relaxation(self) -> None:
         """Refuse options beside which rollouts cannot be relaxed.

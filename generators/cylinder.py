@@ -13,8 +13,8 @@ with drawn centre, radius R, speed U' and sense; it has no divergence. The Reyno
 number U D / nu is drawn between 80 and 200, where the flow is two-dimensional and
 periodic (Williamson, Annu. Rev. Fluid Mech. 28 (1996) 477).
 
-Expected behaviour: after some 25 D/U the wake is a street of vortices of either sign,
-shed in turn from both sides with the frequency St U / D. The Strouhal number St is
+Expected behaviour: from about the time 25 D/U vortices of either sign are shed in turn
+from both sides, with the frequency St U / D. The Strouhal number St is
 about 0.16 at Re 100 and 0.2 at Re 200 in an unbounded stream (Williamson, J. Fluid
 Mech. 206 (1989) 579), and larger in a channel.
 """

@@ -11,6 +11,7 @@ and ``obstacle_diameter`` [length].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -147,6 +148,16 @@ class Box:
     def is_periodic(self) -> bool:
         """Whether any axis repeats itself."""
         return any(self.periodic)
+
+    @property
+    def largest_radius(self) -> float:
+        """Half of the shortest period [length]; infinite without a periodic axis.
+
+        Within a larger radius a particle would be a neighbour by two of its images.
+        """
+        if not self.is_periodic:
+            return math.inf
+        return 0.5 * float(self.lengths[np.asarray(self.periodic)].min())
 
     @property
     def walls(self) -> tuple[str, ...]:

@@ -244,14 +244,12 @@ class _SizeEntry(_RegistryModel):
                 f"task.score_grid.cells: expected at most {most}, which gives at most "
                 f"{MOST_NODES} nodes in this box, got {cells}"
             )
-        for period in box.lengths[list(box.periodic)]:
-            # A particle would be a neighbour by two of its images. A radius of half a
-            # period may be rounded up.
-            if self.task.radius > 0.5 * period * (1.0 + 1e-6):
-                raise ValueError(
-                    f"task.radius: expected at most half of each period, "
-                    f"{0.5 * period:g}, got {self.task.radius:g}"
-                )
+        # A radius of half a period may be rounded up.
+        if self.task.radius > box.largest_radius * (1.0 + 1e-6):
+            raise ValueError(
+                f"task.radius: expected at most half of each period, "
+                f"{box.largest_radius:g}, got {self.task.radius:g}"
+            )
         return self
 
 

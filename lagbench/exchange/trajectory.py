@@ -494,23 +494,18 @@ class Description:
             ) from None
 
     def _check_radius(self) -> None:
-        """Refuse a radius above half a period.
-
-        A particle would be a neighbour by two of its images, and models see the nearest
-        image only.
-        """
+        """Refuse a radius above half a period: models see the nearest image only."""
         box = self.source_box
-        if box is None or not box.is_periodic:
+        if box is None:
             return
-        shortest_period = float(box.lengths[np.asarray(box.periodic)].min())
-        most = 0.5 * shortest_period
+        most = box.largest_radius
         # A period is a difference of two bounds, so it is rounded.
         if self.radius <= most * (1.0 + 1e-9):
             return
         raise UsageError(
             "the radius is above half of the shortest period",
             where="--radius, or the radius of the metadata",
-            expected=f"at most {most:.6g}, half of the period {shortest_period:.6g}",
+            expected=f"at most {most:.6g}, half of the period {2.0 * most:.6g}",
             got=self.radius,
             fix="give a smaller --radius: a few spacings of the particles are enough",
         )

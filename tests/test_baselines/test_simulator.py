@@ -285,6 +285,15 @@ def test_models_without_wall_velocity_have_none() -> None:
     assert caught.value.where == "model.wall_velocity"
 
 
+def test_within_the_radius_a_particle_has_one_image() -> None:
+    tall = {"bounds": ((0.0, 0.5), (0.0, 1.0)), "periodic": ("x",)}
+    network(radius=0.25, changes=tall)
+    network(radius=0.3, changes=tall | {"periodic": ("y",)})
+    with pytest.raises(UsageError) as caught:
+        network(radius=0.26, changes=tall)
+    assert caught.value.where == "model.radius"
+
+
 def test_a_predicted_frame_moves_with_its_own_wall_velocity() -> None:
     """After the last known wall velocity that one stays."""
     window = batch(swirl(0, 8), walls=True)

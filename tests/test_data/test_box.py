@@ -56,6 +56,12 @@ def test_a_displacement_leads_to_the_nearest_image(box: Box) -> None:
         assert_allclose(way, expected, atol=1e-12)
 
 
+def test_the_largest_radius_is_half_of_the_shortest_period() -> None:
+    assert WALLED.largest_radius == np.inf
+    assert CHANNEL.largest_radius == 1.0  # its height of 0.8 lies between walls
+    assert SOLID.largest_radius == 0.25
+
+
 def test_between_walls_a_displacement_is_the_plain_difference_bit_for_bit() -> None:
     rng = np.random.default_rng(1)
     start = rng.random((100, 2)).astype(np.float32)
