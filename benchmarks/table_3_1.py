@@ -220,11 +220,12 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "frames per second. t/frame is the time of a run with all substeps of a "
         f"frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So t/substep contains "
-        "a twentieth of the time of a copy. If a frame has more than "
-        f"{FIXED} substeps, t/frame is therefore less than the number of substeps "
-        "times t/substep. On a CPU the difference is small, often smaller than the "
-        "noise. On a GPU the copy takes long: there t/frame can be half of this "
-        "product.",
+        "a twentieth of the time of a copy. For a frame of "
+        f"{2 * FIXED} substeps, the product of {2 * FIXED} and t/substep contains two "
+        "copies, but t/frame contains only one. So t/frame is smaller than the "
+        "product. On a CPU the difference is small, often smaller than the noise. "
+        "Where our solver runs on a GPU, the copy takes long, and t/frame can be half "
+        "of the product.",
         "",
     ]
 
