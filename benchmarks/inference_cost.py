@@ -4,8 +4,8 @@
     python benchmarks/inference_cost.py --rows 1-4 --output docs/figures
 
 rolls untrained models out over boxes of 2,000 q^2 particles at one density:
-connectivity radius and grid spacing shrink with 1/q, and a network of whole frames has
-as many inputs as the box has numbers. Prints a table of milliseconds of processor time
+connectivity radius and grid spacing shrink with 1/q, and the `mlp` has as many inputs
+as the box has numbers. Prints a table of milliseconds of processor time
 and the exponents of a least-squares line through their logarithms; with --output also
 into `inference_cost.md` there. The solver's exponents are in table_3_1.py's table.
 """
@@ -189,8 +189,9 @@ def main() -> int:
         "## Time of a predicted frame for more and more particles\n\n"
         "The table shows the processor time [ms] of one predicted frame on one core. "
         f"It is the time of a rollout of {FRAMES} frames, divided by {FRAMES}. The "
-        "models are a graph network (`gns`), a network of whole frames (`mlp`) and "
-        "`neuralmpm`. They are untrained, because the weights do not change the time. "
+        "models are a graph network (`gns`), a network with all particles of a frame "
+        "as one input (`mlp`), and `neuralmpm`. They are untrained, because the "
+        "weights do not change the time. "
         f"Their options come from the recipes for {SPLIT} {SIZE}.\n\n"
         f"The box holds {PARTICLES:,} q^2 particles: q multiplies the number of "
         "particles along each axis. A power of the number of particles was fitted to "

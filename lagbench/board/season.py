@@ -36,6 +36,7 @@ from lagbench.errors import ChecksFailedError, UsageError, suggest_name
 from lagbench.metrics.table import RANKING, ranking_metric
 from lagbench.references.shipped import shipped
 from lagbench.references.table import NAIVE
+from lagbench.scoring.boards import board_option
 from lagbench.scoring.skill import best_reference
 from lagbench.submission.provenance import Overrides
 
@@ -588,12 +589,18 @@ def reveal(board: str | Path, name: str, value: str) -> Season:
     with board_lock(folder):
         season = read_season(folder, name)
         if not season.is_waiting:
+            expected = "a season that was closed with --source"
+            got = "no source"
+            if season.value:
+                expected = "a season that has no random value yet"
+                got = f"the value {season.value!a}, which cannot be changed"
+            run = f"lagbench season run {name}{board_option(folder.path)}"
             raise UsageError(
                 "the season waits for no random value",
                 where=str(folder.path / season_path(name)),
-                expected="a season that was closed with --source",
-                got=f"value {season.value!a}" if season.value else "no source",
-                fix="leave --value out: lagbench season run scores the models",
+                expected=expected,
+                got=got,
+                fix=f"leave --value out: {run} scores the models",
             )
         revealed, issues = examine(Season, season.model_dump() | {"value": value})
         if revealed is None or not value.strip():
@@ -609,13 +616,16 @@ def reveal(board: str | Path, name: str, value: str) -> Season:
     return revealed
 
 
-def season_registry(season: Season, registry: Registry, recorded: Recorded) -> Registry:
+def season_registry(
+    season: Season, registry: Registry, recorded: Recorded, *, board: Path
+) -> Registry:
     """Return a registry in which the data sets of a season hold blind scenarios only.
 
     Args:
         season: a season with seeds.
         registry: where splits are described.
         recorded: content hashes of blind scenarios that are known already.
+        board: folder of the season's leaderboard.
 
     Raises:
         UsageError: the season still waits for its random value.
@@ -624,7 +634,7 @@ def season_registry(season: Season, registry: Registry, recorded: Recorded) -> R
     splits: dict[str, Split] = {}
     measured: dict[str, dict[str, Measured]] = {}
     for data_set in season.data_sets:
-        size = blind_size(season, data_set, registry, recorded)
+        size = blind_size(season, data_set, registry, recorded, board=board)
         split = splits.get(data_set.split, registry.split(data_set.split))
         entry = split.sizes[data_set.size].model_copy(
             update={
@@ -643,7 +653,12 @@ def season_registry(season: Season, registry: Registry, recorded: Recorded) -> R
 
 
 def blind_size(
-    season: Season, data_set: SeasonDataSet, registry: Registry, recorded: Recorded
+    season: Season,
+    data_set: SeasonDataSet,
+    registry: Registry,
+    recorded: Recorded,
+    *,
+    board: Path,
 ) -> Size:
     """Return the size whose blind scenarios are scored.
 
@@ -655,6 +670,7 @@ def blind_size(
         data_set: one of its data sets.
         registry: where splits are described.
         recorded: content hashes of blind scenarios that are known already.
+        board: folder of the season's leaderboard.
 
     Raises:
         UsageError: the season still waits for its random value.
@@ -666,7 +682,8 @@ def blind_size(
             where=f"season {season.season}",
             expected=season.source,
             got="no value yet",
-            fix=f"lagbench season close {season.season} --value VALUE",
+            fix=f"lagbench season close {season.season}{board_option(board)} "
+            "--value VALUE",
         )
     public = registry.size(data_set.split, data_set.size)
     if public.measured is None or not is_same_data(data_set, public):

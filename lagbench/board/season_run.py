@@ -277,7 +277,13 @@ class _SeasonRun:
             DataError: a scenario is missing, or was drawn from another seed than the
                 one that the season has for the data set.
         """
-        size = blind_size(self.season, data_set, self.registry, self.recorded)
+        size = blind_size(
+            self.season,
+            data_set,
+            self.registry,
+            self.recorded,
+            board=self.folder.path,
+        )
         fix = (
             f"lagbench generate --season {self.season.season} "
             f"--split {data_set.split} --size {data_set.size}"

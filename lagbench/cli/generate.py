@@ -158,7 +158,7 @@ def _season_targets(
     recorded_hashes: Mapping[tuple[str, str], Mapping[int, str]] = {}
     if scores is not None:
         recorded_hashes = scores.recorded
-    registry = season_registry(season, load(), recorded_hashes)
+    registry = season_registry(season, load(), recorded_hashes, board=folder.path)
     targets = []
     known = []
     for data_set in season.data_sets:

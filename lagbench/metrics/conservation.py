@@ -141,7 +141,7 @@ def momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length/frame", source="section 5.2", least=0.0)
 def momentum_scale(pair: FramePair) -> float:
-    """Sum of the true speeds; divides the error in momentum_error."""
+    """Sum of the true speeds: the denominator of momentum_error."""
     return float(pair.truth.speeds.sum())
 
 
@@ -162,7 +162,7 @@ def angular_momentum_gap(pair: FramePair) -> float:
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1", least=0.0)
 def angular_momentum_scale(pair: FramePair) -> float:
-    """Sum of true speed times distance from the box centre; divides the error in
+    """Sum of true speed times distance from the box centre: the denominator of
     angular_momentum_error.
     """
     return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)

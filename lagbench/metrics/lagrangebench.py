@@ -56,7 +56,8 @@ METRICS = (
     _error(
         name="e_kin_mse",
         unit="mass^2 length^4/frame^4",
-        summary="MSE of E_kin: squared error of the sum of m u^2, every tenth frame",
+        summary="MSE of E_kin: squared error of the sum of m u^2, at predicted frames "
+        "2, 12, ...",
         of=("energy_predicted", "energy_true"),
         series=squared_energy_errors,
         over_frames=mean_of_every_tenth,

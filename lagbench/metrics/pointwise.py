@@ -117,23 +117,35 @@ def _errors_of_material(
 
 
 def _over_rollouts(
-    name: str, word: str, reduction: Callable[[Floats], float], source: str
+    name: str,
+    reduction: Callable[[Floats], float],
+    source: str,
+    *,
+    summary: str,
+    summary_to_frame: str,
 ) -> Iterator[Metric]:
     """Yield the metrics that reduce ``attribute_mse`` over the rollout, and over each
     horizon.
+
+    Args:
+        name: name of the metric of the whole rollout.
+        reduction: returns the value of a series of frames.
+        source: where the metric is defined.
+        summary: of the metric of the whole rollout.
+        summary_to_frame: of the others; the number of the last frame follows.
     """
     rollout = partial(
         _error, unit="1", source=source, of=("attribute_mse",), per_frame=False
     )
     yield rollout(
         name=name,
-        summary=f"{word} attribute_mse of the rollout",
+        summary=summary,
         over_frames=reduction,
     )
     for horizon in HORIZONS:
         yield rollout(
             name=f"{name}_{horizon}",
-            summary=f"{word} attribute_mse of the first {horizon} frames",
+            summary=f"{summary_to_frame} {horizon}",
             over_frames=FirstFrames(horizon, reduction),
             horizon=horizon,
         )
@@ -159,7 +171,19 @@ METRICS = (
     ),
     *_errors("velocity", "length/frame"),
     attribute_mse,
-    *_over_rollouts("mse_avg", "Mean", mean, "Eq. 4.17"),
-    *_over_rollouts("mse_end", "Last", last, "Eq. 4.18"),
+    *_over_rollouts(
+        "mse_avg",
+        mean,
+        "Eq. 4.17",
+        summary="Mean attribute_mse of the rollout",
+        summary_to_frame="Mean attribute_mse up to predicted frame",
+    ),
+    *_over_rollouts(
+        "mse_end",
+        last,
+        "Eq. 4.18",
+        summary="attribute_mse in the last predicted frame",
+        summary_to_frame="attribute_mse in predicted frame",
+    ),
 )
 """Metrics of this family."""

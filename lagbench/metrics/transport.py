@@ -160,7 +160,7 @@ def sliced_w2(pair: FramePair) -> float:
     module="ot",
 )
 def sinkhorn_pot(pair: FramePair) -> float:
-    """Sinkhorn divergence by the library POT; regularisation 0.1 blurs it; optional."""
+    """Sinkhorn divergence by the library POT, regularisation 0.1; optional."""
     box = pair.scenario.config.box
     return sinkhorn_divergence(pair.truth.position, pair.prediction.position, box)
 

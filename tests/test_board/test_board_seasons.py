@@ -107,7 +107,7 @@ def simulate(bench: ModelBoard, season: Season) -> None:
         "curl-noise",
         "tiny",
         root=season_root(season.season, bench.root),
-        registry=season_registry(season, load(), {}),
+        registry=season_registry(season, load(), {}, board=bench.folder),
         workers=1,
     )
 
@@ -367,8 +367,9 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
     """There are no seeds before, and no second value after."""
     season = close_season(own, "later", source="lottery of 1 May")
     assert season.data_sets[0].draw_seed is None
-    with pytest.raises(UsageError):
-        season_registry(season, load(), {})
+    with pytest.raises(UsageError) as without_value:
+        season_registry(season, load(), {}, board=own.folder)
+    assert f"--board {own.folder}" in str(without_value.value.fix)
     revealed = reveal(own.folder, "later", "17 4 33")
     assert revealed.data_sets[0].draw_seed == draw_seed(
         "later",
@@ -378,8 +379,9 @@ def test_a_season_waits_for_its_random_value(own: ModelBoard) -> None:
         models=season.models,
         value="17 4 33",
     )
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError) as second_value:
         reveal(own.folder, "later", "1 2 3")
+    assert "17 4 33" in str(second_value.value.got)
 
 
 @pytest.mark.parametrize(
