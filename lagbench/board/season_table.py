@@ -182,8 +182,8 @@ def markdown_table(rows: Sequence[SeasonRow]) -> str:
                 f"{row.split} {row.size}",
                 row.method,
                 f"{len(row.models)} of {row.seeds}",
-                f"{row.public:.3f}",
-                f"{row.blind:.3f}",
+                f"{row.public:z.3f}",
+                f"{row.blind:z.3f}",
                 describe_gap(row),
                 str(row.blind_scenarios),
             )
@@ -194,5 +194,5 @@ def markdown_table(rows: Sequence[SeasonRow]) -> str:
 def describe_gap(row: SeasonRow) -> str:
     """Return the gap and its interval in figures."""
     if math.isnan(row.low):
-        return f"{row.gap:+.3f}"
-    return f"{row.gap:+.3f} [{row.low:+.3f}, {row.high:+.3f}]"
+        return f"{row.gap:+z.3f}"
+    return f"{row.gap:+z.3f} [{row.low:+z.3f}, {row.high:+z.3f}]"

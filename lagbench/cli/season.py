@@ -330,8 +330,8 @@ def _tables(name: str, rows: tuple[SeasonRow, ...]) -> Iterator[Table]:
             cells.append(
                 (
                     row.method,
-                    f"{row.public:.3f}",
-                    f"{row.blind:.3f}",
+                    f"{row.public:z.3f}",
+                    f"{row.blind:z.3f}",
                     describe_gap(row),
                     f"{len(row.models)} of {row.seeds}",
                     str(row.blind_scenarios),
