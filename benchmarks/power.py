@@ -30,7 +30,6 @@ from lagbench.scoring.score_file import read_statistics
 Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).parent.parent
-TEST = {"cavity": 20, "curl-noise": 16, "fluid": 16, "multimaterial": 16}
 DIFFERENCES = (0.05, 0.10, 0.20)
 SEEDS = 3
 DRAWS = 1000
@@ -51,6 +50,16 @@ ASSUMED = {
     "large": Scatter(0.10, 0.20, 0.20),
 }
 """What is assumed of methods and seeds that nobody has measured."""
+
+
+def count_test_scenarios() -> dict[str, int]:
+    """Return the number of test scenarios at size mini, by split."""
+    registry = load()
+    counts = {}
+    for split in registry.splits:
+        size = registry.size(split, "mini")
+        counts[split] = len(size.subsets["test"])
+    return counts
 
 
 def read_methods(split: str) -> dict[str, Floats]:
@@ -171,7 +180,7 @@ def count_pairs_of_seeds() -> tuple[Counter[str], int]:
     """Return the pairs of seeds of one method by split, and how many of all differ."""
     pairs: Counter[str] = Counter()
     differing_count = 0
-    for split in TEST:
+    for split in count_test_scenarios():
         for values in read_methods(split).values():
             for first, second in itertools.combinations(values, 2):
                 pairs[split] += 1
@@ -210,11 +219,12 @@ The table shows the standard deviations of b_i, c_s and e_si.
 
 **Rows.** The first three rows use assumed standard deviations. The other rows have the
 names of splits. They use standard deviations that we measured from the score files of
-size mini in leaderboard/scores.
+size mini in leaderboard/scores. (Score files of entries that are not active count too.)
 
 The measurement needs two methods whose means differ by less than a factor of two. At
-least one of these methods must have several seeds. A row is inaccurate if
-its split has only two such methods, and only one of them has several seeds.
+least one of these methods must have several seeds. A split without such methods has
+no row. A row is inaccurate if its split has only two such methods, and only one of
+them has several seeds.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
@@ -264,7 +274,7 @@ def render_page() -> str:
     cases = []
     for name, scatter in ASSUMED.items():
         cases.append((f"assumed: {name}", 16, scatter))
-    for split, scenarios in TEST.items():
+    for split, scenarios in count_test_scenarios().items():
         methods = read_methods(split)
         scatter = measure_scatter(methods)
         is_known = np.isfinite(astuple(scatter))

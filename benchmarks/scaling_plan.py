@@ -411,7 +411,8 @@ def main() -> int:
         "q names a row of Table 3.1 of the thesis. The row gives the number of "
         "particles, the grid and the substeps. The first table shows processor times "
         "for one particle: for drawing the initial state, for one substep, and for "
-        "writing, hashing and averaging one frame. Its last column is the number of "
+        "three steps with one frame: writing it, hashing it and computing its "
+        "statistics. Its last column is the number of "
         "bytes of one particle in one frame of the file.",
         "",
         *parts_table(measured),

@@ -108,6 +108,8 @@ HOW_TO_READ = """\
   the cells along an axis. So at `mini` compare only the order of the models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
   lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
+- **readme-network** is the small network of the program in the README. There is no
+  record of its training.
 - **Comparisons** have two models, *first* and *second*. `where` is the data set. The
   first number of `means` and of `seeds` belongs to the first model, the second number
   to the second model. `lead` is the difference of the means in the units of the
