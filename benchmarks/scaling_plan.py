@@ -411,9 +411,10 @@ def main() -> int:
         "q names a row of Table 3.1 of the thesis. The row gives the number of "
         "particles, the grid and the substeps. The first table shows processor times "
         "for one particle: for drawing the initial state, for one substep, and for "
-        "three steps with one frame: writing it, hashing it and computing its "
-        "statistics. Its last column is the number of "
-        "bytes of one particle in one frame of the file.",
+        "three kinds of work on a frame. *Writing a frame* includes hashing and "
+        "compressing it. *Hashing a written frame* is the work of `lagbench verify`: "
+        "it reads the frame from the file and hashes it again. Its last column is the "
+        "number of bytes of one particle in one frame of the file.",
         "",
         *parts_table(measured),
         "",

@@ -186,11 +186,12 @@ and figures of a size. If you interrupt the command, the same command continues.
 `lagbench submit` makes entries from the trained models.
 
 This page shows only results that have an entry. `python -m studies.results` can also
-show the results of two files that are not in the repository. It looks for them in the
-subfolder `<split>/<size>/` of the folder that its option `--studies` or `--runs` names.
-`python -m studies.thesis` writes the first file, `mlp_studies.json`, into the folder of
-runs. The second file, `var_protocol.json`, is the output of
-`python -m studies.thesis.var_protocol --size mini --json`.
+show the results of two files that are not in the repository. Its options `--studies`
+and `--runs` each name a folder. It looks for both files in both folders, first in that
+of `--studies`, in the subfolder `<split>/<size>/`. `python -m studies.thesis` writes
+the first file, `mlp_studies.json`, into the folder of runs. The second file is the
+output of `python -m studies.thesis.var_protocol --size mini --json`. Save it as
+`fluid/mini/var_protocol.json` in one of the two folders.
 
 A variant is a model with other options, with another recipe, or with another way of
 prediction:"""
@@ -307,8 +308,9 @@ def _chapter(results: SplitResults) -> Iterator[str]:
         tau = order_agreement(results)
         if tau is not None:
             yield (
-                "Kendall's tau compares the order of the models by MSE with that of "
-                f"the thesis: {tau} (1: the same order, -1: the reversed order)."
+                "Kendall's tau compares two orders of the models: by our MSE, averaged "
+                "over the test scenarios, and by the MSE of the thesis on T0. It is "
+                f"{tau} (1: the same order, -1: the reversed order)."
             )
     yield COST_NOTE
     yield cost_table(results)
