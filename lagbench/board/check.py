@@ -122,7 +122,12 @@ def check_board(
         issues += check_base(folder, base, own)
 
     score_predictions = partial(
-        score, root=root, registry=full_registry, progress=progress, write=False
+        score,
+        root=root,
+        packages=False,
+        registry=full_registry,
+        progress=progress,
+        write=False,
     )
     rescoring = Rescoring(
         folder=folder,

@@ -129,7 +129,11 @@ def publish(
         for path in removed:
             path.unlink()
 
-    written = [folder.path / path for path in reversed(moves)]
+    # the entry first, although it is moved last
+    written = [folder.path / entry.yaml_path]
+    for path in moves:
+        if path != entry.yaml_path:
+            written.append(folder.path / path)
     return _result_of(
         entry,
         board=folder.path,
@@ -245,7 +249,8 @@ def _require_short(path: Path, card: ScoreCard) -> None:
             where=f"{card.header.split} {card.header.size}",
             expected=f"at most {MAX_SCORE_BYTES} bytes",
             got=f"{length} bytes",
-            fix="uninstall packages that add metrics, and submit again",
+            fix="no leaderboard takes a data set of so many scenarios and frames: "
+            "submit predictions of a smaller size",
         )
 
 

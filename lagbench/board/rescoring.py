@@ -19,6 +19,7 @@ from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.package_metrics import FAILED_METRIC
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
 from lagbench.scoring.score_layout import FILM_RANGE, LAST_STEP, SUBMISSION
@@ -276,11 +277,16 @@ def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:
 def _compare_annotations(
     path: Path, card: ScoreCard, new_file: ScoredFile, file: EntryFile
 ) -> Iterator[ValidationIssue]:
-    """Yield where flags, warnings, diverged scenarios or the budget differ."""
+    """Yield where flags, warnings, diverged scenarios or the budget differ.
+
+    Older entries may have a warning of a package's metric. It is not compared.
+    """
     old_file = file.scored_file
+    old_warnings = _flag_names(old_file.warnings)
+    compared_warnings = [name for name in old_warnings if name != FAILED_METRIC]
     pairs: dict[str, tuple[object, object]] = {
         "flags": (_flag_names(new_file.flags), _flag_names(old_file.flags)),
-        "warnings": (_flag_names(new_file.warnings), _flag_names(old_file.warnings)),
+        "warnings": (_flag_names(new_file.warnings), compared_warnings),
         "diverged_at": (
             dict(sorted(new_file.diverged_at.items())),
             dict(sorted(old_file.diverged_at.items())),

@@ -226,23 +226,32 @@ def _format_seeds(seeds: Iterable[int | None]) -> str:
 def require_new(
     identities: Sequence[str], paths: Sequence[Path], owners: Mapping[str, str]
 ) -> None:
-    """Refuse predictions that another entry or another seed has.
+    """Refuse predictions that an entry or another of the files has.
 
     An identity is a content hash or a fingerprint; ``owners`` names the file or entry
-    that has it already.
+    of the leaderboard that has it already.
 
     Raises:
-        UsageError: these predictions are submitted already.
+        UsageError: these predictions are submitted already, or two files have the same.
     """
-    owner_of = dict(owners)
+    path_of: dict[str, Path] = {}
     for identity, path in zip(identities, paths, strict=True):
-        if identity in owner_of:
+        if identity in owners:
             raise UsageError(
                 "these predictions are submitted already",
                 where=str(path),
                 expected="predictions that no entry and no other seed has",
-                got=f"those of {owner_of[identity]}",
-                fix="submit the file of each seed once; what goes by a new name "
-                "supersedes its old entry",
+                got=f"those of {owners[identity]}",
+                fix="a further seed needs predictions of another training; what goes "
+                "by a new name supersedes its old entry",
             )
-        owner_of[identity] = str(path)
+        if identity in path_of:
+            raise UsageError(
+                "the predictions of several seeds are equal",
+                where=str(path),
+                expected="predictions of another training for each seed",
+                got=f"those of {path_of[identity]}",
+                fix="train with each seed, and predict with the weights of each "
+                "training; or submit one of the files",
+            )
+        path_of[identity] = path

@@ -120,6 +120,7 @@ def submit(
         card = score(
             file.path,
             root=root,
+            packages=False,  # an entry tells nothing of the submitter's packages
             workers=workers,
             registry=registry,
             progress=progress,

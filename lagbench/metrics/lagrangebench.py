@@ -57,7 +57,7 @@ METRICS = (
         name="e_kin_mse",
         unit="mass^2 length^4/frame^4",
         summary="MSE of E_kin: squared error of the sum of m u^2, at predicted frames "
-        "2, 12, ...",
+        "2, 12, 22 and so on",
         of=("energy_predicted", "energy_true"),
         series=squared_energy_errors,
         over_frames=mean_of_every_tenth,

@@ -8,6 +8,8 @@ many metrics use it. A metric of another package is a :class:`Metric` as well.
 from __future__ import annotations
 
 import enum
+import functools
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -288,9 +290,13 @@ class Metric:
 
         place = f"frame {pair.frame}"
         if not is_bool:
-            what = "whether a metric is defined is neither true nor false"
-            raise self._failure(what, place, expected="a bool", got=is_defined)
-        return self._to_number(value, place)
+            raise self._failure(
+                "whether a metric is defined is neither true nor false",
+                f"{_line_of_function(self.defined)}, {self.name}, {place}",
+                expected="a bool",
+                got=is_defined,
+            )
+        return self._to_number(value, self.statistic, place)
 
     def per_frame_from(self, *statistics: Floats) -> Floats:
         """Return the value per frame from the statistics in ``of``, shape [frame].
@@ -304,9 +310,12 @@ class Metric:
         except (Exception, SystemExit) as error:
             self.raise_named(error, place)
         if series.shape != statistics[0].shape:
-            what = "the series of a metric has another shape"
-            expected = f"one value per frame, shape {statistics[0].shape}"
-            raise self._failure(what, place, expected=expected, got=series.shape)
+            raise self._failure(
+                "the series of a metric has another shape",
+                f"{_line_of_function(self.series)}, {self.name}, {place}",
+                expected=f"one value per frame, shape {statistics[0].shape}",
+                got=series.shape,
+            )
         return series
 
     def over_horizon(self, series: Floats) -> float:
@@ -320,16 +329,23 @@ class Metric:
             value: object = self.over_frames(series)
         except (Exception, SystemExit) as error:
             self.raise_named(error, place)
-        return self._to_number(value, place)
+        return self._to_number(value, self.over_frames, place)
 
-    def _to_number(self, value: object, place: str) -> float:
-        """Return a statistic as a float; an array of one element is converted."""
+    def _to_number(self, value: object, function: object, place: str) -> float:
+        """Return the value of a function as a float.
+
+        An array of one element is converted.
+        """
         if not isinstance(value, (str, bytes, complex)):
             # as arrays of other packages raise
             with suppress(TypeError, ValueError, OverflowError, RuntimeError):
                 return float(value)  # type: ignore[arg-type]
-        what = "a metric gave no number"
-        raise self._failure(what, place, expected="a float", got=value)
+        raise self._failure(
+            "a metric gave no number",
+            f"{_line_of_function(function)}, {self.name}, {place}",
+            expected="a float",
+            got=value,
+        )
 
     def raise_named(self, error: Exception | SystemExit, place: str) -> NoReturn:
         """Raise an error of the metric's functions again, with name and place added.
@@ -339,28 +355,27 @@ class Metric:
         Raises:
             WorkFailedError: the error would end the program, or takes no attribute.
         """
+        where = f"{_line_of_call(error)}, {self.name}, {place}"
         if isinstance(error, SystemExit):
             what = "a metric would end the program"
-            failure = self._failure(what, place, expected="a number", got=error)
+            failure = self._failure(what, where, expected="a number", got=error)
             raise failure from error
         try:
             error.add_note(f"in metric {self.name}, {place}")
             error.metric_name = self.name  # type: ignore[attr-defined]
         except AttributeError:  # such as an exception that is a frozen dataclass
             what = "a metric failed"
-            failure = self._failure(what, place, expected="a number", got=error)
+            failure = self._failure(what, where, expected="a number", got=error)
             raise failure from error
         raise error
 
     def _failure(
-        self, what: str, place: str, *, expected: str, got: object
+        self, what: str, where: str, *, expected: str, got: object
     ) -> WorkFailedError:
         """Return the error for a function of the metric that does not work."""
-        function = self.series if self.statistic is None else self.statistic
-        package = getattr(function, "__module__", "?")
         error = WorkFailedError(
             what,
-            where=f"{package}, {self.name}, {place}",
+            where=where,
             expected=expected,
             got=f"{type(got).__name__}: {got!r:.60}",
             fix="mend it, or leave it out: uninstall the package that adds it",
@@ -406,6 +421,33 @@ class Metric:
         if self.direction is Direction.HIGHER:
             return -value
         return value
+
+
+def _line_of_function(function: object) -> str:
+    """Return the file and the first line of a function; else the name of its module.
+
+    The function may also be a partial one, or an object that can be called.
+    """
+    inner = function
+    while isinstance(inner, functools.partial):
+        inner = inner.func
+    if callable(inner):
+        inner = inspect.unwrap(inner)
+    code = getattr(inner, "__code__", None)
+    if code is None:
+        code = getattr(type(inner).__call__, "__code__", None)
+    if code is None:
+        return str(getattr(function, "__module__", "?"))
+    return f"{code.co_filename}, line {code.co_firstlineno}"
+
+
+def _line_of_call(error: BaseException) -> str:
+    """Return the file and the line at which a function that was called here failed."""
+    trace = error.__traceback__
+    if trace is None or trace.tb_next is None:  # a function without lines in Python
+        return "?"
+    file = trace.tb_next.tb_frame.f_code.co_filename
+    return f"{file}, line {trace.tb_next.tb_lineno}"
 
 
 def metric(

@@ -182,8 +182,8 @@ METRICS = (
         "mse_end",
         last,
         "Eq. 4.18",
-        summary="attribute_mse in the last predicted frame",
-        summary_to_frame="attribute_mse in predicted frame",
+        summary="The attribute_mse in the last predicted frame",
+        summary_to_frame="The attribute_mse in predicted frame",
     ),
 )
 """Metrics of this family."""

@@ -10,10 +10,19 @@ import functools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from lagbench.errors import WorkFailedError, find_place_in_extension, text_of
+from lagbench.errors import (
+    LagbenchError,
+    WorkFailedError,
+    escape_unprintable,
+    find_place_in_extension,
+    text_of,
+)
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
-from lagbench.submission.issues import Severity, ValidationIssue, quote
+from lagbench.submission.issues import MAX_TEXT, Severity, ValidationIssue, quote
+
+FAILED_METRIC = "metric"
+"""Name of the warning for a metric that was left out of a score."""
 
 FIX = "mend it, or leave it out: uninstall the package that adds it"
 OWN_FIX = "mend the function, or leave it out of metrics="
@@ -60,9 +69,25 @@ def package_metric_errors() -> Iterator[None]:
             notes or None,
         ]
         where = ", ".join(place for place in places if place)
-        raise PackageMetricError(
-            name, where=where, got=quote(f"{type(error).__name__}: {text_of(error)}")
-        ) from error
+        raise PackageMetricError(name, where=where, got=_describe(error)) from error
+
+
+def _describe(error: Exception) -> str:
+    """Return what a metric raised, or what is wrong with its value, in a short line."""
+    if not isinstance(error, LagbenchError):
+        return quote(f"{type(error).__name__}: {text_of(error)}")
+    description = _shorten(error.what)
+    if error.got is not None:
+        description += f"; got {_shorten(str(error.got))}"
+    return description
+
+
+def _shorten(text: str) -> str:
+    """Return the beginning of a text in one printable line."""
+    line = escape_unprintable(" ".join(text.split()))
+    if len(line) <= MAX_TEXT:
+        return line
+    return f"{line[: MAX_TEXT - 3]}..."
 
 
 def drop_metric(metrics: Sequence[Metric], name: str) -> tuple[Metric, ...]:
@@ -88,7 +113,7 @@ def own_metric_error(error: PackageMetricError) -> WorkFailedError:
 def describe_failure(error: PackageMetricError) -> ValidationIssue:
     """Return the warning for a metric that was left out of a score."""
     return ValidationIssue(
-        check="metric",
+        check=FAILED_METRIC,
         severity=Severity.WARNING,
         what=f"{error.what}; its column is left out",
         where=str(error.where),

@@ -21,7 +21,7 @@ from lagbench.data.contents import check_contents
 from lagbench.data.registry import Registry, Size, load
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
-from lagbench.metrics.table import select
+from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import ReferencePredictor, given_in
 from lagbench.references.shipped import ReferenceScores, correlation_of, shipped
 from lagbench.references.table import REFERENCES, references_of
@@ -308,7 +308,7 @@ def measure(
         progress: called with the state of the work.
     """
     task = load_scored_task(size, root)
-    metrics = select()
+    metrics = select(known=METRICS)
     names_to_measure = []
     for reference in references_of(size):
         if names is None or reference.name in names:

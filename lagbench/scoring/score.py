@@ -27,6 +27,7 @@ from lagbench.errors import (
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (
+    METRICS,
     OwnMetrics,
     available,
     own_metrics,
@@ -81,6 +82,7 @@ def score(
     scheduler: str | None = None,
     extras: str | Collection[str] = (),
     metrics: OwnMetrics = (),
+    packages: bool = True,
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
     registry: Registry | None = None,
@@ -103,6 +105,7 @@ def score(
             :class:`~lagbench.metrics.FramePair`, or a
             :class:`~lagbench.metrics.Metric` where a direction and a unit are to be
             stated; one of them, or a list. They are measured in this process.
+        packages: whether to measure the metrics of installed packages too.
         progress: called with the state of the work.
         examined: called with the result of the validation, before anything is raised
             for it.
@@ -130,7 +133,10 @@ def score(
     own = own_metrics(metrics)
     if own:
         workers = _one_worker(workers, scheduler)
-    measured_metrics = select((*_select_metrics(extras), *own))
+    table = METRICS
+    if packages:
+        table = available()
+    measured_metrics = select((*_select_metrics(extras, table), *own), known=table)
     path = Path(predictions).absolute()
     expected_split = None
     if split is not None:
@@ -438,12 +444,17 @@ def _write(card: ScoreCard, folder: Path) -> ScoreCard:
     return card.at(json_path, netcdf_path)
 
 
-def _select_metrics(extras: str | Collection[str]) -> tuple[Metric, ...]:
-    """Return the metrics to measure; refuse extras as `check_extras` does."""
+def _select_metrics(
+    extras: str | Collection[str], table: Mapping[str, Metric]
+) -> tuple[Metric, ...]:
+    """Return the metrics of a table to measure.
+
+    Extras are refused as by `check_extras`.
+    """
     if isinstance(extras, str):
         extras = (extras,)
     check_extras(extras)
-    return select(extras=extras)
+    return select(extras=extras, known=table)
 
 
 def check_extras(extras: Collection[str]) -> None:

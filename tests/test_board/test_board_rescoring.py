@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +33,10 @@ from lagbench.board import submit as submitting
 from lagbench.board.build import collect
 from lagbench.board.check import CheckResult, check_board
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.metrics import FramePair
 from lagbench.metrics.table import available
 from lagbench.scoring import score
+from lagbench.scoring.score_file_writer import write_statistics
 
 PREDICTOR = "floors/cavity/tiny/persistence.nc"
 
@@ -107,29 +108,73 @@ def test_scoring_again_confirms_and_is_recorded(
     assert findings_of(own) == ["verified"]
 
 
+PACKAGE_METRICS = """
+from lagbench.metrics import Direction, Metric
+
+def fail(pair):
+    raise ValueError("a word of this machine")
+
+def make_metric(name, statistic):
+    return Metric(
+        name=name, family="mine", unit="1", direction=Direction.LOWER,
+        perfect=0.0, source="here", summary="none", statistic=statistic,
+    )
+
+METRICS = (
+    make_metric("board_fails", fail),
+    make_metric("board_works", lambda pair: 1.0),
+)
+"""
+
+
 @pytest.mark.slow
 def test_metrics_of_packages_decide_nothing(
-    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+    own: BoardBench, predictions: Path, package: Callable[..., Path]
 ) -> None:
-    """Whoever scores again may have a package that measures more, or lack the
-    submitter's.
+    """An entry has none of them. Whoever scores again may have a package that measures
+    more or fails.
     """
-    own_metric = replace(
-        available()["position_mse"],
-        name="other",
-        of=(),
-        statistic=lambda pair: 1.0,
-    )
-    more = {**available(), "other": own_metric}
-    with monkeypatch.context() as patch:
-        patch.setattr("lagbench.metrics.table.available", lambda: more)
-        assert len(rescored(own, predictions).confirmed) == 1
-        own.submit(predictions, replace=True)
-        # the same predictions by another name, measured otherwise
-        twin = own.predict(noisy, "twin")
-        with pytest.raises(UsageError):
-            own.submit(twin)
+    own.submit(predictions, replace=True)
+    before = own.state()
+    package("metrics", "board_metrics:METRICS", PACKAGE_METRICS)
+    assert set(available()) >= {"board_fails", "board_works"}
     assert len(rescored(own, predictions).confirmed) == 1
+    own.submit(predictions, replace=True)
+    assert own.state() == before
+
+
+@pytest.mark.slow
+def test_metrics_of_packages_in_older_entries_decide_nothing(
+    own: BoardBench, predictions: Path
+) -> None:
+    """Whoever scores again lacks the package of the submitter."""
+
+    def measured_elsewhere(pair: FramePair) -> float:
+        return 1.0
+
+    card = score.score(
+        predictions,
+        root=own.data.root,
+        registry=own.registry,
+        metrics=measured_elsewhere,
+        write=False,
+    )
+    write_statistics(card, own.folder / SCORES / "noisy.nc")
+    own.forge("noisy")
+
+    def add_warning(content: dict[str, Any]) -> None:
+        warning = {"name": "metric", "reasons": ["the metric my_fails failed"]}
+        (file,) = content["score"]["files"]
+        file["warnings"] = [*file.get("warnings", []), warning]
+
+    own.edit("noisy", add_warning)
+    result = rescored(own, predictions)
+    assert not result.findings
+    assert len(result.confirmed) == 1
+    # the same predictions by another name, measured otherwise
+    twin = own.predict(noisy, "twin")
+    with pytest.raises(UsageError):
+        own.submit(twin)
 
 
 def test_a_damaged_file_of_a_reference_does_not_end_the_check(

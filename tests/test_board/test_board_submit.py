@@ -192,6 +192,29 @@ def test_predictions_are_submitted_once(
     assert result.method == "first"
 
 
+@pytest.mark.usefixtures("unscored")
+def test_equal_predictions_of_several_seeds_come_from_one_training(
+    own: BoardBench,
+) -> None:
+    """No entry has them, so none is to be superseded."""
+    files = [own.predict(nearer, "new", seed=seed) for seed in range(3)]
+    with pytest.raises(UsageError) as caught:
+        own.submit(*files)
+    assert has_all_parts(caught.value)
+    assert caught.value.where == str(files[1])
+    assert str(files[0]) in str(caught.value.got)
+    assert "supersede" not in str(caught.value)
+    assert "train" in str(caught.value.fix)
+
+
+def test_written_files_are_named_in_the_order_of_the_seeds(own: BoardBench) -> None:
+    """The entry comes first."""
+    files = [own.predict(shifted(seed), "new", seed=seed) for seed in range(3)]
+    result = own.submit(*files)
+    names = [path.name for path in result.files[:4]]
+    assert names == ["new.yaml", "new_0.nc", "new_1.nc", "new_2.nc"]
+
+
 def has_all_parts(error: LagbenchError) -> bool:
     """Say whether a message has where, expected, got and fix."""
     parts = (error.where, error.expected, error.got, error.fix)

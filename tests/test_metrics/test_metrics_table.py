@@ -571,29 +571,29 @@ STRANGE: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("what", "function"), STRANGE)
 def test_a_value_that_is_no_number_names_its_metric(what: str, function: Any) -> None:
-    """The error for a metric of another package names the metric, its module, and any
-    note. Whether a value is defined must be true or false: a forgotten return would
-    leave out every frame.
+    """The error for a metric of another package names the metric, the line of its
+    function, and any note. Whether a value is defined must be true or false: a
+    forgotten return would leave out every frame.
     """
     bad = replace(OTHERS, **{what: function})
     with pytest.raises(WorkFailedError) as caught:
         bad.measure(pairs()[0])
-    assert caught.value.where == f"{__name__}, enstrophy_error, frame 2"
+    line = function.__code__.co_firstlineno
+    place = f"{__file__}, line {line}, enstrophy_error, frame 2"
+    assert caught.value.where == place
     caught.value.add_note("scenario 3")
     again = pickle.loads(pickle.dumps(caught.value))
-    assert again.where == f"{__name__}, enstrophy_error, frame 2, scenario 3"
+    assert again.where == f"{place}, scenario 3"
     assert "scenario 3" in str(again)
     assert "scenario 3" in str(caught.value)
 
 
-def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
-    """Such as a ufunc or a partial, whose name is in the error too; undefined values
-    are NaN.
-    """
+def test_a_metric_may_have_no_code_and_a_bool_of_numpy() -> None:
+    """Such as a ufunc, whose name is in the error too; undefined values are NaN."""
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
-    without_module = replace(OTHERS, statistic=bare)
+    without_code = replace(OTHERS, statistic=bare)
     with pytest.raises(WorkFailedError) as caught:
-        without_module.measure(pairs()[0])
+        without_code.measure(pairs()[0])
     assert caught.value.where == "?, enstrophy_error, frame 2"
     undefined = replace(OTHERS, defined=returning(np.bool_(0)))
     assert math.isnan(undefined.measure(pairs()[0]))

@@ -9,6 +9,7 @@ import re
 import shutil
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -575,6 +576,64 @@ def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) ->
     assert "scenario" in str(caught.value.where)
     assert "metrics=" in str(caught.value.fix)
     assert "package" not in str(caught.value)
+
+
+NO_NUMBER = """
+import functools
+
+from lagbench.metrics import Direction, Metric
+
+def my_text(pair):
+    return "many" if pair.frame > 10 else 1.0
+
+def undecided(pair):
+    return "perhaps"
+
+def my_array(pair, word):
+    return [word, word]
+
+def make_metric(name, **functions):
+    return Metric(
+        name=name, family="mine", unit="1", direction=Direction.LOWER,
+        perfect=0.0, source="here", summary="none", **functions,
+    )
+
+METRICS = (
+    make_metric("my_text", statistic=my_text),
+    make_metric("my_undecided", statistic=my_text, defined=undecided),
+    make_metric("my_array", statistic=functools.partial(my_array, word="few")),
+    make_metric(
+        "my_total", statistic=lambda pair: 1.0, over_frames=lambda values: "all"
+    ),
+)
+"""
+"""A package whose metrics give no numbers."""
+
+
+def test_a_value_of_a_package_that_is_no_number_is_in_the_warning(
+    bench: ScoreBench, predictions: Path, package: Callable[..., Path]
+) -> None:
+    """It has the value, and the line of the function that returned it."""
+    module = package("metrics", "no_number:METRICS", NO_NUMBER)
+    card = bench.evaluate(predictions, workers=1)
+    by_metric = {}
+    for warning in card.warnings:
+        (name,) = re.findall(r"my_\w+", warning.what)
+        by_metric[name] = warning
+    expected = {
+        "my_text": (6, "many", "frame 11"),
+        "my_undecided": (9, "perhaps", "frame"),
+        "my_array": (12, "few", "frame"),
+        "my_total": (26, "all", "over all frames"),
+    }
+    assert set(by_metric) == set(expected)
+    for name, (line, value, place) in expected.items():
+        text = str(by_metric[name].got)
+        assert f"{module}, line {line}, " in text
+        assert f"'{value}'" in text
+        assert place in text
+        assert "\\n" not in text
+        assert "..." not in text
 
 
 class MuteError(Exception):

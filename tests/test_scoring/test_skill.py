@@ -488,6 +488,28 @@ def test_a_new_measurement_finds_a_forged_score(
     assert changed_metrics == {"persistence": ("position_rmse",)}
 
 
+FAILING = """
+from lagbench.metrics import Direction, Metric
+
+def fail(pair):
+    raise ValueError("mine")
+
+METRICS = Metric(
+    name="reference_fails", family="mine", unit="1", direction=Direction.LOWER,
+    perfect=0.0, source="here", summary="fails", statistic=fail,
+)
+"""
+
+
+def test_shipped_scores_have_no_metrics_of_packages(
+    bench: ScoreBench, package: Callable[..., Path]
+) -> None:
+    """So a metric of a package makes no difference to a new measurement."""
+    package("metrics", "reference_metric:METRICS", FAILING)
+    measured = measure(bench.size, bench.root, names=["persistence"])
+    assert set(measured["persistence"].scores).issubset(METRICS)
+
+
 def test_sizes_that_lie_in_a_root_can_be_measured(bench: ScoreBench) -> None:
     sizes = sizes_with_test_files(bench.root, registry=bench.registry)
     names = [size.name for size in sizes]
