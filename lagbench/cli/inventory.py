@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lagbench.data.box import describe_bounds
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
@@ -235,6 +236,7 @@ def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
         "task": size.task.model_dump(),
         "subsets": size.subsets,
         "bounds": size.bounds,
+        "periodic": size.periodic,
         "dt": size.dt,
         "frame_interval": size.frame_interval,
     }
@@ -265,6 +267,7 @@ def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:
         f"  frame      {size.frame_interval:.6g} s, "
         f"{size.substeps_per_frame} substeps of {size.dt:.6g} s"
     )
+    yield f"  box        {describe_bounds(size.bounds, size.periodic)}"
     yield f"  hash       {size_overview.dataset_sha256 or 'not measured yet'}"
     yield f"  folder     {size_overview.folder} (there: {size_overview.state})"
     yield f"  picture    {size_overview.picture or 'none'}"

@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from lagbench.data.box import describe_bounds
 from lagbench.data.layout import parse_ids
 from lagbench.errors import UsageError, format_count
 from lagbench.exchange.adoption import adopt, import_split
-from lagbench.exchange.local_split import LocalSplit, format_bounds
+from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
@@ -281,11 +282,12 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
     if fewest == most:
         particles = format_count(fewest, "particle")
     frames = format_count(local_split.frames, "frame")
+    box = describe_bounds(local_split.bounds, local_split.periodic)
     given_frames = format_count(local_split.input_frames, "frame")
     lines = [
         f"{local_split.folder}: {', '.join(counts)}, {frames}, {particles}",
         f"  task    {given_frames} given, {local_split.horizon} to predict",
-        f"  box     {format_bounds(local_split.bounds)}",
+        f"  box     {box}",
         f"  hash    {local_split.dataset_sha256}",
         *_next_steps(local_split),
     ]

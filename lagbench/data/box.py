@@ -311,6 +311,22 @@ def unit_box(dimension: int) -> Box:
     return UNIT_CUBE
 
 
+def describe_bounds(bounds: Sequence[Sequence[float]], periodic: Sequence[str]) -> str:
+    """Return the ends and the periodic axes of a box, for a reader.
+
+    >>> describe_bounds([(0.0, 1.0), (0.25, 2.0)], ["x"])
+    '[0, 1] x [0.25, 2], periodic x'
+
+    Args:
+        bounds: lower and upper end of each axis [length], shape [axis, 2].
+        periodic: names of the periodic axes.
+    """
+    text = " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in bounds)
+    if periodic:
+        text += f", periodic {', '.join(periodic)}"
+    return text
+
+
 def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
     """Return for each axis whether it is named, shape [axis].
 

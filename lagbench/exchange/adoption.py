@@ -103,7 +103,8 @@ def adopt(
     Raises:
         UsageError: no radius or frame interval, too few trajectories or one named
             twice, an output folder that exists already, a task that does not fit the
-            data. One message names everything that is missing.
+            data, a period that the positions contradict. One message names everything
+            that is missing.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
         DataError: positions are not finite, or outside the unit box, or
             particles jump by more than half the box along an axis with walls.
@@ -156,7 +157,7 @@ def adopt(
         counts=counts,
         progress=progress,
     )
-    notes = [*local_split.notes, *_notes_of_counts(counts)]
+    notes = list(local_split.notes)
     if "bounds" not in options:
         walls = format_bounds(local_split.bounds)
         notes.append(
@@ -180,16 +181,6 @@ def _require_option(options: DataOptions, name: str, meaning: str) -> None:
         got="nothing",
         fix=f"add --{option} NUMBER, or the key {name} of a --describe file",
     )
-
-
-def _notes_of_counts(counts: Mapping[str, int]) -> Iterator[str]:
-    """Yield what a user should know of the number of test trajectories."""
-    if counts["test"] < FEWEST_SCENARIOS:
-        yield (
-            f"{format_count(counts['test'], 'trajectory')} for test: under "
-            f"{FEWEST_SCENARIOS} no difference between methods can be significant; "
-            "--test takes more"
-        )
 
 
 def _divide_into_subsets(
@@ -322,7 +313,7 @@ def import_split(
 
     Raises:
         UsageError: unknown format, a folder that is there, a task that does not fit the
-            data.
+            data, a period that the positions contradict.
         UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
             pickle of more than arrays, or particles of a kind that no material is
             known for.

@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,12 +51,15 @@ from lagbench.errors import (
     DataError,
     UsageError,
     WorkFailedError,
+    format_count,
 )
 from lagbench.metrics.coverage import CELLS, Cloud, fitting_cells
+from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
 
 from .crossings import CrossingCheck
+from .periods import PeriodCheck, check_overlap
 from .trajectory import (
     FEWEST_CELLS,
     Bounds,
@@ -99,6 +102,7 @@ class LocalSplit:
     horizon: int  # frames to predict
     # the walls, or one period [length]: lowest and highest position along each axis
     bounds: Bounds
+    periodic: tuple[str, ...]  # names of the axes without walls
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
@@ -242,7 +246,9 @@ def make_local_split(
         built = root / description.name
         size = load(built / DESCRIPTION).size(description.name, SIZE)
         _move_to_place(built, folder)
-    return _summarise(folder, size, manifest, spacing=builder.spacing)
+    local_split = _summarise(folder, size, manifest, spacing=builder.spacing)
+    notes = builder.periods.describe_extent(spacing=builder.spacing)
+    return replace(local_split, notes=(*local_split.notes, *notes))
 
 
 def _check_cells(description: Description) -> None:
@@ -315,10 +321,15 @@ def _summarise(
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
         bounds=size.bounds,
+        periodic=size.periodic,
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=(*_describe_motion(manifest.statistics), *_describe_size(size.bounds)),
+        notes=(
+            *_describe_motion(manifest.statistics),
+            *_describe_size(size.bounds),
+            *_describe_test(len(size.subsets["test"])),
+        ),
     )
 
 
@@ -348,6 +359,16 @@ def _describe_size(bounds: Bounds) -> Iterator[str]:
         yield (
             f"the longest side of the box is {side:.2g}: score grids and models are "
             "made for sides near 1. --rescale enlarges the box"
+        )
+
+
+def _describe_test(count: int) -> Iterator[str]:
+    """Yield a note for the user if test has too few trajectories for a p-value."""
+    if count < FEWEST_SCENARIOS:
+        yield (
+            f"{format_count(count, 'trajectory')} for test: under {FEWEST_SCENARIOS} "
+            "no difference between methods can be significant; put more into test "
+            "(option --test of adopt)"
         )
 
 
@@ -478,6 +499,13 @@ class SplitBuilder:
     dimension: int = 0  # components of a position; 0 before the first scenario
     # whether trajectories have velocities of walls; None before the first
     has_walls: bool | None = None
+    periods: PeriodCheck = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Prepare the check of the stated periods."""
+        # Without bounds no axis is periodic, whatever the dimension.
+        box = self.description.box or unit_box(2)
+        self.periods = PeriodCheck(box, scale=self.description.transform.scale)
 
     def add(self, subset: str, trajectory: Trajectory) -> None:
         """Write the next scenario."""
@@ -580,6 +608,7 @@ class SplitBuilder:
         position = self._transform_positions(raw_position)
         where = f"{trajectory.name}, frame 0"
         self._check_positions(position, raw_position, trajectory, where=where)
+        self._check_overlap(raw_position, where=where)
         spacing = description.spacing
         if not spacing:
             spacing = estimate_spacing(
@@ -608,10 +637,15 @@ class SplitBuilder:
         before: NDArray[np.float32] | None = None
         motion = MotionCheck(rate=description.rate)
         crossings = CrossingCheck(periodic=description.periodic)
+        last = trajectory.frames - 1
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
             position = self._transform_positions(raw_position)
             self._check_positions(position, raw_position, trajectory, where=where)
+            if number in (0, last // 2, last):
+                self._check_overlap(raw_position, where=where)
+            transform = description.transform
+            self.periods.add(transform.transform_positions(raw_position))
             if before is not None:
                 step = self._box.displacement(before, position.astype(np.float64))
                 crossings.add(step, self._lengths, frame=number)
@@ -631,6 +665,7 @@ class SplitBuilder:
                 yield position, velocity
             before = position
         crossings.finish(where=trajectory.name)
+        self.periods.finish(where=trajectory.name, spacing=self.spacing)
         motion.finish(where=f"{trajectory.name}, velocity")
 
     @property
@@ -644,6 +679,12 @@ class SplitBuilder:
         """Return positions in the unit box, wrapped along periodic axes."""
         position = self.description.transform.transform_positions(raw_position)
         return self._box.wrap(position).astype(np.float32, copy=False)
+
+    def _check_overlap(self, raw_position: NDArray[np.floating], *, where: str) -> None:
+        """Refuse stated periods that put particles of a frame on one another."""
+        transform = self.description.transform
+        position = transform.transform_positions(raw_position)
+        check_overlap(position, self._box, scale=transform.scale, where=where)
 
     @property
     def _lengths(self) -> NDArray[np.float64]:
