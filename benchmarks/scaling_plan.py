@@ -413,8 +413,8 @@ def main() -> int:
         "for one particle: for drawing the initial state, for one substep, and for "
         "three kinds of work on a frame. *Writing a frame* includes hashing and "
         "compressing it. *Hashing a written frame* is the work of `lagbench verify`: "
-        "it reads the frame from the file and hashes it again. Its last column is the "
-        "number of bytes of one particle in one frame of the file.",
+        "it reads the frame from the file and hashes it again. The last column of the "
+        "table is the number of bytes of one particle in one frame of the file.",
         "",
         *parts_table(measured),
         "",
