@@ -104,8 +104,8 @@ HOW_TO_READ = """\
   no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
   GPUs. Each value in its tables comes from one scenario. So compare its numbers with
-  ours only roughly. Size `mini` has about a quarter of the particles and about half
-  the cells along an axis. So at `mini` compare only the order of the models.
+  ours only roughly. Size `mini` has about a quarter of the particles and half the cells
+  along an axis (on cavity 36 % and 60 %). So at `mini` compare only the order of the models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
   lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
 - **readme-network** is the small network of the program in the README. There is no
@@ -187,10 +187,11 @@ and figures of a size. If you interrupt the command, the same command continues.
 
 This page shows only results that have an entry. `python -m studies.results` can also
 show the results of two files that are not in the repository. Its options `--studies`
-and `--runs` each name a folder. It looks for both files in both folders, first in that
-of `--studies`, in the subfolder `<split>/<size>/`. `python -m studies.thesis` writes
-the first file, `mlp_studies.json`, into the folder of runs. The second file is the
-output of `python -m studies.thesis.var_protocol --size mini --json`. Save it as
+and `--runs` each name a folder. In both folders the files lie in the subfolder
+`<split>/<size>/`. If both folders have a file, the one in the folder of `--studies`
+counts. `python -m studies.thesis` writes the first file, `mlp_studies.json`, into the
+folder of runs. The second file is the output of
+`python -m studies.thesis.var_protocol --size mini --json`. Save it as
 `fluid/mini/var_protocol.json` in one of the two folders.
 
 A variant is a model with other options, with another recipe, or with another way of
