@@ -125,8 +125,9 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "training": BoardCheck(
         "a training on windows of `test` or `shift`; a `kind: classical` with "
-        "predictions of a trained model; weights that were trained on another data "
-        "set than that of their entry",
+        "predictions of a trained model; weights that are stored with an entry of "
+        "another data set than that of their training (an entry may share weights of "
+        "another size)",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",
