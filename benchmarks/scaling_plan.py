@@ -422,7 +422,8 @@ def main() -> int:
         "the scenario of test as its perturbed run. In this measurement all three runs "
         "have the same number of frames. So the sum of the parts counts three runs of "
         "the solver and two written scenarios. A whole generation takes longer: it "
-        "also imports and compiles, and it writes the manifest and draws the pictures.",
+        "also imports and compiles, and it writes the manifest and draws the pictures. "
+        "The *client* is the process that you start; it starts the workers.",
         "",
         *whole_table(measured),
         "",
