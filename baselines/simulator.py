@@ -462,14 +462,13 @@ class GraphNetwork(Baseline):
             UsageError: the radius is above half a period of the box.
         """
         radius = self.options.radius
-        largest_radius = self.info.box.largest_radius
-        # half a period may be rounded
-        if radius is None or radius <= largest_radius * (1.0 + 1e-6):
+        box = self.info.box
+        if radius is None or box.allows_radius(radius):
             return
         raise UsageError(
             "the radius is above half of the shortest period",
             where="model.radius",
-            expected=f"at most {largest_radius:g}",
+            expected=f"at most {box.largest_radius:g}",
             got=radius,
             fix=f"set a smaller one; the data set has {self.info.radius:g}",
         )

@@ -159,6 +159,13 @@ class Box:
             return math.inf
         return 0.5 * float(self.lengths[np.asarray(self.periodic)].min())
 
+    def allows_radius(self, radius: float) -> bool:
+        """Tell whether a radius [length] is at most the largest one, but for rounding.
+
+        A period is a difference of two bounds, so it is rounded.
+        """
+        return radius <= self.largest_radius * (1.0 + 1e-6)
+
     @property
     def walls(self) -> tuple[str, ...]:
         """Names of the walls: two for each axis that is not periodic."""

@@ -244,8 +244,7 @@ class _SizeEntry(_RegistryModel):
                 f"task.score_grid.cells: expected at most {most}, which gives at most "
                 f"{MOST_NODES} nodes in this box, got {cells}"
             )
-        # A radius of half a period may be rounded up.
-        if self.task.radius > box.largest_radius * (1.0 + 1e-6):
+        if not box.allows_radius(self.task.radius):
             raise ValueError(
                 f"task.radius: expected at most half of each period, "
                 f"{box.largest_radius:g}, got {self.task.radius:g}"

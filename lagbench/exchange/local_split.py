@@ -605,10 +605,9 @@ class SplitBuilder:
         description = self.description
         raw_position, _ = next(trajectory.read())
         raw_position = np.asarray(raw_position)
-        position = self._transform_positions(raw_position)
+        position = self._wrap(description.transform.transform_positions(raw_position))
         where = f"{trajectory.name}, frame 0"
         self._check_positions(position, raw_position, trajectory, where=where)
-        self._check_overlap(raw_position, where=where)
         spacing = description.spacing
         if not spacing:
             spacing = estimate_spacing(
@@ -634,18 +633,19 @@ class SplitBuilder:
         ``v(f) = (x(f) - x(f-1)) / interval``, and ``v(0) = v(1)``.
         """
         description = self.description
+        transform = description.transform
         before: NDArray[np.float32] | None = None
         motion = MotionCheck(rate=description.rate)
         crossings = CrossingCheck(periodic=description.periodic)
         last = trajectory.frames - 1
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
-            position = self._transform_positions(raw_position)
+            unwrapped = transform.transform_positions(raw_position)
+            position = self._wrap(unwrapped)
             self._check_positions(position, raw_position, trajectory, where=where)
             if number in (0, last // 2, last):
-                self._check_overlap(raw_position, where=where)
-            transform = description.transform
-            self.periods.add(transform.transform_positions(raw_position))
+                check_overlap(unwrapped, self._box, scale=transform.scale, where=where)
+            self.periods.add(unwrapped)
             if before is not None:
                 step = self._box.displacement(before, position.astype(np.float64))
                 crossings.add(step, self._lengths, frame=number)
@@ -673,18 +673,9 @@ class SplitBuilder:
         """The stated box in the unit box, else the unit box itself."""
         return self.description.box or unit_box(self.dimension)
 
-    def _transform_positions(
-        self, raw_position: NDArray[np.floating]
-    ) -> NDArray[np.float32]:
-        """Return positions in the unit box, wrapped along periodic axes."""
-        position = self.description.transform.transform_positions(raw_position)
+    def _wrap(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return positions [length] that are wrapped along periodic axes."""
         return self._box.wrap(position).astype(np.float32, copy=False)
-
-    def _check_overlap(self, raw_position: NDArray[np.floating], *, where: str) -> None:
-        """Refuse stated periods that put particles of a frame on one another."""
-        transform = self.description.transform
-        position = transform.transform_positions(raw_position)
-        check_overlap(position, self._box, scale=transform.scale, where=where)
 
     @property
     def _lengths(self) -> NDArray[np.float64]:

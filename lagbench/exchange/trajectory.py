@@ -496,12 +496,9 @@ class Description:
     def _check_radius(self) -> None:
         """Refuse a radius above half a period: models see the nearest image only."""
         box = self.source_box
-        if box is None:
+        if box is None or box.allows_radius(self.radius):
             return
         most = box.largest_radius
-        # A period is a difference of two bounds, so it is rounded.
-        if self.radius <= most * (1.0 + 1e-9):
-            return
         raise UsageError(
             "the radius is above half of the shortest period",
             where="--radius, or the radius of the metadata",

@@ -60,6 +60,9 @@ def test_the_largest_radius_is_half_of_the_shortest_period() -> None:
     assert WALLED.largest_radius == np.inf
     assert CHANNEL.largest_radius == 1.0  # its height of 0.8 lies between walls
     assert SOLID.largest_radius == 0.25
+    assert WALLED.allows_radius(5.0)
+    assert SOLID.allows_radius(0.25)
+    assert not SOLID.allows_radius(0.251)
 
 
 def test_between_walls_a_displacement_is_the_plain_difference_bit_for_bit() -> None:
