@@ -11,6 +11,7 @@ be formed again.
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,12 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.hdf5 import open_hdf5, open_variable, read_attribute
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
+from .package_metrics import PackageMetricError, drop_metric, package_metric_errors
 from .score_layout import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
@@ -60,7 +64,9 @@ class SubmissionStatistics:
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here.
 
-        Metrics that are formed only when they are named are left out.
+        Metrics that are formed only when they are named are left out, and so is a
+        metric of another package that fails, with a
+        :class:`~lagbench.data.registry.PluginWarning`.
         """
         names = []
         for name, metric in available().items():
@@ -72,11 +78,18 @@ class SubmissionStatistics:
         """Return scores by the name of the metric."""
         statistics = set(next(iter(self.tallies.values())).names)
         table = available()
-        metrics = []
+        metrics: tuple[Metric, ...] = ()
         for name in names:
             if name in table and statistics.issuperset(table[name].of):
-                metrics.append(table[name])
-        return aggregate(metrics, self.tallies)
+                metrics += (table[name],)
+        while True:
+            try:
+                with package_metric_errors():
+                    return aggregate(metrics, self.tallies)
+            except PackageMetricError as error:
+                message = f"{error.what}; it is left out: {error.where}: {error.got}"
+                warnings.warn(message, PluginWarning, stacklevel=2)
+                metrics = drop_metric(metrics, error.metric)
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:

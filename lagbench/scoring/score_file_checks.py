@@ -65,9 +65,7 @@ MOST_STOPS = 5
 # time for every 50 files together [s]; a busy machine may need minutes
 WALL_SECONDS = 600.0
 
-UNREAD = (
-    "not read, because too many others had to be stopped or took all the time allowed"
-)
+UNREAD = "not read, because too many others had to be stopped"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -326,8 +324,11 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
     """Return the files that a child cannot read, and why.
 
     Where a file stops a child, another one reads the rest. After :data:`MOST_STOPS`
-    stops, and after :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files, the
-    rest is left unread, whatever the files contain.
+    stops the rest is left unread.
+
+    Raises:
+        WorkFailedError: the machine is too busy: all files together took longer than
+            :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` of them.
     """
     reasons: dict[Path, str] = {}
     pending = list(paths)
@@ -336,22 +337,26 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
     end = time.monotonic() + WALL_SECONDS * parts
 
     while pending:
-        wall = end - time.monotonic()
-        if stops == MOST_STOPS or wall <= 0.0:
+        if stops == MOST_STOPS:
             return reasons | dict.fromkeys(pending, UNREAD)
         names = [str(path) for path in pending]
-        answers, stopped, _ = run_in_child(
-            READ, names, seconds=CPU_SECONDS * parts, wall=wall
+        answers = run_in_child(
+            READ,
+            names,
+            seconds=CPU_SECONDS * parts,
+            wall=max(end - time.monotonic(), 0.0),
         )
 
-        for path, reason in zip(pending, answers, strict=False):
+        for path, reason in zip(pending, answers.values, strict=False):
             if reason is not None:
                 reasons[path] = reason
-        if len(answers) < len(pending):
-            culprit = pending[len(answers)]
-            reasons[culprit] = f"reading it had to be stopped: {stopped}"
+        read_count = len(answers.values)
+        if read_count < len(pending):
+            culprit = pending[read_count]
+            answers.require_in_time(str(culprit))
+            reasons[culprit] = f"reading it had to be stopped: {answers.stopped}"
             stops += 1
-        pending = pending[len(answers) + 1 :]
+        pending = pending[read_count + 1 :]
     return reasons
 
 

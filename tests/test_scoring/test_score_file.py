@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from numpy.typing import NDArray
 from score_bench import ScoreBench, straight
 
+from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
 from lagbench.metrics.aggregate import round_statistics
@@ -292,6 +294,34 @@ def test_scores_nc_reads_back_to_the_bit(card: ScoreCard) -> None:
         assert_array_equal(tally.total, expected.total)
         assert_array_equal(tally.weight, expected.weight)
         assert_array_equal(tally.undefined, expected.undefined)
+
+
+FAILING = """
+from lagbench.metrics import Direction, Metric
+
+def divide(values):
+    return values / "2"
+
+HALF = Metric(
+    name="my_half", family="mine", unit="1", direction=Direction.LOWER,
+    perfect=0.0, source="here", summary="none", of=("velocity_mse",), series=divide,
+)
+METRICS = (HALF,)
+"""
+"""A package whose metric cannot be formed from the statistics that it takes."""
+
+
+@pytest.mark.filterwarnings("default:the metric my_half failed")
+def test_a_metric_of_a_package_that_fails_is_left_out(
+    card: ScoreCard, package: Callable[..., Path]
+) -> None:
+    """The other scores are as before; the warning has the line that failed."""
+    module = package("metrics", "failing_half:METRICS", FAILING)
+    statistics = read_statistics(card.files[1])
+    with pytest.warns(PluginWarning, match="my_half") as caught:
+        scores = statistics.scores()
+    assert list(scores) == list(card.submission)
+    assert f"{module}, line 5" in str(caught[0].message)
 
 
 def test_scores_json_has_what_a_comparison_needs(card: ScoreCard) -> None:

@@ -13,7 +13,7 @@ import pytest
 from board_bench import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.scoring import score_file_checks as isolation
 from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
 
@@ -206,13 +206,13 @@ def test_many_files_that_stop_the_child_are_bounded(
     assert found[files[-1]] == isolation.UNREAD
 
 
-def test_waiting_files_share_one_deadline(
+def test_no_file_is_accused_of_a_busy_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Children that wait cost the time of all files once, not once each."""
+    """A child that only waits ends the reading of all files: none is at fault."""
     use_child(monkeypatch, tmp_path, "import time; time.sleep(60)")
     monkeypatch.setattr(isolation, "WALL_SECONDS", 0.5)
     started = time.monotonic()
-    found = find_unreadable([tmp_path / f"{i}.nc" for i in range(9)])
+    with pytest.raises(WorkFailedError, match="the machine is too busy"):
+        find_unreadable([tmp_path / f"{i}.nc" for i in range(9)])
     assert time.monotonic() - started < 20.0
-    assert [said == isolation.UNREAD for said in found.values()] == [False] + [True] * 8
