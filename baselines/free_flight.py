@@ -94,6 +94,8 @@ def find_bodies(
 ) -> Bodies:
     """Return the bodies of particles that act on each other within the next frame.
 
+    The result also tells which bodies touch no wall.
+
     Two particles belong to one body if they are within reach now or after one frame at
     their velocities, or if other particles link them.
 
@@ -104,8 +106,8 @@ def find_bodies(
         position: positions [length], shape [particle, axis].
         velocity: velocities [length/frame], shape [particle, axis].
         sample: window of each particle, ascending, int64, shape [particle].
-        reach: distance up to which particles act on each other [length]; walls act up
-            to half of it.
+        reach: distance up to which particles act on each other [length]. A wall acts on
+            particles up to half of this distance.
         box: box that holds the particles.
     """
     position = position.detach()
@@ -115,9 +117,10 @@ def find_bodies(
     near_wall = torch.zeros(len(position), dtype=torch.bool, device=position.device)
     links = []
     cluster_reach = CLUSTER_REACH * reach
+    wall_reach = reach / 2
     for each in states:
-        distance = wall_distance(each, bounds, reach / 2, box.box.periodic)
-        near_wall |= (distance < 1.0).any(dim=1)
+        scaled_distance = wall_distance(each, bounds, wall_reach, box.box.periodic)
+        near_wall |= (scaled_distance < 1.0).any(dim=1)
         links.append(radius_graph(each, cluster_reach, sample, box=box.box))
     cluster, _ = _connected(torch.cat(links, dim=1), len(position))
     for each in states:

@@ -473,7 +473,8 @@ def edge_features(
 def safe_length(vector: Tensor) -> Tensor:
     """Return the lengths of vectors, shape [..., 1] from [..., axis].
 
-    The gradient of a norm is NaN at 0, where two particles coincide; here it is 0.
+    The gradient of a norm is NaN at 0, where two particles coincide; here it is 0. The
+    length of a vector with NaN is 0 too.
     """
     squares = vector**2
     square = squares.sum(dim=-1, keepdim=True)

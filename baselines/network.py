@@ -298,7 +298,7 @@ def edge_map(
     """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
 
     Args:
-        rest: f, the rest of an MLP from its first hidden layer on.
+        rest: f, all of an MLP after its first linear layer; it begins with ReLU.
         edge_index: senders j and receivers i, shape [2, edge].
         edge: latents e of the edges, shape [edge, latent].
         sender: parts s of the hidden layer, shape [particle, hidden].

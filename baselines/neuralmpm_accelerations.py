@@ -66,7 +66,7 @@ class Accelerations(ABC):
         output: Tensor,
         grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the grid's velocity and the accelerations at the particles.
+        """Return the grid's velocity at the particles, and their accelerations.
 
         The velocity, and the acceleration in each coming frame, have shape [particle,
         axis].
@@ -119,12 +119,12 @@ class StressAccelerations(Accelerations):
 
     @property
     def channels(self) -> int:
-        """Three stresses of each material and two accelerations in each frame."""
+        """Components of the stress and, beside walls, of the acceleration."""
         return self._stress_channels + 2 * self.frames
 
     @property
     def _stress_channels(self) -> int:
-        """Three stresses of each material in each frame."""
+        """Three components of the stress of each material in each frame."""
         return 3 * self.material_count * self.frames
 
     def mirror(self, matrix: Tensor) -> list[Tensor]:

@@ -138,13 +138,14 @@ def describe_start(start: Mapping[str, Any] | None) -> str:
 def first_difference(expected: Mapping[str, Any], logged: object) -> str:
     """Return the first key whose value differs, with both values.
 
-    Options that a log leaves out have the values of :data:`LATER_OPTIONS`.
+    Where nothing differs, the text says so. Options that only one of the two states
+    have the values of :data:`LATER_OPTIONS` in the other.
     """
     if not isinstance(logged, Mapping):
         logged = {}
-    return _describe_difference(
-        _fill_later_options(expected, logged), _fill_later_options(logged, expected)
-    )
+    whole_expected = _fill_later_options(expected, logged)
+    whole_logged = _fill_later_options(logged, expected)
+    return _describe_difference(whole_expected, whole_logged)
 
 
 def _fill_later_options(

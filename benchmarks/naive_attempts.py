@@ -587,13 +587,11 @@ class Predictors:
         bounce = float(choice["bounce"])
         position, velocity = case.flown(0)
         position = position.copy()
-        velocity = velocity + 0.5 * given.fall
         clouds = {}
         wanted = set(case.frames)
         for steps, frame in enumerate(given.predicted_frames, start=1):
-            has_fallen = steps > 1
             has_touched = steps > case.flight
-            velocity = velocity + given.fall * has_fallen
+            velocity = velocity + given.fall
             velocity = velocity * (1.0 - friction * has_touched)
             position = position + velocity
             is_beyond = (position < low) | (position > high)

@@ -102,11 +102,12 @@ def format_scores(pair: FramePair) -> str:
     grid = pair.scenario.config.grid
     names = SHOWN[Placement(grid.placement)]
     metrics = select(names)
-    statistics = tally([pair], metrics, (2,))
+    statistics = tally([pair], metrics, (pair.frame,))
     scores = aggregate(metrics, {0: statistics})
     lines = []
     for name in names:
         score = scores[name]
+        # a rounding error would be shown in place of 0
         value = round(score.mean, 12)
         words = name.replace("_", " ")
         lines.append(f"{words} {value:.2g}")

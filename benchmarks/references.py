@@ -94,7 +94,7 @@ def main() -> int:
     )
     are_hard_enough = []
     for size, references in measured:
-        is_hard_enough = _is_hard_enough(size, references, each=options.each)
+        is_hard_enough = _print_hardness(size, references, each=options.each)
         are_hard_enough.append(is_hard_enough)
     print(
         "\n| data set | active frames, median | least | greatest | predicted frames "
@@ -167,10 +167,13 @@ def _relative_cost(size: Size, reference: ReferenceScores) -> str:
     return f"{reference.seconds_per_frame / seconds:.2g}"
 
 
-def _is_hard_enough(
+def _print_hardness(
     size: Size, references: Mapping[str, ReferenceScores], *, each: bool
 ) -> bool:
-    """Print how often the frozen field fails; an undefined correlation has failed."""
+    """Print how often the frozen field fails, and return whether that is enough.
+
+    Where the correlation is undefined, it has failed.
+    """
     if "frozen-field" not in references:
         return True
     frozen = references["frozen-field"]

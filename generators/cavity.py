@@ -1,6 +1,7 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
-Every moving wall follows a program of its own (:func:`.draw_program`): knots with
+Every moving wall, except those of a belt (see below), follows a program of its own
+(:func:`.draw_program`): knots with
 speeds drawn from [-U, U], of the other sign at each knot. Without the change of sign
 half of the walls would slide as before when it matters, and the frozen flow would do
 for an answer. One scenario in eight is the classic: lid at rest, then a constant speed.
@@ -93,8 +94,9 @@ def _draw_motion(
 
     first_moving_frame = 0
     if is_classic(scenario):
-        # In the last given frame at the latest: what is to be predicted is never at
-        # rest.
+        # It moves in the last given frame at the latest, so no predicted frame is at
+        # rest. A belt does not use the draw, but without it all later draws would
+        # change.
         earliest = start - size.value("lid_lead")
         latest = start + size.task.input_frames - 1
         first_moving_frame = draw_integer(rng, earliest, latest)

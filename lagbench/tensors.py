@@ -56,7 +56,9 @@ class TensorBox(nn.Module):
         return way - torch.where(count == 0.0, 0.0, count * self.period)
 
     def inside(self, position: Tensor) -> Tensor:
-        """Return positions inside: those beyond a wall are put on it, others wrapped.
+        """Return positions inside the box.
+
+        Those beyond a wall are put on it. Along periodic axes they are wrapped.
 
         Args:
             position: points [length], shape [..., axis].

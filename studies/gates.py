@@ -92,13 +92,13 @@ class Gates:
 
     @property
     def failed(self) -> list[str]:
-        """Names of the gates that the weights do not pass."""
+        """Names of the gates that the weights fail; None is no failure."""
         names = []
         for name, limit in LIMITS.items():
             value = getattr(self, name)
             if value is None:
                 continue
-            is_within = abs(value) < limit  # NaN is not
+            is_within = abs(value) < limit  # False for NaN
             if name == "densest_cell":
                 is_within = value <= limit
             if not is_within:

@@ -122,7 +122,8 @@ HOW_TO_READ = """\
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
 
 CLAIMS_NOTE = """\
-The table has one question per row, and one answer per data set. Tables, figures and
+The table has one question per row, and one answer per data set. It has the data sets of
+the thesis: `cavity`, `curl-noise`, `fluid` and `multimaterial`. Tables, figures and
 sections in the questions are those of the thesis. The answers use the ranking metric
 over the horizon:
 
@@ -149,7 +150,8 @@ command, this command trains the models. Then `lagbench submit` makes the entrie
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-No data set has active entries of both models, so these questions have no answer:"""
+Each of these questions compares two models. No data set of the thesis has active
+entries of both, so the questions have no answer:"""
 
 TRAINING_NOTE = """\
 The three validation columns show the first seed. They have the lowest validation error
@@ -220,6 +222,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
         parts.append(verdict_on_learning(summarised))
     parts.append(HOW_TO_READ)
     parts += _claims(learned)
+    parts += _references_and_training(summarised)
     for results in [*scored, *newer_learned]:
         parts += _chapter(results)
 
@@ -241,7 +244,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
 
 
 def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
-    """Yield an overview of all claims, then the comparisons behind each."""
+    """Yield an overview of the thesis's claims, then the comparisons behind each."""
     yield "## Claims"
     if not learned:
         yield "No model has been scored yet. The commands are at the end of this page."
@@ -267,6 +270,11 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
         yield UNANSWERED_NOTE
         yield "\n".join(unanswered)
 
+
+def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
+    """Yield where references are better than models, and how models have converged."""
+    if not learned:
+        return
     leading = leading_references(learned)
     if leading.rows:
         yield (

@@ -7,6 +7,7 @@ not used; ``lagbench leaderboard check`` compares them.
 from __future__ import annotations
 
 import math
+import shlex
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -485,13 +486,14 @@ def _require_possible(board: Folder, path: Path, score_file: ScoreFile) -> None:
     """Refuse a score file with values that no prediction can have."""
     impossible = next(find_impossible_values(score_file), None)
     if impossible is not None:
+        folder = shlex.quote(str(board.path))
         raise UnreadableFileError(
             "impossible scores",
             where=str(board.path / path),
             expected="scores that a prediction can have",
             got=impossible,
-            fix=f"lagbench leaderboard check --board {board.path} names all that is "
-            "wrong; submit the predictions again",
+            fix=f"lagbench leaderboard check --board {folder} lists every faulty file; "
+            "submit the predictions again",
         )
 
 
@@ -1148,7 +1150,7 @@ def build(
             where=", ".join(str(path) for path in stale),
             expected=", ".join(descriptions),
             got="another content, or no file",
-            fix=f"lagbench leaderboard build --board {board}",
+            fix=f"lagbench leaderboard build --board {shlex.quote(str(board))}",
         )
     for path, data in stale.items():
         write_atomically(path, data, option="--board")

@@ -608,7 +608,7 @@ def format_value(value: float | str, form: str) -> str:
 
 
 def _format_count(value: float) -> str:
-    """Return a whole number with at most three digits and a unit of counts."""
+    """Return the text of a count: at most three digits, and a unit of counts."""
     for factor, name in COUNT_UNITS:
         if value >= 0.9995 * factor:
             return f"{text(value / factor)} {name}"

@@ -125,9 +125,9 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "training": BoardCheck(
         "a training on windows of `test` or `shift`; a `kind: classical` with "
-        "predictions of a trained model; weights that are stored with an entry of "
-        "another data set than that of their training (an entry may share weights of "
-        "another size)",
+        "predictions of a trained model; an entry that stores weights which were "
+        "trained on another data set (weights of another size of the split are "
+        "allowed)",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",

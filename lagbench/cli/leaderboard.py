@@ -422,13 +422,13 @@ def _describe_reproduced(
 
 
 def _name_fix_of_difference(entry_path: PurePath, board: Path) -> str:
-    """Return the line that follows an entry whose model gives other scores."""
+    """Return the fix for an entry whose model does not give the entry's scores."""
     _, split, size, _ = entry_path.parts
     submit = name_submit_command(entry_path, board)
     return (
-        "  fix: if the predictions are of other weights, predict again with these and "
-        f"replace the entry: lagbench predict FILE --split {split} --size {size} "
-        f"-o PREDICTIONS.nc; {submit}"
+        "  fix: if the predictions were made with other weights, predict again with "
+        "those of the entry and replace the entry: lagbench predict FILE "
+        f"--split {split} --size {size} -o PREDICTIONS.nc; {submit}"
     )
 
 

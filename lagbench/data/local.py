@@ -480,7 +480,7 @@ def _size_error(
 
 
 def suggest_repair(size: Size, *options: str, root: Path | None = None) -> str:
-    """Return a hint how to make a data set whole again.
+    """Return a hint on how to make a data set whole again.
 
     >>> from lagbench.data.registry import load
     >>> suggest_repair(load().size("cavity", "tiny"), "--subset test")

@@ -126,7 +126,7 @@ def paint_pictures(root: Path, size: Size, split: Split, manifest: Manifest) -> 
 
 
 def _first_test_entry(manifest: Manifest) -> FileEntry:
-    """Return the first file of test, of a manifest without one its first file."""
+    """Return the first file of test; without one, the first of the manifest."""
     for entry in manifest.files:
         if entry.subset == "test":
             return entry

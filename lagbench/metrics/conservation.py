@@ -181,7 +181,7 @@ def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
 
 @_error(source="Eq. 3.3", over_frames=over_frames_rms)
 def density_rmse(pair: FramePair) -> float:
-    """Root mean squared error of density relative to rest, over all nodes.
+    """Root mean squared error of density over all nodes, in units of the rest density.
 
     All nodes of the grid, so that material in the wrong place shows both where it is
     missing and where it should not be. 0 is perfect; values of a box that is filled in

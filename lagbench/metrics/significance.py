@@ -140,18 +140,18 @@ def holm(p_values: Sequence[float]) -> list[float]:
     >>> holm([0.01, 0.04, 0.03])
     [0.03, 0.06, 0.06]
     """
-    claimed = []
+    defined = []
     for i, p_value in enumerate(p_values):
         if not math.isnan(p_value):
-            claimed.append(i)
-    claimed.sort(key=lambda i: (p_values[i], i))
+            defined.append(i)
+    defined.sort(key=lambda i: (p_values[i], i))
 
     corrected = [math.nan] * len(p_values)
-    least = 0.0
-    for step, i in enumerate(claimed):
-        stepped = min(1.0, (len(claimed) - step) * p_values[i])
-        least = max(least, stepped)
-        corrected[i] = least
+    largest_so_far = 0.0
+    for step, i in enumerate(defined):
+        stepped = min(1.0, (len(defined) - step) * p_values[i])
+        largest_so_far = max(largest_so_far, stepped)
+        corrected[i] = largest_so_far
     return corrected
 
 

@@ -253,11 +253,14 @@ def update_working_copy(
 def _remote_manifest_with(
     size: Size, url: str, scenarios: Collection[int]
 ) -> Manifest | None:
-    """Return a store's manifest, asked for again where it lacks a scenario."""
+    """Return a store's manifest; None where the store has none.
+
+    The store is asked again where the first answer lacks a scenario or is None.
+    """
     manifest = remote_manifest(size, url)
     if manifest is not None and not _list_missing(manifest, scenarios):
         return manifest
-    # A writer may have put it just now.
+    # A writer may have put the scenario there since the first answer.
     return remote_manifest(size, url, fresh=0.0)
 
 

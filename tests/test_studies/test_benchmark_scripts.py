@@ -9,14 +9,18 @@ import sys
 import warnings
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from score_bench import ScoreBench, still
 
 from benchmarks import free_flight, inference_cost, table_3_1
-from benchmarks.naive_attempts import measured_frames
+from benchmarks.naive_attempts import AnalogCase, Predictors, measured_frames
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
+from lagbench.references.predictor import Given
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -133,3 +137,30 @@ def test_a_scenario_at_rest_is_compared_at_a_predicted_frame() -> None:
     size = load().size("fluid", "mini")
     first_predicted = size.task.input_frames
     assert measured_frames(size, 30, 0) == (first_predicted,)
+
+
+def test_damped_flight_without_contact_is_free_flight() -> None:
+    """The parabola of a falling point in time steps, in a closed form."""
+    size = load().size("fluid", "mini")
+    end = size.task.input_frames + size.task.horizon
+    start = np.array([[0.5, 0.8], [0.52, 0.8]])
+    velocity = np.array([0.002, 0.001])
+    given = Given(
+        size=size,
+        root=Path(),
+        position=np.array([start - velocity, start]),
+        material=np.zeros(2, np.int8),
+        walls=np.zeros((end, 4, 2)),
+        area=0.01,
+        parameters={},
+    )
+    last_given = size.task.input_frames - 1
+    frames = (last_given + 1, last_given + 2, last_given + 12)
+    case = AnalogCase(given=given, frames=frames, without=None, thinning=1)
+    no_library: Any = None
+    predictors = Predictors(no_library)
+    clouds = predictors.damped(case, {"bounce": 0.6, "friction": 0.0})
+    for frame in frames:
+        k = frame - last_given
+        expected = start + k * velocity + given.fall * (k * (k + 1) / 2)
+        assert_allclose(clouds[frame], expected, rtol=0.0, atol=1e-12)
