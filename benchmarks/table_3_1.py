@@ -255,11 +255,12 @@ def markdown(
         )
     lines += [
         "",
-        "The next table shows how the times grow. In its row `A against B` p is the "
-        "exponent in A ~ B^p: the slope of a least-squares line through the logarithms "
-        'of A and B. The column "thesis, same rows" uses only the rows of the thesis '
-        "that are in the table above. If the table above has all rows of the thesis, "
-        "the last two columns are equal.",
+        "The next table shows how the times grow. Each row compares two quantities. "
+        "For example, the row `t/frame against q^2` has the exponent p in "
+        "t/frame ~ (q^2)^p. It is the slope of a least-squares line through the "
+        'logarithms of both. The column "thesis, same rows" uses only the rows of the '
+        "thesis that are in the table above. If the table above has all rows of the "
+        "thesis, the last two columns are equal.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
