@@ -492,7 +492,7 @@ def cost_table(results: SplitResults) -> str:
         "parameters",
         "seeds",
         "CPU hours per seed",
-        "hardware",
+        "trained on",
         "s/frame",
         "solver s/frame",
         "speed-up",

@@ -78,7 +78,8 @@ score is better.
   costs no more per frame than the model). If every classical solver costs more, the
   solver is the cheapest one, and the cell says so. The brackets contain the 95 %
   interval. The name of the solver follows. If the whole interval is below 1,
-  [learning pays](glossary.md)."""
+  [learning pays](glossary.md). A dash means that the cost of the model was not measured
+  beside the solvers."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -158,7 +159,7 @@ The three validation columns show the first seed. They have the lowest validatio
 in the first quarter, the first half and all of the steps. `validated` is the metric of
 this error. The last column shows how much the error decreased in the second half of the
 steps. If it decreased by more than 2 %, the training has not converged. Hours do not
-include validations, except in the first trainings of NeuralMPM. If a training started
+include validations, except those of NeuralMPM on cavity mini. If a training started
 from the weights of earlier trainings, its steps, epochs and hours include the earlier
 trainings."""
 
@@ -170,8 +171,9 @@ share stands only once. If there is no record of the training, `recipe` and `cha
 come from the entry. The speed-up is the time of our solver for a frame, on one core,
 divided by the time of the model on the same machine. The times are those of the entry,
 mostly means over whole rollouts. The first table of this page has means over the first
-ten frames, which were measured in another run. So the two can differ. Hours do not
-include validations, except in the first trainings of NeuralMPM."""
+ten frames, which were measured in another run. So the two can differ. `trained on` is
+the machine of the training. Hours do not include validations, except those of NeuralMPM
+on cavity mini, and do not include hours on a GPU."""
 
 COMMANDS = """\
 ## How to make these results again
