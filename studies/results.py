@@ -172,8 +172,9 @@ come from the entry. The speed-up is the time of our solver for a frame, on one 
 divided by the time of the model on the same machine. The times are those of the entry,
 mostly means over whole rollouts. The first table of this page has means over the first
 ten frames, which were measured in another run. So the two can differ. `trained on` is
-the machine of the training. Hours do not include validations, except those of NeuralMPM
-on cavity mini, and do not include hours on a GPU."""
+the machine of the training. `s/frame` is the time on one core of a CPU. Hours do not
+include validations, except those of NeuralMPM on cavity mini. They do not include hours
+on a GPU."""
 
 COMMANDS = """\
 ## How to make these results again

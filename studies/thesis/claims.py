@@ -86,10 +86,12 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials, with no more "
+    "Does NeuralMPM gain by one velocity grid for all materials, with at most as many "
     "training steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
-    "Does NeuralMPM gain by conserved momentum, shorter bundles and more windows of "
-    "the first frames?": Claim("neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")),
+    "Does NeuralMPM gain by three changes together: momentum is conserved, bundles "
+    "are shorter, and more training windows come from the first frames?": Claim(
+        "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
+    ),
     "Does NeuralMPM gain by shape matching and density projection?": Claim(
         "neuralmpm-projected", ("neuralmpm-conserving",)
     ),
@@ -100,12 +102,12 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does NeuralMPM with shape matching gain if its grids for shape and density are "
-    "as fine as at full?": Claim(
+    "Does NeuralMPM with shape matching gain if, at mini, its grids for shape and "
+    "density have as many cells as at full?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),
-    "Is LSTM + MLP the most accurate frame model? (In Table 4.8 it is.)": Claim(
+    "Is LSTM + MLP more accurate than MLP and LSTM? (In Table 4.8 it is.)": Claim(
         "lstm-mlp", tuple(name for name in FRAME_MODELS if name != "lstm-mlp")
     ),
     "Is persistence, in which nothing moves, better than VAR(1)? (In section 4.8.3 "
