@@ -112,8 +112,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scores that a prediction can have",
     ),
     "score": BoardCheck(
-        "a score or a diverged rollout in the entry that disagrees with its score "
-        "files",
+        "a score in the entry that disagrees with its score files; a diverged rollout "
+        "that the entry states and the score files cannot have",
         "the score block is not what the score files give",
         "what the score files give",
     ),
