@@ -207,13 +207,15 @@ python benchmarks/power.py --write
 ## Differences that the test finds
 
 **Model.** We draw random scores of two methods. In scenario i, with seed s, a method
-has the score m (1 + a_i + b_i + c_s + e_si). Here m is the mean of the method. The
-other four terms are random:
+has the score m (1 + b_i + c_s + e_si). Here m is the mean of the method. The other
+three terms are random:
 
-- a_i belongs to the scenario. It is the same for both methods.
 - b_i belongs to the method in this scenario (column "method in scenario").
 - c_s belongs to the seed (column "seed").
 - e_si is the rest (column "rest").
+
+The model has no term that both methods share in a scenario. In the difference of the
+methods such a term would count only in proportion to the difference of their means.
 
 The table shows the standard deviations of b_i, c_s and e_si.
 

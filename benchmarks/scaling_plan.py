@@ -338,7 +338,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     checking = frame_hours * p.check
     perturbed_runs = (
         f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all), "
-        f"up to frame {HORIZON} of {frames}"
+        f"{HORIZON} of the {frames} frames of each"
     )
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
