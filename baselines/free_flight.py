@@ -94,7 +94,7 @@ def find_bodies(
 ) -> Bodies:
     """Return the bodies of particles that act on each other within the next frame.
 
-    The result also tells which bodies touch no wall.
+    The result also tells which bodies are out of reach of all walls.
 
     Two particles belong to one body if they are within reach now or after one frame at
     their velocities, or if other particles link them.

@@ -101,7 +101,7 @@ class FieldAccelerations(Accelerations):
         output: Tensor,
         grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the grid's velocity and the accelerations at the particles."""
+        """Return the grid's velocity at the particles, and their accelerations."""
         axes = self.grid.dimension
         particles = len(stencil.weight)
         channels = axes * self.frames  # of a layer
@@ -119,7 +119,7 @@ class StressAccelerations(Accelerations):
 
     @property
     def channels(self) -> int:
-        """Components of the stress and, beside walls, of the acceleration."""
+        """In each frame three of each material's stress, and two of a push of walls."""
         return self._stress_channels + 2 * self.frames
 
     @property
@@ -141,7 +141,7 @@ class StressAccelerations(Accelerations):
         output: Tensor,
         grid_velocity: Tensor,
     ) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the grid's velocity and the accelerations at the particles."""
+        """Return the grid's velocity at the particles, and their accelerations."""
         grid = self.grid
         velocity = grid.gather(stencil, grid_velocity)
         stress, wall_push = output.tensor_split([self._stress_channels], dim=1)

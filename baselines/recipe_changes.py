@@ -138,8 +138,8 @@ def describe_start(start: Mapping[str, Any] | None) -> str:
 def first_difference(expected: Mapping[str, Any], logged: object) -> str:
     """Return the first key whose value differs, with both values.
 
-    Where nothing differs, the text says so. Options that only one of the two states
-    have the values of :data:`LATER_OPTIONS` in the other.
+    Where nothing differs, the text says so. If one of the two lacks an option of
+    :data:`LATER_OPTIONS`, its value there counts.
     """
     if not isinstance(logged, Mapping):
         logged = {}

@@ -577,8 +577,9 @@ class Predictors:
         return self._after_flight(case, 0, follow)
 
     def damped(self, case: AnalogCase, choice: Choice) -> Clouds:
-        """Free flight with bounces: walls return a share of the speed, and friction
-        takes a share per frame.
+        """Free flight with bounces: walls return a share of the speed.
+
+        After the first contact friction takes a share of the speed in each frame.
         """
         given = case.given
         low = given.box.lower_walls

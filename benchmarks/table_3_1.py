@@ -6,8 +6,9 @@ q.
 writes table_3_1_DEVICE.md and table_3_1_DEVICE.png and prints the table. The rows take
 particles, grid and substeps per frame from the thesis; a block of liquid, four
 particles per cell, falls and spreads (free-surface solver). Times are the best of the
-repeats, in milliseconds: processor time on the CPU, so that other processes do not
-count, wall time on a GPU. --machine names the machine in the text above the table.
+repeats, in milliseconds: processor time with --device cpu, so that other processes do
+not count, and wall-clock time with the other devices. --machine names the machine in
+the text above the table.
 """
 
 from __future__ import annotations
@@ -206,14 +207,14 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     ours = f"with `--device {device}`"
     if machine:
         ours = f"{ours} on {machine}"
-    if device == "cuda":
-        clock = "as wall-clock time in milliseconds"
+    clock = "as wall-clock time in milliseconds"
+    if device == Device.CPU:
+        clock = "as processor time in milliseconds"
+    consequence = "On a CPU the difference is small, often smaller than the noise."
+    if device == Device.CUDA:
         consequence = (
             "On a GPU the copy takes long, so t/frame can be half of the product."
         )
-    else:
-        clock = "as processor time in milliseconds"
-        consequence = "On a CPU the difference is small, often smaller than the noise."
     return [
         "## Table 3.1: time of the solver for more and more particles",
         "",
@@ -227,7 +228,7 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "number of frames per second. t/frame is the time of a run with all substeps "
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
-        f"contains a twentieth of the time of a copy. For a frame of {2 * FIXED} "
+        f"contains 1/{FIXED} of the time of a copy. For a frame of {2 * FIXED} "
         f"substeps, the product of {2 * FIXED} and our t/substep contains two copies, "
         f"but our t/frame contains only one. {consequence}",
         "",

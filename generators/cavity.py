@@ -1,10 +1,11 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
 Every moving wall, except those of a belt (see below), follows a program of its own
-(:func:`.draw_program`): knots with
-speeds drawn from [-U, U], of the other sign at each knot. Without the change of sign
-half of the walls would slide as before when it matters, and the frozen flow would do
-for an answer. One scenario in eight is the classic: lid at rest, then a constant speed.
+(:func:`.draw_program`): knots with speeds drawn from [-U, U], of the other sign at each
+knot. Without the change of sign half of the walls would slide as before when it
+matters, and the frozen flow would do for an answer. One scenario in eight is the
+classic: lid at rest, then a constant speed.
+
 Expected behaviour: vortices grow from the moving walls, are cut off where a wall turns
 and merge; the flow never settles. The id decides which walls move, so that every subset
 holds all six choices alike. Two walls that meet in a corner never move both, because

@@ -92,7 +92,7 @@ class Gates:
 
     @property
     def failed(self) -> list[str]:
-        """Names of the gates that the weights fail; None is no failure."""
+        """Names of the gates that the weights fail. A value of None does not fail."""
         names = []
         for name, limit in LIMITS.items():
             value = getattr(self, name)

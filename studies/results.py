@@ -151,17 +151,18 @@ command, this command trains the models. Then `lagbench submit` makes the entrie
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-Each of these questions compares two models. No data set of the thesis has active
-entries of both, so the questions have no answer:"""
+Each of these questions compares a model with one or two others. On no data set of the
+thesis do the model and one of the others have entries that count, so the questions have
+no answer:"""
 
 TRAINING_NOTE = """\
 The three validation columns show the first seed. They have the lowest validation error
 in the first quarter, the first half and all of the steps. `validated` is the metric of
 this error. The last column shows how much the error decreased in the second half of the
 steps. If it decreased by more than 2 %, the training has not converged. Hours do not
-include validations, except those of NeuralMPM on cavity mini. If a training started
-from the weights of earlier trainings, its steps, epochs and hours include the earlier
-trainings."""
+include hours on a GPU or validations. (Only those of the first seed of NeuralMPM on
+cavity mini include validations.) If a training started from the weights of earlier
+trainings, its steps, epochs and hours include the earlier trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
@@ -172,9 +173,9 @@ come from the entry. The speed-up is the time of our solver for a frame, on one 
 divided by the time of the model on the same machine. The times are those of the entry,
 mostly means over whole rollouts. The first table of this page has means over the first
 ten frames, which were measured in another run. So the two can differ. `trained on` is
-the machine of the training. `s/frame` is the time on one core of a CPU. Hours do not
-include validations, except those of NeuralMPM on cavity mini. They do not include hours
-on a GPU."""
+the machine on which the training ended. `s/frame` is the time on one core of a CPU.
+Hours do not include hours on a GPU or validations. (Only those of the first seed of
+NeuralMPM on cavity mini include validations.)"""
 
 COMMANDS = """\
 ## How to make these results again
@@ -250,7 +251,10 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
     """Yield an overview of the thesis's claims, then the comparisons behind each."""
     yield "## Claims"
     if not learned:
-        yield "No model has been scored yet. The commands are at the end of this page."
+        yield (
+            "No model has been scored yet on a data set of the thesis. The commands "
+            "are at the end of this page."
+        )
         return
 
     rows_by_claim = {}
@@ -275,18 +279,18 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
 
 
 def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
-    """Yield where references are better than models, and how models have converged."""
+    """Yield where references beat models, and how errors still fall at the end."""
     if not learned:
         return
     leading = leading_references(learned)
     if leading.rows:
         yield (
-            "### In which metrics has a reference predictor a better mean than every "
+            "## In which metrics has a reference predictor a better mean than every "
             "model?"
         )
         yield table_markdown(leading)
 
-    yield "### How much does the error decrease with the training?"
+    yield "## How much does the error decrease with the training?"
     yield TRAINING_NOTE
     yield training_table(learned)
 

@@ -29,7 +29,7 @@ from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
-from .package_metrics import PackageMetricError, drop_metric, package_metric_errors
+from .package_metrics import PackageMetricError, package_metric_errors
 from .score_layout import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
@@ -64,8 +64,8 @@ class SubmissionStatistics:
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here.
 
-        Metrics that are formed only when they are named are left out, and so is a
-        metric of another package that fails, with a
+        Metrics that are formed only when they are named are left out. A metric of
+        another package that fails is left out too, with a
         :class:`~lagbench.data.registry.PluginWarning`.
         """
         names = []
@@ -75,21 +75,22 @@ class SubmissionStatistics:
         return self._aggregate(names)
 
     def _aggregate(self, names: Iterable[str]) -> dict[str, Score]:
-        """Return scores by the name of the metric."""
+        """Return scores by the name of the metric, without metrics that fail."""
         statistics = set(next(iter(self.tallies.values())).names)
         table = available()
-        metrics: tuple[Metric, ...] = ()
+        metrics: dict[str, Metric] = {}
         for name in names:
             if name in table and statistics.issuperset(table[name].of):
-                metrics += (table[name],)
+                metrics[name] = table[name]
         while True:
             try:
                 with package_metric_errors():
-                    return aggregate(metrics, self.tallies)
+                    return aggregate(metrics.values(), self.tallies)
             except PackageMetricError as error:
                 message = f"{error.what}; it is left out: {error.where}: {error.got}"
-                warnings.warn(message, PluginWarning, stacklevel=2)
-                metrics = drop_metric(metrics, error.metric)
+                warnings.warn(message, PluginWarning, stacklevel=3)
+                # metrics that follow from it need the stored statistics only
+                del metrics[error.metric]
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:

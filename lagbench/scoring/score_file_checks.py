@@ -327,8 +327,9 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
     stops the rest is left unread.
 
     Raises:
-        WorkFailedError: the machine is too busy: all files together took longer than
-            :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` of them.
+        WorkFailedError: the machine is too busy (all files together took longer than
+            :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` of them), or has too
+            little memory, or the child itself failed.
     """
     reasons: dict[Path, str] = {}
     pending = list(paths)
@@ -353,7 +354,7 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
         read_count = len(answers.values)
         if read_count < len(pending):
             culprit = pending[read_count]
-            answers.require_in_time(str(culprit))
+            answers.require_in_time(f"{len(pending)} score files")
             reasons[culprit] = f"reading it had to be stopped: {answers.stopped}"
             stops += 1
         pending = pending[read_count + 1 :]

@@ -86,8 +86,10 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials, with at most as many "
-    "training steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
+    "Does NeuralMPM gain by one velocity grid for all materials, without more training "
+    "steps than with one grid per material?": Claim(
+        "neuralmpm", ("neuralmpm-unmixed",)
+    ),
     "Does NeuralMPM gain by three changes together: momentum is conserved, bundles "
     "are shorter, and more training windows come from the first frames?": Claim(
         "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
@@ -102,8 +104,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does NeuralMPM with shape matching gain if, at mini, its grids for shape and "
-    "density have as many cells as at full?": Claim(
+    "Does NeuralMPM with shape matching gain by one more grid, of 60 cells, for shape "
+    "and for density?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),

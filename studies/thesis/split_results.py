@@ -637,7 +637,7 @@ def format_budget(record: Mapping[str, Any]) -> str:
 
 
 def format_hardware(record: Mapping[str, Any]) -> str:
-    """Return the machine of a training: its GPU, or its processor and threads."""
+    """Return the machine on which a training ended: GPU, or processor and threads."""
     hardware = record.get("hardware")
     if not hardware:
         return "-"

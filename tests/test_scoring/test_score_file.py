@@ -306,21 +306,28 @@ HALF = Metric(
     name="my_half", family="mine", unit="1", direction=Direction.LOWER,
     perfect=0.0, source="here", summary="none", of=("velocity_mse",), series=divide,
 )
-METRICS = (HALF,)
+DOUBLE = Metric(
+    name="my_double", family="mine", unit="1", direction=Direction.LOWER,
+    perfect=0.0, source="here", summary="none", of=("velocity_mse",),
+    series=lambda values: 2.0 * values,
+)
+METRICS = (HALF, DOUBLE)
 """
-"""A package whose metric cannot be formed from the statistics that it takes."""
+"""A package with a metric that cannot be formed, and one that can."""
 
 
 @pytest.mark.filterwarnings("default:the metric my_half failed")
 def test_a_metric_of_a_package_that_fails_is_left_out(
     card: ScoreCard, package: Callable[..., Path]
 ) -> None:
-    """The other scores are as before; the warning has the line that failed."""
+    """The others are formed; the warning has the line that failed."""
     module = package("metrics", "failing_half:METRICS", FAILING)
     statistics = read_statistics(card.files[1])
     with pytest.warns(PluginWarning, match="my_half") as caught:
         scores = statistics.scores()
-    assert list(scores) == list(card.submission)
+    assert list(scores) == [*card.submission, "my_double"]
+    expected = 2.0 * card.submission["velocity_mse"].values
+    assert_allclose(scores["my_double"].values, expected, rtol=1e-6)
     assert f"{module}, line 5" in str(caught[0].message)
 
 

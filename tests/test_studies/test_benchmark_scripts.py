@@ -20,6 +20,7 @@ from benchmarks import free_flight, inference_cost, table_3_1
 from benchmarks.naive_attempts import AnalogCase, Predictors, measured_frames
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
+from lagbench.generators.split import Device
 from lagbench.references.predictor import Given
 
 REPOSITORY = Path(__file__).parents[2]
@@ -164,3 +165,12 @@ def test_damped_flight_without_contact_is_free_flight() -> None:
         k = frame - last_given
         expected = start + k * velocity + given.fall * (k * (k + 1) / 2)
         assert_allclose(clouds[frame], expected, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("device", list(Device))
+def test_the_text_of_table_3_1_names_the_clock_of_its_device(device: Device) -> None:
+    """The serial CPU device is timed by processor time, the others on the wall."""
+    text = "\n".join(table_3_1.describe(device, machine="", repeats=3))
+    assert ("processor time" in text) == (device == Device.CPU)
+    assert ("wall-clock time" in text) == (device != Device.CPU)
+    assert ("On a GPU" in text) == (device == Device.CUDA)
