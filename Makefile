@@ -22,7 +22,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/.dev
-	$(BIN)/mypy lagbench studies validation
+	$(BIN)/mypy lagbench studies validation benchmarks
 
 bench: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest benchmarks -s

@@ -29,7 +29,7 @@ HEAD = """\
 mean kinetic energy |
 |---:|---|---|---:|---:|---:|---:|---:|"""
 
-ScenarioRow = tuple[str, str, float, int, float, int, float]
+ScenarioRow = tuple[object, object, object, object, float, int, float]
 """The values of a scenario in the order of the columns, after its id."""
 
 

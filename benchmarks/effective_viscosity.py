@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from lagbench.data.grid import Grid, fields
+from lagbench.data.grid import fields
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 
@@ -76,8 +76,7 @@ def _print_fits(name: str, fits: Sequence[ViscosityFit]) -> None:
 def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
     """Fit dE/dt = - nu * enstrophy to the energy E of a scenario."""
     task = size.task
-    score_grid = task.score_grid
-    grid = Grid(score_grid.cells, score_grid.placement)
+    grid = size.field_grid
     (low, high), _ = size.bounds
     area = (high - low) ** 2
     full_weight = grid.full_weight(size.particles, area)
@@ -92,23 +91,23 @@ def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
             position = stored_position.astype(np.float64)
             velocity = stored_velocity.astype(np.float64)
             squared_speed = np.sum(velocity**2, axis=-1)
-            energy = 0.5 * np.mean(squared_speed)
+            energy = 0.5 * float(np.mean(squared_speed))
             energies.append(energy)
             node_fields = fields(position, velocity, grid, full=full_weight)
-            enstrophy = np.nanmean(node_fields.vorticity**2)
+            enstrophy = float(np.nanmean(node_fields.vorticity**2))
             enstrophies.append(enstrophy)
         parameters = file.header.parameters
 
     # integral of the enstrophy up to each frame, and the energy lost up to it
     interval = size.frame_interval
-    dissipation = cumulative_trapezoid(enstrophies, dx=interval, initial=0.0)
+    dissipation = cumulative_trapezoid(enstrophies, dx=interval, initial=0)
     initial_energy = energies[0]
     energy_loss = initial_energy - np.array(energies)
     product = dissipation @ energy_loss
     square = dissipation @ dissipation
     viscosity = float(product / square)
     energy_share = energies[-1] / initial_energy
-    frequency = int(parameters["frequency"])
+    frequency = int(str(parameters["frequency"]))
     return ViscosityFit(frequency, viscosity, energy_share)
 
 

@@ -218,7 +218,8 @@ def other_scenario(test: CalibrationScenario) -> Floats:
     other_start = other[last_given]
     other_path = other[test.first : test.end]
     displacement = other_path - other_start
-    return test.positions[last_given] + displacement
+    position: Floats = test.positions[last_given] + displacement
+    return position
 
 
 def field_steps(test: CalibrationScenario) -> Floats:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.data.grid import Grid, fields
+from lagbench.data.grid import fields
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.metrics.vorticity import pearson
@@ -121,8 +121,7 @@ def _score_frozen_field(
     truth = stored_truth.astype(np.float64)
     given = given_in(file, size, root)
     box = size.box
-    score_grid = size.task.score_grid
-    grid = Grid(score_grid.cells, score_grid.placement, box)
+    grid = size.field_grid
     full = grid.full_weight(size.particles, box.volume)
     correlation = float("nan")
     squared_error = 0.0
@@ -145,8 +144,8 @@ def _score_frozen_field(
         true_vorticity = true_fields.vorticity[nodes].ravel()
         vorticity = predicted_fields.vorticity[nodes].ravel()
         error = true_vorticity - vorticity
-        squared_error += np.mean(error**2)
-        squared_truth += np.mean(true_vorticity**2)
+        squared_error += float(np.mean(error**2))
+        squared_truth += float(np.mean(true_vorticity**2))
         if frame == judged_frame:
             correlation = pearson(true_vorticity, vorticity)
     relative_error = float(np.sqrt(squared_error / squared_truth))
@@ -162,13 +161,13 @@ def _judge_activity(size: Size, root: Path, each: bool) -> bool:
             parameters = file.header.parameters
         kind_name = KINDS[size.split]
         kind = parameters[kind_name]
-        active_frames = parameters["active_frames"]
+        active_frames = int(str(parameters["active_frames"]))
         counts_by_kind[kind].append(active_frames)
         if each:
             print(f"  {scenario}: {kind} {active_frames}")
     medians = []
     for kind, counts in counts_by_kind.items():
-        median = np.median(counts)
+        median = float(np.median(counts))
         medians.append(median)
         print(
             f"{size.split} {size.name}, {kind}: median {median:g} active frames "

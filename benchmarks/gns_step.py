@@ -51,9 +51,9 @@ def plain_update(
 def use_conventional(options: argparse.Namespace) -> None:
     """Put the chosen conventional parts in place of ours."""
     if options.edge_layer == "plain":
-        EdgeMLP.forward = plain_update
+        EdgeMLP.forward = plain_update  # type: ignore[method-assign]
     if options.products == "torch":
-        layers.linear = nn.functional.linear
+        layers.linear = nn.functional.linear  # type: ignore[assignment]
     if options.hidden == "kept":
         layers.LARGEST_KEPT = math.inf
 

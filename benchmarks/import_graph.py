@@ -89,10 +89,10 @@ def _import_statements(source: str) -> list[tuple[ImportStatement, bool]]:
         if isinstance(node, ast.Import | ast.ImportFrom):
             statements.append((node, is_for_types))
         elif _is_for_types(node):
-            for child in node.body:
-                pending.append((child, True))
-            for child in node.orelse:
-                pending.append((child, is_for_types))
+            for statement in node.body:
+                pending.append((statement, True))
+            for statement in node.orelse:
+                pending.append((statement, is_for_types))
         elif not isinstance(node, ast.expr):  # no expression holds a statement
             for child in ast.iter_child_nodes(node):
                 pending.append((child, is_for_types))

@@ -205,7 +205,7 @@ class Library:
         path = self.size.path(self.root, scenario)
         train = read_train_scenario(path)
         reflection = self.mirrors[mirror]
-        image = reflection.positions(train.position)
+        image = reflection.positions(train.position.astype(np.float64))
         return image, train.material
 
     def states(

@@ -29,12 +29,14 @@ import numpy as np
 import taichi as ti
 from conventional_fluid import ConventionalFluid
 
+from lagbench.data.box import Box
 from lagbench.generators import curl_noise_3d
 from lagbench.generators.draws import generator
 from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.periodic_noise import scaled_to
 from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
-from validation.flows import Box, constants, lattice
+from validation.flows import constants, lattice
 
 TARGET = 3.0
 
@@ -162,7 +164,7 @@ def start(grid: int):
     count = len(position)
     rng = generator("periodic-cube", "benchmark", 1, 0)
     flow = curl_noise_3d.draw_noise(rng, position, 2)
-    flow = curl_noise_3d.scaled_to(flow, 0.15)
+    flow = scaled_to(flow, 0.15)
     state = InitialState(
         position=position,
         velocity=flow.velocity,

@@ -250,11 +250,11 @@ def one(text: str) -> int:
     q, frames, what = text.split(",")
     row = row_of(q)
     with tempfile.TemporaryDirectory() as folder:
+        costs: Parts | Whole
         if what == "parts":
-            measure = measure_parts
+            costs = measure_parts(row, int(frames), Path(folder))
         else:
-            measure = measure_whole
-        costs = measure(row, int(frames), Path(folder))
+            costs = measure_whole(row, int(frames), Path(folder))
         print(json.dumps(asdict(costs)))
     return 0
 

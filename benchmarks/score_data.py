@@ -105,9 +105,9 @@ def make_score_data(
     )
     with writer:
         for scenario in scenarios:
-            flow = _flow(scenario, frames, size.particles, error=0.02)
-            positions = np.stack(list(flow))
-            predicted = positions[size.task.input_frames :]
+            predicted_flow = _flow(scenario, frames, size.particles, error=0.02)
+            all_positions = np.stack(list(predicted_flow))
+            predicted = all_positions[size.task.input_frames :]
             writer.add(scenario, predicted)
     return ScoreData(root, registry, path)
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 import lagbench
 from lagbench.data.local import locate
 from lagbench.exchange import adopt
+from lagbench.metrics.table import select
 from lagbench.scoring.scenario import ScenarioJob, score_scenario
-from lagbench.scoring.score import _select_metrics
 from lagbench.scoring.task import load_scored_task
 from lagbench.submission.predictions import open_predictions
 
@@ -102,7 +102,7 @@ def main() -> None:
         task = load_scored_task(size, root)
         with open_predictions(path) as opened:
             info = opened.info
-        metric_names = [metric.name for metric in _select_metrics(())]
+        metric_names = [metric.name for metric in select(())]
         job = ScenarioJob(
             task=task,
             scenario=2,

@@ -155,7 +155,7 @@ def _vorticity(positions: Floats) -> Floats:
     v = velocity[..., 1]
     dv_dx = np.gradient(v, spacing, axis=0)
     du_dy = np.gradient(u, spacing, axis=1)
-    return dv_dx - du_dy
+    return np.asarray(dv_dx - du_dy)
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from lagbench.generators.split import Device
 DEVICE = Device(os.environ.get("LAGBENCH_BENCH_DEVICE", "cpu"))
 LAST = 9 if DEVICE is Device.CUDA else 4
 ROWS = table_3_1.THESIS[:LAST]
+REPEATS = 3
 
 GOAL = 1.05
 """Exponent of a substep's time against particles; printed only."""
@@ -46,7 +47,7 @@ def test_row(
     """Time frames of the row's own substeps, and substeps in runs of 20."""
 
     def one_round() -> None:
-        timed_row = table_3_1.measure(row, device=DEVICE, repeats=3)
+        timed_row = table_3_1.measure(row, device=DEVICE, repeats=REPEATS)
         timed_rows.append(timed_row)
 
     best_seconds(benchmark, one_round, rounds=1)
@@ -65,7 +66,7 @@ def test_exponents(timed_rows: list[table_3_1.TimedRow], tmp_path: Path) -> None
     """A substep's time grows with the particles, and far less than their square."""
     if len(timed_rows) < 2:
         pytest.skip("needs the rows of this module in the same run")
-    table = table_3_1.markdown(timed_rows, DEVICE.value)
+    table = table_3_1.markdown(timed_rows, DEVICE.value, repeats=REPEATS)
     print(f"\n{table}")
     figure = tmp_path / "figure_3_1.png"
     table_3_1.draw(timed_rows, DEVICE.value, figure)

@@ -31,6 +31,7 @@ import lagbench
 from lagbench.data.layout import ScenarioKey
 from lagbench.data.registry import REGISTRY_VARIABLE, default_path, load
 from lagbench.data.yamlfile import read_yaml
+from lagbench.store.windows import Windows
 from lagbench.torch import RUN, WindowDataset, WindowSampler, collate
 
 TARGET = 1000.0
@@ -219,7 +220,7 @@ def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tensors = dataset(root)
     registry = load(root / "datasets.yaml")
     arrays = lagbench.windows("cavity", root=root, history=HISTORY, registry=registry)
-    routes = {"tensors": tensors, "arrays": arrays}
+    routes: dict[str, WindowDataset | Windows] = {"tensors": tensors, "arrays": arrays}
     order = list(WindowSampler(tensors, seed=SEED))
     spent = dict.fromkeys(routes, 0.0)
     # In turns over the same windows, so that a machine that slows down slows both.
