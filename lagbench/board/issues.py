@@ -126,8 +126,8 @@ CHECKS: Mapping[str, BoardCheck] = {
     "training": BoardCheck(
         "a training on windows of `test` or `shift`; a `kind: classical` with "
         "predictions of a trained model; an entry that stores weights which were "
-        "trained on another data set (weights of another size of the split are "
-        "allowed)",
+        "trained on another data set or size (weights that another entry stores may be "
+        "of another size)",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",
