@@ -233,6 +233,8 @@ def _name_score_and_cost(results: SplitResults, name: str | None, beside: str) -
     seconds = _seconds_in_run(results, name, beside)
     if seconds is None:
         return text
+    if seconds >= 1.0:
+        return f"{text} ({number(seconds)} s)"
     return f"{text} ({number(1000.0 * seconds)} ms)"
 
 
