@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import Box
 from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
 from lagbench.figures.html import MISSING, text, words
+from lagbench.figures.solid import View
 from lagbench.scoring.score_layout import spaced
 
 from .columns import describe_check, format_ranks
@@ -45,6 +47,7 @@ MAP_LEVELS = 500  # steps of a vorticity map: more than a colour has
 FILM_LEVELS = 1000  # steps across a film: two to a pixel
 HISTOGRAM_LEVELS = 500  # steps of a histogram: two to a pixel
 OBSTACLE_DIGITS = 4  # of the place and radius of an obstacle in a film
+PERIOD_DIGITS = 4  # of a period in a film
 SHOWN_DIGITS = 3  # of the values at frames of interest
 
 # Values of maps are cut off at so many times the truth's greatest: an explosion would
@@ -142,6 +145,24 @@ def _add_film(film: Floats32, arrays: ArrayStore) -> Reference:
     return arrays.add(frames, kind="film", levels=FILM_LEVELS)
 
 
+def _picture_periods(box: Box) -> list[list[float]]:
+    """Return how far a period leads in a picture, for each periodic axis.
+
+    Along x and y, in sides of the picture.
+    """
+    periods = []
+    for axis, is_periodic in enumerate(box.periodic):
+        if not is_periodic:
+            continue
+        step = np.zeros(box.dimension)
+        step[axis] = box.lengths[axis]
+        if box.dimension == 3:
+            view = View(box)
+            step = view.place(step) - view.place(np.zeros(3))
+        periods.append([round_digits(value, PERIOD_DIGITS) for value in step.tolist()])
+    return periods
+
+
 def _plain_obstacle(pictures: Pictures) -> list[float] | None:
     """Return x, y and radius of the obstacle in a film; None without one."""
     if pictures.obstacle is None:
@@ -196,6 +217,7 @@ class _TabWriter:
             "curves": curves,
             "pictured": tab.pictured,
             "energy": self._mean_curve(tab.energy),
+            "periods": _picture_periods(tab.size.box),
             "truth": self._pictures(tab.truth),
             "references": references,
             "rows": rows,

@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -255,6 +256,40 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
     assert page.value(label) == "Play"
     run(page, "document.getElementById('panel').close()")
     until(page, f"{label} === 'Pause'")
+
+
+def positions_between(page: Page, film: str, time: float, periods: str) -> list[float]:
+    """Return what the page's function gives for one particle of a film."""
+    script = files("lagbench.board").joinpath("page", "film.js").read_text()
+    frames = f"{film}.length / 2"
+    call = f"positionsAt({film}, 1, {frames}, {time}, {periods})"
+    values: list[float] = page.value(f"(() => {{{script}\nreturn [...{call}];}})()")
+    return values
+
+
+def test_a_film_does_not_fly_across_a_periodic_box(page: Page) -> None:
+    """A particle that leaves on one side stays there until it is on the other.
+
+    Catmull-Rom splines give straight lines at the constant speed 0.04 per frame.
+    """
+    wrapped = "[0.90, 0.5, 0.94, 0.5, 0.98, 0.5, 0.02, 0.5, 0.06, 0.5]"
+    both_axes = "[[1, 0], [0, 1]]"
+    early = positions_between(page, wrapped, 2.25, both_axes)
+    late = positions_between(page, wrapped, 2.75, both_axes)
+    assert early == pytest.approx([0.98, 0.5])
+    assert late == pytest.approx([0.02, 0.5])
+    # beside the jump nothing is drawn towards the other side
+    for time_before, least, most in ((1.5, 0.94, 0.98), (3.5, 0.02, 0.06)):
+        x, y = positions_between(page, wrapped, time_before, both_axes)
+        assert least <= x <= most
+        assert y == pytest.approx(0.5)
+
+    even = "[0.10, 0.5, 0.14, 0.5, 0.18, 0.5, 0.22, 0.5, 0.26, 0.5]"
+    x, _ = positions_between(page, even, 1.5, both_axes)
+    assert x == pytest.approx(0.16)
+    # with walls such a step is a motion
+    x, _ = positions_between(page, wrapped, 2.5, "[]")
+    assert x == pytest.approx(0.5)
 
 
 def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:

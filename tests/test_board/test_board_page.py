@@ -41,6 +41,7 @@ from lagbench.board.overview import (
 from lagbench.board.page import render, same_page
 from lagbench.board.show import tables
 from lagbench.board.table_view import MOST_REASONS, Cell, make_table
+from lagbench.figures.solid import View
 from lagbench.references.predictor import Kind
 
 HOSTILE = (
@@ -144,6 +145,25 @@ def test_the_obstacle_of_a_film_arrives_at_the_script() -> None:
         assert row_data["pictures"]["obstacle"] == [0.25, 0.5, 0.04688]
     assert data.hero is not None
     assert data.hero["obstacle"] == [0.25, 0.5, 0.04688]
+
+
+def test_the_periods_of_a_film_arrive_at_the_script() -> None:
+    """One step in the picture per periodic axis; a box with walls has none."""
+    for split, expected in (
+        ("cavity", []),
+        ("poiseuille", [[1.0, 0.0], [0.0, 1.0]]),
+        ("cylinder", [[1.0, 0.0]]),
+    ):
+        board = make_board(((split, "mini"),), entries=3)
+        assert read_page_data(render(board)).tabs[0]["periods"] == expected
+
+    board = make_board((("curl-noise-3d", "mini"),), entries=3)
+    periods = read_page_data(render(board)).tabs[0]["periods"]
+    view = View(board.tabs[0].size.box)
+    corner = view.place(np.zeros(3))
+    for axis in range(3):
+        end = view.place(np.eye(3)[axis])
+        assert_allclose(periods[axis], end - corner, atol=1e-4)
 
 
 def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:

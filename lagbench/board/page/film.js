@@ -5,8 +5,13 @@ const TRAIL = 7;
 const TRAIL_LENGTH = 0.05;
 const quiet = matchMedia("(prefers-reduced-motion: reduce)");
 
-/** Return positions of all particles at a time between the stored frames (Catmull-Rom). */
-function positionsAt(film, count, frames, time) {
+/** Return whether a step along x and y is shorter by whole periods: then the particle left on one side and came in on the other. */
+function isWrapped(periods, x, y) {
+  return periods.some(([px, py]) => 2 * Math.abs(x * px + y * py) > px * px + py * py);
+}
+
+/** Return positions of all particles at a time between the stored frames (Catmull-Rom). A particle jumps where it leaves a periodic box. */
+function positionsAt(film, count, frames, time, periods = []) {
   const last = frames - 1;
   const at = Math.min(last, Math.max(0, time));
   const i = Math.min(last - 1, Math.floor(at));
@@ -14,8 +19,18 @@ function positionsAt(film, count, frames, time) {
   const weights = last > 0 ? [((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2, ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2] : [0, 1, 0, 0];
   const rows = [i - 1, i, i + 1, i + 2].map((k) => 2 * count * Math.min(last, Math.max(0, k)));
   const found = new Float64Array(2 * count);
-  for (let k = 0; k < found.length; k += 1) {
-    for (let j = 0; j < 4; j += 1) found[k] += weights[j] * film[rows[j] + k];
+  const isCut = (from, to) => isWrapped(periods, film[to] - film[from], film[to + 1] - film[from + 1]);
+  for (let k = 0; k < found.length; k += 2) {
+    const places = rows.map((row) => row + k);
+    if (periods.length) {
+      if (isCut(places[1], places[2])) places.fill(places[t < 0.5 ? 1 : 2]);
+      if (isCut(places[0], places[1])) places[0] = places[1];
+      if (isCut(places[2], places[3])) places[3] = places[2];
+    }
+    for (let j = 0; j < 4; j += 1) {
+      found[k] += weights[j] * film[places[j]];
+      found[k + 1] += weights[j] * film[places[j] + 1];
+    }
   }
   return found;
 }
@@ -39,8 +54,8 @@ function particleColours(materials, first) {
 
 /** Plays one film on two canvases, `pixels` wide; `ended` is called `rest` seconds after its last frame, `stop` ends it. */
 class Film {
-  constructor({ frames, materials, sides, obstacle = null }, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
-    Object.assign(this, { frames, materials, sides, obstacle, rest, ended, rested: 0 });
+  constructor({ frames, materials, sides, obstacle = null, periods = [] }, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
+    Object.assign(this, { frames, materials, sides, obstacle, periods, rest, ended, rested: 0 });
     this.time = 0;
     this.playing = false;
     this.canvases = this.sides.map(([name]) => el("canvas", { width: pixels, height: pixels, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
@@ -99,7 +114,7 @@ class Film {
     if (this.obstacle) this.paintObstacle(context, width);
     const path = [];
     for (let k = TRAIL; k >= 0; k -= 1) {
-      if (this.time - this.gap * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - this.gap * k));
+      if (this.time - this.gap * k >= 0) path.push(positionsAt(film, count, this.frames.length, this.time - this.gap * k, this.periods));
     }
     const place = (spots, k) => [width * spots[2 * k], width * (1 - spots[2 * k + 1])];
     for (let k = 0; k < count; k += 1) {
@@ -107,7 +122,12 @@ class Film {
       context.globalAlpha = 0.3;
       context.lineWidth = radius / 2;
       context.beginPath();
-      path.forEach((spots, j) => (j ? context.lineTo(...place(spots, k)) : context.moveTo(...place(spots, k))));
+      path.forEach((spots, j) => {
+        const before = path[Math.max(0, j - 1)];
+        const isCut = isWrapped(this.periods, spots[2 * k] - before[2 * k], spots[2 * k + 1] - before[2 * k + 1]);
+        if (j && !isCut) context.lineTo(...place(spots, k));
+        else context.moveTo(...place(spots, k));
+      });
       context.stroke();
       context.globalAlpha = 0.9;
       context.beginPath();
@@ -138,6 +158,7 @@ function filmOf(tab, row) {
     frames: row.pictures.filmFrames,
     materials: row.pictures.material,
     obstacle: row.pictures.obstacle,
+    periods: tab.periods,
     sides: [["truth", numbersOf(tab.truth.film)], [short(row.name), numbersOf(row.pictures.film)]],
   };
 }

@@ -21,7 +21,7 @@ function setHero(tab) {
 function heroFilm(tab, leader, isFirst) {
   if (!isFirst) return filmOf(tab, leader);
   const { frames, material, films, obstacle } = BOARD.hero;
-  return { frames, materials: material, obstacle, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
+  return { frames, materials: material, obstacle, periods: tab.periods, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
 }
 
 function drawHero(tab, isFirst) {
