@@ -194,8 +194,10 @@ def main() -> int:
         "weights do not change the time. "
         f"Their options come from the recipes for {SPLIT} {SIZE}.\n\n"
         f"The box holds {PARTICLES:,} q^2 particles: q multiplies the number of "
-        "particles along each axis. A power of the number of particles was fitted to "
-        "the times of each model. The last row shows its exponent; 1 means that the "
+        "particles along each axis. The number of cells of `neuralmpm` along each axis "
+        "is multiplied by q, and the connectivity radius of `gns` is divided by q. So "
+        "a particle has as many neighbours as at q = 1. A power of the number of "
+        "particles was fitted to the times of each model. The last row shows its exponent; 1 means that the "
         "time grows linearly."
     )
     heads = ("q", "particles", *MODELS)

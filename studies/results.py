@@ -151,9 +151,9 @@ command, this command trains the models. Then `lagbench submit` makes the entrie
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-Each of these questions compares a model with one or two others. On no data set of the
-thesis do the model and one of the others have entries that count, so the questions have
-no answer:"""
+Each of these questions compares a model with one or two others. To answer it, the model
+and one of the others need entries that count on the same data set. No data set of the
+thesis has such entries, so these questions have no answer:"""
 
 TRAINING_NOTE = """\
 The three validation columns show the first seed. They have the lowest validation error
