@@ -197,8 +197,8 @@ def main() -> int:
         "particles along each axis. The number of cells of `neuralmpm` along each axis "
         "is multiplied by q, and the connectivity radius of `gns` is divided by q. So "
         "a particle has as many neighbours as at q = 1. A power of the number of "
-        "particles was fitted to the times of each model. The last row shows its exponent; 1 means that the "
-        "time grows linearly."
+        "particles was fitted to the times of each model. The last row shows its "
+        "exponent; 1 means that the time grows linearly."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)
