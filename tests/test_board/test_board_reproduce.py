@@ -289,7 +289,7 @@ def test_a_model_that_gives_other_scores(own: ModelBoard) -> None:
     assert printed.exit_code == ChecksFailedError.exit_code
     assert "NOT reproduced" in printed.stdout
     text = " ".join(printed.stdout.split())
-    assert "fix: if the predictions are of other weights" in text
+    assert "fix: if the predictions were made with other weights" in text
     for part in ("lagbench predict FILE --split", "lagbench submit", "--replace"):
         assert part in text
 
