@@ -7,7 +7,7 @@ Taichi's own mpm128 example: one kernel launch per substep, every phase a parall
 float32 sums by atomics, Taichi's default fast math. Its sums depend on
 the order of threads, so no two runs agree to the bit.
 
-    python benchmarks/conventional.py --grid 40 --threads 1 --substeps 2000
+    PYTHONPATH=. python benchmarks/conventional.py --grid 40 --threads 1 --substeps 2000
 
 prints one JSON object: particle-substeps per second of wall time and core, and per
 second of processor time (best of the repeats), and the mean kinetic energy per particle

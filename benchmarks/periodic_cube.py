@@ -2,7 +2,7 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """Our solver and conventional Taichi code on a periodic cube, alternately in one run.
 
-    python benchmarks/periodic_cube.py --grid 16 --substeps 200 --rounds 3
+    PYTHONPATH=. python benchmarks/periodic_cube.py --grid 16 --substeps 200 --rounds 3
 
 The conventional side has the equations of ``generators/nodal_stress_nd.py``, written
 after Taichi's own mpm88 example: one launch per substep, every phase a parallel loop,

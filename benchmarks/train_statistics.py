@@ -1,6 +1,6 @@
 """Print the statistics of train of every split beside those of the thesis.
 
-    python benchmarks/train_statistics.py [--size full]
+    PYTHONPATH=. python benchmarks/train_statistics.py [--size full]
 
 Per-frame velocity x(f) - x(f-1) and acceleration (second difference), mean and standard
 deviation over all train scenarios, from datasets.yaml. Table 5.3 of the thesis is

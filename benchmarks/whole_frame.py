@@ -1,7 +1,7 @@
 """Our solver on the cavity that ``conventional.py`` runs: one core, strict, fixed-point
 sums.
 
-    python benchmarks/whole_frame.py --grid 40 --substeps 2000
+    PYTHONPATH=. python benchmarks/whole_frame.py --grid 40 --substeps 2000
 
 prints one JSON object: particle-substeps per second of wall time and core, and per
 second of processor time (best of the repeats), and the mean kinetic energy per particle
