@@ -119,7 +119,7 @@ class StressAccelerations(Accelerations):
 
     @property
     def channels(self) -> int:
-        """In each frame three of each material's stress, and two of a push of walls."""
+        """Components of the stress of each material and of the push of walls."""
         return self._stress_channels + 2 * self.frames
 
     @property

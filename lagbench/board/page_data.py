@@ -146,9 +146,9 @@ def _add_film(film: Floats32, arrays: ArrayStore) -> Reference:
 
 
 def _picture_periods(box: Box) -> list[list[float]]:
-    """Return how far a period leads in a picture, for each periodic axis.
+    """Return the step of a period in a picture, for each periodic axis of the box.
 
-    Along x and y, in sides of the picture.
+    Shape [periodic axis, 2], along x and y, in sides of the picture.
     """
     periods = []
     for axis, is_periodic in enumerate(box.periodic):
