@@ -196,7 +196,7 @@ After this page you know how small a difference the test can find.
 `lagbench.metrics.differ`. This page answers two questions about the test:
 
 - How often does the test find a difference that exists?
-- How often does the test find a difference between two seeds of the same method?
+- How often does the test find a difference between seeds of the same method?
 
 This command writes the page:
 
@@ -214,14 +214,15 @@ three terms are random:
 - c_s belongs to the seed (column "seed").
 - e_si is the rest (column "rest").
 
-The model has no term that both methods share in a scenario. In the difference of the
-methods such a term would count only in proportion to the difference of their means.
+A scenario may be harder for both methods. The model leaves this out, because it nearly
+cancels in the difference of the methods.
 
 The table shows the standard deviations of b_i, c_s and e_si.
 
 **Rows.** The first three rows use assumed standard deviations. The other rows have the
 names of splits. They use standard deviations that we measured from the score files of
-size mini in leaderboard/scores. (Score files of entries that are not active count too.)
+size mini in leaderboard/scores. (Score files of entries that are not
+[active](glossary.md) count too.)
 
 The measurement needs two methods whose means differ by less than a factor of two. At
 least one of these methods must have several seeds. A split without such methods has
@@ -242,9 +243,9 @@ small differences ranks by chance.
 
 ## Differences between equal methods
 
-In this table both sides are seeds of the same method. So the test should find a
-difference in at most 5 % of the draws. A share of 5 % has a statistical error of 1.4
-percentage points (95 % interval).
+In this table both sides are seeds of the same method. If both sides have several seeds,
+the test should find a difference in at most 5 % of the draws. A share of 5 % has a
+statistical error of 1.4 percentage points (95 % interval).
 
 With one seed on each side the test is the
 [sign-flip test](scoring.md#comparing-two-methods) over scenarios. The two seeds are two

@@ -113,7 +113,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "score": BoardCheck(
         "a score in the entry that disagrees with its score files; a diverged rollout "
-        "that the entry states and the score files cannot have",
+        "in the entry that contradicts the score files",
         "the score block is not what the score files give",
         "what the score files give",
     ),
