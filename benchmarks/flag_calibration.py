@@ -11,8 +11,8 @@ average.
     python benchmarks/flag_calibration.py --size mini --root DATA [--splits
         cavity,fluid] [--trained runs/cavity/mini/gns-0/predictions.nc ...]
 
-``--trained`` adds predictions of trained models to the honest ones, on the splits and
-the size that are named.
+``--trained`` also prints the values of trained models, in lines of their own. Their
+predictions must be of the splits and the size that are named.
 
 The thresholds in lagbench/scoring/flags.py lie between the extremes that this prints.
 """

@@ -337,8 +337,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
     perturbed_runs = (
-        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all), "
-        f"{HORIZON} of the {frames} frames of each"
+        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all); "
+        f"each has {HORIZON} frames, the horizon of fluid full"
     )
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {

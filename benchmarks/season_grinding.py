@@ -152,7 +152,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gain_head.append(f"gain, best of {tries:,}")
     swap_head = ["data set", "leading entry", "second entry", "lead in skill"]
     for tries in options.tries:
-        swap_head.append(f"second leads in any of {tries:,}")
+        draws = "1"
+        if tries > 1:
+            draws = f"any of {tries:,}"
+        swap_head.append(f"second leads in {draws}")
     gain_table = markdown(gain_head, gains)
     swap_table = markdown(swap_head, swaps)
     sys.stdout.write(f"{gain_table}\n\n")

@@ -221,8 +221,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         f"The table compares two solvers: ours, run {ours}, and that of the thesis, "
         "run on the GPU of its author. (`lagbench cite cavity` names the thesis.) The "
         "particles, the grid and the substeps per frame of each row are those of Table "
-        "3.1 of the thesis. q is its quality factor: the number of particles grows "
-        "roughly as q^2.",
+        "3.1 of the thesis. The thesis calls q the quality factor: the number of "
+        "particles grows roughly as q^2.",
         "",
         f"Each of our times is the shortest of {repeats} runs, {clock}. fps is the "
         "number of frames per second. t/frame is the time of a run with all substeps "

@@ -185,8 +185,8 @@ def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
     """Return which solvers a model beats that is cheaper than all of them."""
     name_of_model = label(model)
     sentence = (
-        f"On {results.where} no classical solver is as cheap as {name_of_model}, the"
-        " best model."
+        f"On {results.where} there is no verdict, because no classical solver is as"
+        f" cheap as the best model, {name_of_model}."
     )
     error = results.methods[model].scores[results.ranking].mean
     behind = []
@@ -297,7 +297,7 @@ def training_table(all_results: Sequence[SplitResults]) -> str:
         "validation at 1/4",
         "1/2",
         "1",
-        "last doubling",
+        "decrease in the second half",
     )
     rows = []
     for results in all_results:

@@ -61,9 +61,9 @@ On this page you can look up three things: how well the reference models predict
 data set, which claims of the thesis are true on our data, and the cost of the
 trainings. (The thesis is D. Dharma, PhD thesis, University of Leeds, 2025.)
 
-The first table has the best model of each data set. Then follow the claims, the
-trainings, and one chapter per data set. A chapter has all models, with the numbers of
-the thesis beside ours."""
+The first table has the best learned model and the best hybrid of each data set. Then
+follow the claims, the trainings, and one chapter per data set. A chapter has all
+models, with the numbers of the thesis beside ours."""
 
 SUMMARY_NOTE = """\
 Each row compares the best learned model, or the best hybrid, of a data set with the
@@ -141,8 +141,9 @@ over the horizon:
 The answers compare two models over the seeds that both have. If there are no such
 seeds, or if one of the models draws no random numbers, the answers use all seeds of
 both. They leave out models that fail a [gate](baselines.md#gates), and superseded and
-withdrawn entries. If an operator has an entry with the recipe `pushforward`, the
-answers use this entry."""
+withdrawn entries. If an operator has an entry that is named after it, with
+", pushforward" at the end, the answers use this entry. It was trained with the recipe
+`pushforward`, or with the options of that recipe."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. If a line has a
@@ -201,8 +202,8 @@ folder of runs. The second file is the output of
 `python -m studies.thesis.var_protocol --size mini --json`. Save it as
 `fluid/mini/var_protocol.json` in one of the two folders.
 
-A variant is a model with other options, with another recipe, or with another way of
-prediction:"""
+`python -m studies.thesis` also has the following models. Each line has the name of a
+model in this program, and the options that make the model:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -314,9 +315,10 @@ def _chapter(results: SplitResults) -> Iterator[str]:
 
     if size.split in TABLE_4_8:
         yield (
-            "This table has two errors for each scene, as Table 4.8 of the thesis: "
+            "This table has two errors for each scene, like Table 4.8 of the thesis: "
             "`average` is `mse_avg` of the scenario, and `end` is its `mse_end`. A "
-            "cell is our value / the value of the thesis."
+            "cell is our value / the value of the thesis. Our scenario is not the one "
+            "of the thesis, but our first test scenario of the same scene."
         )
         yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
     elif size.split in EXPECTED:
@@ -336,9 +338,9 @@ def _chapter(results: SplitResults) -> Iterator[str]:
 def _vorticity_note(results: SplitResults) -> str:
     note = (
         "This table has the metrics of the vorticity at frame "
-        f"{key_frame(results.size)}, as Tables 5.4, 5.5 and Fig. 5.13 of the thesis. A "
-        "cell is the mean over test scenarios, with the first test scenario (T0) in "
-        "brackets"
+        f"{key_frame(results.size)}. Tables 5.4 and 5.5 and Fig. 5.13 of the thesis "
+        "have the same metrics. A cell is the mean over test scenarios, with the first "
+        "test scenario (T0) in brackets"
     )
     if results.size.split == "cavity":
         return f"{note}. The thesis has only T0: compare it with the brackets."

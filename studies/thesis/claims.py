@@ -65,7 +65,7 @@ _CLAIMS = {
         metrics=("position_rmse", "energy_error"),
         at_key_frame=("vorticity_pearson",),
     ),
-    "Is SuperGAT better with summed messages than without?": Claim(
+    "Is SuperGAT better if each particle also receives the sum of its messages?": Claim(
         "supergat", ("supergat-unsummed",)
     ),
     "Is SuperGAT better with MX attention than with scaled dot products (SD)? (Eq. "
@@ -86,8 +86,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials, without more training "
-    "steps than with one grid per material?": Claim(
+    "Does NeuralMPM gain by one velocity grid for all materials instead of one per "
+    "material, with at most as many training steps?": Claim(
         "neuralmpm", ("neuralmpm-unmixed",)
     ),
     "Does NeuralMPM gain by three changes together: momentum is conserved, bundles "

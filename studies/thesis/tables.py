@@ -110,7 +110,7 @@ def rollout_table(results: SplitResults, printed: Sequence[RolloutErrors]) -> Ta
                 cells.append(f"{number(error)} / {number(thesis_error, 4)}")
         rows.append(tuple(cells))
 
-    heads = ["thesis's id", "scene", "our id"]
+    heads = ["thesis's id", "scene", "id of our scenario"]
     for column in ("average", "end"):
         for name in names:
             heads.append(f"{column}, {label(name)}")

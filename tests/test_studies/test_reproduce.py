@@ -279,14 +279,14 @@ def test_the_page_shows_models_skill_and_training(sources: Sources) -> None:
     assert rows[0]["skill"] == "-"  # no naive baseline was scored
     assert "0.007715" in page  # SuperGAT's MAE in Table 5.4
     trainings = {}
-    for row in markdown_rows(page, "last doubling"):
+    for row in markdown_rows(page, "decrease in the second half"):
         trainings[row["model"]] = row
     training = trainings["GNS"]
     assert training["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
     assert training["validation at 1/4"] == "4"
     assert training["1/2"] == "2"
     assert training["1"] == "0.5"
-    assert training["last doubling"] == "75 %"
+    assert training["decrease in the second half"] == "75 %"
     for row in markdown_rows(page, "the first is"):
         assert row["the first is"] == "too few scenarios"
     assert page == page_of(sources)

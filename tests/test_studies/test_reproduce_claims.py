@@ -451,7 +451,7 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     row = table.rows[1]
     circle = dict(zip(table.columns, row, strict=True))
     assert circle["thesis's id"] == "26"
-    assert circle["our id"] == "38"
+    assert circle["id of our scenario"] == "38"
     assert circle["average, MLP"] == f"{ids.index(38)} / 2.127"
     assert circle["average, LSTM"] == "- / 3.583"
 
