@@ -261,7 +261,8 @@ the seeds of the first side is still unknown.
 {false_rows}
 
 The rows *middling* and *large* are equal. All standard deviations of *large* are twice
-those of *middling*, and the test does not depend on the scale of the scores.
+those of *middling*, so all differences are twice as large. The test does not depend on
+the scale of the differences.
 
 The leaderboard has {pair_count} pairs of two seeds of the same method at size mini:
 {pairs_by_split}. The test finds a difference, at 5 %, in
