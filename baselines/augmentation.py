@@ -45,7 +45,7 @@ class Symmetry(enum.StrEnum):
 
     NONE = "none"
     MIRROR = "mirror"
-    """x -> -x about the middle of the box, in 3-D z -> -z too: any split."""
+    """x -> -x about the middle of the box, in 3-D z -> -z too: not with a stream."""
     SQUARE = "square"
     """All eight images of the square, or 48 of the cube: splits without gravity."""
 
@@ -53,10 +53,9 @@ class Symmetry(enum.StrEnum):
 def check_symmetry(
     symmetry: object, size: Size, *, find_forcing: Callable[[], Collection[str]]
 ) -> None:
-    """Refuse all images of the square where some of them are no motion of the split.
+    """Refuse mirror images that are no motion of the split.
 
-    Mirror images alone are possible everywhere. A split whose description names no
-    gravity, as an imported one may, passes.
+    A split whose description names no gravity, as an imported one may, passes.
 
     Args:
         symmetry: the images that are asked for.
@@ -65,9 +64,20 @@ def check_symmetry(
             the data, so it is called only where the answer counts.
 
     Raises:
-        UsageError: all images of the square are asked for where gravity or a force on
-            layers acts, or where only some axes are periodic.
+        UsageError: mirror images are asked for where a stream flows along x; or all
+            images of the square where gravity or a force on layers acts, or where only
+            some axes are periodic.
     """
+    has_stream = "fringe_rate" in size.parameters
+    if has_stream and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
+        raise UsageError(
+            f"the stream in {size.split} flows along x; in a mirror image it would "
+            "flow backwards",
+            where="model.symmetry",
+            expected=str(Symmetry.NONE),
+            got=str(symmetry),
+            fix="set model.symmetry=none",
+        )
     if symmetry != Symmetry.SQUARE:
         return
     if len(set(size.box.periodic)) > 1:
@@ -220,7 +230,7 @@ def _draw_solid_matrices(
 
 
 def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
-    """Return the mirror image of each window about the middle of the box.
+    """Return an image of each window: mirrored or turned about the middle of the box.
 
     Args:
         batch: windows.
@@ -262,10 +272,10 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     if walls is not None:
         # A wall takes the place of the wall to which its mirrored normal points.
         permutation = wall_permutation(matrix)
-        old_wall = permutation.argmax(dim=2)
+        source_wall = permutation.argmax(dim=2)  # shape [window, wall of the image]
         walls = _multiply(matrix[:, None, None], walls)
-        old_walls = old_wall[:, None, :, None].expand_as(walls)
-        walls = walls.gather(2, old_walls)
+        source_walls = source_wall[:, None, :, None].expand_as(walls)
+        walls = walls.gather(2, source_walls)
     force = batch.body_force
     if force is not None:
         force = _mirror_force(force, matrix)

@@ -107,18 +107,19 @@ class ParticleGrid(nn.Module):
         return places.to(torch.float32)
 
     def _periodic_places(
-        self, interval: tuple[float, float], multiple: int
+        self, interval: tuple[float, float], divisor: int
     ) -> tuple[float, Tensor]:
         """Return a cell's width and the nodes' places along a periodic axis [length].
 
-        The number of nodes is the multiple that is nearest to the number of spacings in
-        the period. It is at least three: so many nodes a particle touches.
+        The number of nodes is the multiple of ``divisor`` that is nearest to the number
+        of spacings in the period. It is at least three, because a particle touches
+        three nodes, which must be different ones.
         """
         low, high = interval
         period = high - low
-        nearest_multiples = round(period / self.spacing / multiple)
-        fewest_multiples = math.ceil(3 / multiple)
-        nodes = multiple * max(nearest_multiples, fewest_multiples)
+        nearest_multiples = round(period / self.spacing / divisor)
+        fewest_multiples = math.ceil(3 / divisor)
+        nodes = divisor * max(nearest_multiples, fewest_multiples)
 
         width = period / nodes
         numbers = torch.arange(nodes, dtype=torch.float64)

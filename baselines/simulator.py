@@ -331,8 +331,8 @@ class GraphNetworkOptions(Options):
     # how far matter acts on matter; walls act half as far [radius]. A body that nothing
     # reaches gets one learned mean acceleration. None leaves it to the network.
     free_flight: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    # keep particles in the box, and their velocities true to that, in training and in
-    # rollouts
+    # keep particles in the box and out of the obstacle, and their velocities true to
+    # that, in training and in rollouts
     clamp: bool = True
     # iterations after each step of a rollout that move crowded particles apart; 0 for
     # none

@@ -63,7 +63,7 @@ BASELINE = "ballistic-analog"  # the best naive predictor of both, to be beaten
 SPLITS = ("fluid", "multimaterial", "fluid-3d", "multimaterial-3d")
 SIZES = ("mini", "full")
 STRIDE = 4  # frames between the states that are compared
-LAST_STATE = 2 / 3  # share of a scenario's frames within which a state may lie
+STATE_SHARE = 2 / 3  # share of a scenario's frames within which a state may lie
 # Every so many particles count when parameters are chosen, by dimension.
 THINNING = {2: 4, 3: 16}
 MEASURED_EVERY = 10  # frames between those at which the metric is measured
@@ -247,7 +247,7 @@ class Library:
                 if not set(kinds) <= set(present):
                     continue
 
-                end = int(LAST_STATE * len(image))
+                end = int(STATE_SHARE * len(image))
                 for frame in range(1, end, STRIDE):
                     before = image[frame - 1]
                     position = image[frame]
@@ -387,6 +387,10 @@ class Predictors:
         return clouds
 
     def _flown(self, case: AnalogCase, choice: Choice) -> int:
+        """Return the frames of free flight: until the first contact, and ``lag`` more.
+
+        Analogs take over then.
+        """
         horizon = len(case.given.predicted_frames)
         lag = int(choice.get("lag", 0))
         return min(horizon, case.flight + lag)
@@ -479,7 +483,10 @@ class Predictors:
         return self._after_flight(case, flown, follow)
 
     def per_material(self, case: AnalogCase, choice: Choice) -> Clouds:
-        """Every material has analogs of its own, with any company."""
+        """Every material has analogs of its own.
+
+        They may have other materials too, unless the case has one material only.
+        """
         flown = self._flown(case, choice)
         position, _ = case.flown(flown)
         followers = []
@@ -819,7 +826,7 @@ def _attempts_with_other_analogs(predictors: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="from-the-start",
-            what="mixture of the k scenarios with the most similar start",
+            what="mixture of the k mirrored scenarios with the most similar start",
             predict=predictors.from_the_start,
             choices=grid(
                 analogs=(1, 2, 4, 8),

@@ -78,8 +78,10 @@ def test_exponents(timed_rows: list[table_3_1.TimedRow], tmp_path: Path) -> None
 
 
 def test_the_thesis_exponents_follow_from_its_table() -> None:
-    """Its text gives 1.41 for t/frame against q^2; against particles 1.35, per substep
-    0.83.
+    """Compare with the exponents in the text of the thesis.
+
+    They are 1.41 (t/frame against q^2), 1.35 (t/frame against particles) and 0.83
+    (t/substep against particles).
     """
     thesis = table_3_1.exponents_of_thesis()
     assert thesis.frame_q2 == pytest.approx(1.41, abs=0.01)

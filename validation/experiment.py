@@ -478,7 +478,7 @@ def run(
                 result.displacement_energy.append(energy)
             last_position = position
         if done == end or (done > 0 and done % CHECK_EVERY == 0):
-            result.checks.append(_check_state(solver, experiment, box, done))
+            result.checks.append(_measure_state(solver, experiment, box, done))
         report(done)
 
     if experiment.case is Case.CAVITY:
@@ -517,10 +517,10 @@ def _interior(parameters: ClosedBoxParameters) -> slice:
     return slice(parameters.wall + 1, parameters.grid - parameters.wall)
 
 
-def _check_state(
+def _measure_state(
     solver: ClosedBox, experiment: Experiment, box: diagnostics.SquareBox, substep: int
 ) -> AcceptanceCheck:
-    """Return the state of the box now."""
+    """Measure J, the particles per cell and the velocity gradients of the box."""
     position = solver.position()[0]
     jacobian = solver.jacobian()[0]
     outside_corners = jacobian

@@ -513,13 +513,13 @@ def _predictions(row: BoardRow) -> Iterator[Plain]:
         seed = MISSING
         if prediction.seed is not None:
             seed = str(prediction.seed)
-        length = MISSING
+        size = MISSING
         if prediction.bytes is not None:
-            length = f"{text(prediction.bytes / 1e6)} MB"
+            size = f"{text(prediction.bytes / 1e6)} MB"
         yield {
             "seed": seed,
             "mean": text(mean),
-            "size": length,
+            "size": size,
             "sha256": prediction.sha256,
             "url": prediction.url,
             "path": prediction.path,

@@ -39,11 +39,14 @@ class PublicValues:
     source: Path  # the file with the measured values
 
     def find_difference(self) -> tuple[str, str] | None:
-        """Return the first value that is stated otherwise, and the one measured."""
+        """Return the first value that differs, as stated and as measured.
+
+        Both texts name the scenario. None where all values agree.
+        """
         for scenario in sorted({*self.stated, *self.measured}):
             stated = self.stated.get(scenario)
             measured = self.measured.get(scenario)
-            if not _is_same(stated, measured):
+            if not _agree(stated, measured):
                 return _describe(scenario, stated), _describe(scenario, measured)
         return None
 
@@ -160,7 +163,7 @@ def _issue_of_difference(
     )
 
 
-def _is_same(stated: float | None, measured: float | None) -> bool:
+def _agree(stated: float | None, measured: float | None) -> bool:
     if stated is None or measured is None:
         return False
     return math.isclose(stated, measured, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-300)

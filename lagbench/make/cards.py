@@ -190,7 +190,7 @@ def dataset_card(
 
 
 def _yaml_head(size: Size, split: Split, manifest: Manifest) -> str:
-    """Return what catalogues read of a card; JSON strings and lists are YAML."""
+    """Return the YAML head of a card, which catalogues read."""
     category = "1K<n<10K"
     if len(manifest.files) < 1000:
         category = "n<1K"
@@ -203,6 +203,7 @@ def _yaml_head(size: Size, split: Split, manifest: Manifest) -> str:
     }
     lines = ["---"]
     for key, value in values.items():
+        # JSON strings and lists are YAML, too
         lines.append(f"{key}: {json.dumps(value, ensure_ascii=False)}")
     lines.append("---")
     return "\n".join(lines)

@@ -60,17 +60,18 @@ def build_registered(
 def export_safetensors(
     model: Baseline, path: str | Path, *, baseline: str, seed: int = 0, step: int = 0
 ) -> Path:
-    """Write a trained model as a file of safetensors that an entry can carry.
+    """Write a trained model as a file of safetensors, for an entry of a leaderboard.
 
     Args:
         model: a model of :func:`build_registered`.
         path: file to write, named ``.safetensors``.
         baseline: name of its architecture.
-        seed: seed of the training.
-        step: steps of the training.
+        seed: seed of the training; not negative.
+        step: steps of the training; not negative.
 
     Raises:
-        UsageError: the file has another suffix.
+        UsageError: the file has another suffix, no such architecture is installed, or
+            the seed or the step is negative.
         UnreadableFileError: weights are not finite, the model is of another
             architecture, or the file is longer than an entry may carry.
         WorkFailedError: the file cannot be written.
@@ -84,14 +85,23 @@ def export_safetensors(
             got=target.name,
             fix=f"name it {target.stem}{SUFFIX}",
         )
+    for name, number in (("seed", seed), ("step", step)):
+        if number < 0:
+            raise UsageError(
+                f"a negative {name}",
+                where=name,
+                expected="a whole number from 0 on",
+                got=number,
+                fix=f"give the {name} of the training",
+            )
     checkpoint = Checkpoint(
         baseline=baseline,
         options=model.options.model_dump(mode="json"),
         info=model.info,
         weights=model.state_dict(),
         training={
-            "step": step,
-            "recipe": {"name": RECIPE, "training": {"seed": seed}},
+            "step": int(step),
+            "recipe": {"name": RECIPE, "training": {"seed": int(seed)}},
         },
     )
     restore(checkpoint, where=str(target))

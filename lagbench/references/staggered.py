@@ -258,7 +258,10 @@ class StaggeredGrid:
         return padded
 
     def _laplacian(self, padded: Floats) -> Floats:
-        """Return lap u of a component with ghosts, without them [1/(length s)]."""
+        """Return the Laplacian of a component that is padded with ghosts.
+
+        The result has no ghosts [1/(length s)].
+        """
         core = (slice(1, -1),) * self.dimension
         here = padded[core]
         total = np.zeros(here.shape)

@@ -44,7 +44,7 @@ STATE_STRIDE = 2
 UP = 1
 """Axis along which matter falls."""
 
-LAST_STATE = 2 / 3
+STATE_SHARE = 2 / 3
 """Share of a scenario's frames within which a state may lie; the rest is its future."""
 
 
@@ -164,7 +164,7 @@ def describe_state(
 
 @dataclass(frozen=True, eq=False)
 class StateLibrary:
-    """States of train under all mirror images, and what follows each of them."""
+    """States of train under all mirror images, and how they look."""
 
     scenarios: NDArray[np.intp]  # scenario id of each state, shape [state]
     mirrors: NDArray[np.intp]  # number of its mirror image, shape [state]
@@ -205,6 +205,9 @@ def state_library(
     """Return the states of all scenarios of train that have just these materials.
 
     None where there is none. Libraries are kept for the next call.
+
+    Raises:
+        DataError: no scenario of train is as long as the task.
     """
     kinds = tuple(sorted(int(kind) for kind in materials))
     key = (size.folder(root), kinds)
@@ -224,7 +227,7 @@ def _build_library(
         motion = read_train_scenario(size.path(root, scenario))
         if tuple(np.unique(motion.material).tolist()) != kinds:
             continue
-        end = int(LAST_STATE * len(motion.position))  # LAST_STATE is a share
+        end = int(STATE_SHARE * len(motion.position))
         for number, mirror in enumerate(mirrors_of(size)):
             image = mirror.positions(motion.position.astype(np.float64))
             for frame in range(1, end, STATE_STRIDE):

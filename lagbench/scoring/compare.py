@@ -821,10 +821,15 @@ def _score_files(folder: Path) -> list[Path]:
 
 
 def _numbered_files(path: Path) -> list[Path]:
-    """Return a leaderboard's files of the seeds of a method, by name without number."""
+    """Return the score files of all seeds of a method on a leaderboard.
+
+    The path is the name that they share, without the number of a seed. For any other
+    path there are none.
+    """
     place = path
     with suppress(OSError):  # the working folder is gone
         place = Path(os.path.abspath(path))
+    # as in scores/cavity/mini/method.nc
     is_on_board = path.suffix == ".nc" and place.parts[-4:-3] == ("scores",)
     if not is_on_board or os.path.lexists(path):
         return []

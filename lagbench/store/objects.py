@@ -433,6 +433,7 @@ class Objects:
         prefix = self._path.rstrip("/") + "/"
         lengths = {}
         for path, details in objects.items():
+            # An object with the folder's own name does not lie in it.
             if path.startswith(prefix):
                 lengths[path.removeprefix(prefix)] = int(details["size"])
         return lengths

@@ -501,7 +501,13 @@ class WindowReader:
         return self.size.viscosity()
 
     def place(self, index: int) -> tuple[int, int]:
-        """Return scenario id and first frame of a window."""
+        """Return scenario id and first frame of a window.
+
+        Negative numbers count from the end.
+
+        Raises:
+            IndexError: there is no such window.
+        """
         index = operator.index(index)
         if not -len(self) <= index < len(self):
             raise IndexError(f"no window {index} among {len(self)}")

@@ -269,13 +269,13 @@ def _needed_models(
 ) -> list[tuple[str, str]]:
     """Return split and name of every model that items need.
 
-    With a split, all models that the roster has for it are added.
+    With a split, all models that it is expected to have are added.
     """
     needed: dict[tuple[str, str], None] = {}  # a set that keeps its order
     for item in items:
-        for where, names in item.needs.items():
+        for needed_split, names in item.needs.items():
             for name in names:
-                needed[where, name] = None
+                needed[needed_split, name] = None
     if split:
         for name in EXPECTED.get(split, ()):
             needed[split, name] = None

@@ -451,3 +451,14 @@ def test_axes_with_other_ends_do_not_change_places() -> None:
         check_symmetry("square", half, find_forcing=frozenset)
     assert caught.value.where == "model.symmetry"
     check_symmetry("mirror", half, find_forcing=frozenset)
+
+
+@pytest.mark.parametrize("symmetry", ["mirror", "square"])
+def test_a_stream_has_no_mirror_images(symmetry: str) -> None:
+    size = load().size("cylinder", "tiny")
+    with pytest.raises(UsageError) as caught:
+        check_symmetry(symmetry, size, find_forcing=frozenset)
+    assert caught.value.where == "model.symmetry"
+    assert caught.value.fix == "set model.symmetry=none"
+    check_symmetry("none", size, find_forcing=frozenset)
+    check_symmetry(None, size, find_forcing=frozenset)

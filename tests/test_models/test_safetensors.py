@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from conftest import SIZE, SPLIT
@@ -121,6 +122,12 @@ def test_what_cannot_be_exported_is_refused(
         export_safetensors(model, tmp_path / "model.pt", baseline="gns")
     with pytest.raises(UnreadableFileError):
         export_safetensors(model, tmp_path / "a.safetensors", baseline="neuralmpm")
+    for negative in ("seed", "step"):
+        with pytest.raises(UsageError) as caught:
+            export_safetensors(
+                model, tmp_path / "a.safetensors", baseline="gns", **{negative: -1}
+            )
+        assert caught.value.where == negative
     next(model.parameters()).data[:] = torch.nan
     with pytest.raises(UnreadableFileError):
         export_safetensors(model, tmp_path / "a.safetensors", baseline="gns")
@@ -128,6 +135,21 @@ def test_what_cannot_be_exported_is_refused(
 
 
 @pytest.mark.slow
+def test_seed_and_step_may_be_integers_of_numpy(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    path = export_safetensors(
+        small_model(generated),
+        tmp_path / "a.safetensors",
+        baseline="gns",
+        seed=np.int64(3),
+        step=np.int32(5),
+    )
+    training = load(path).training
+    assert training["step"] == 5
+    assert training["recipe"]["training"]["seed"] == 3
+
+
 def test_an_entry_carries_a_file_of_safetensors(
     tmp_path: Path, sound: Path, generated: GenerationResult
 ) -> None:

@@ -136,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _import_libraries() -> None:
-    """Import what commands import, so that forks need not."""
+    """Import what commands import, so that forks need not; torch gets one thread."""
     import netCDF4  # noqa: F401
     import onnxruntime  # noqa: F401
     import torch
