@@ -826,7 +826,8 @@ def _attempts_with_other_analogs(predictors: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="from-the-start",
-            what="mixture of the k mirrored scenarios with the most similar start",
+            what="mixture of the k scenarios or mirror images with the most similar "
+            "start",
             predict=predictors.from_the_start,
             choices=grid(
                 analogs=(1, 2, 4, 8),

@@ -125,9 +125,8 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "training": BoardCheck(
         "a training on windows of `test` or `shift`; a `kind: classical` with "
-        "predictions of a trained model; an entry that stores weights which were "
-        "trained on another data set or size (weights that another entry stores may be "
-        "of another size)",
+        "predictions of a trained model; an entry whose own weights were trained "
+        "on another data set or size (only shared weights may be of another size)",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",
