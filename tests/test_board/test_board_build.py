@@ -425,33 +425,34 @@ def test_variants_follow_from_names() -> None:
     }
 
 
-TWO_DATA_SETS = ("poiseuille", "decaying-vortices")
+TWO_SPLITS = ("poiseuille", "decaying-vortices")
 
 
 @pytest.fixture
-def two_tabs(tmp_path: Path) -> Path:
-    """A copy of two data sets of the committed leaderboard."""
+def two_splits(tmp_path: Path) -> Path:
+    """A copy of the data sets of two splits of the committed leaderboard."""
     board = tmp_path / "board"
     for folder in ("submissions", "scores", "weights"):
-        for split in TWO_DATA_SETS:
+        for split in TWO_SPLITS:
             shutil.copytree(COMMITTED / folder / split, board / folder / split)
     return board
 
 
 @pytest.mark.slow
 def test_workers_form_the_same_page(
-    two_tabs: Path, monkeypatch: pytest.MonkeyPatch
+    two_splits: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tabs of worker processes give the bytes of those that are formed here."""
-    here = build(two_tabs)
+    here = build(two_splits)
     page_of_here = here.page.read_bytes()
     here.page.unlink()
     started = []
     monkeypatch.setattr(board_build, "FEWEST_FOR_WORKERS", 1)
     monkeypatch.setattr(board_build, "available_cores", lambda: started.append(2) or 2)
-    by_workers = build(two_tabs)
+    by_workers = build(two_splits)
     assert started
-    assert by_workers.tabs == len(TWO_DATA_SETS)
+    data_sets = list(two_splits.glob("submissions/*/*"))
+    assert by_workers.tabs == len(data_sets)
     assert by_workers.page.read_bytes() == page_of_here
 
 
@@ -464,24 +465,24 @@ def two_workers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("two_workers")
-def test_a_worker_names_a_damaged_score_file(two_tabs: Path) -> None:
+def test_a_worker_names_a_damaged_score_file(two_splits: Path) -> None:
     """An error in a worker process is that of this process."""
-    damaged = next(two_tabs.glob("scores/poiseuille/*/*.nc"))
+    damaged = next(two_splits.glob("scores/poiseuille/*/*.nc"))
     damaged.write_bytes(damaged.read_bytes()[:5000])
     with pytest.raises(UnreadableFileError) as caught:
-        build(two_tabs)
+        build(two_splits)
     assert caught.value.where == str(damaged)
-    assert not (two_tabs / "index.html").exists()
+    assert not (two_splits / "index.html").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("two_workers")
 def test_workers_name_a_broken_package_once(
-    two_tabs: Path, package: Callable[..., Path]
+    two_splits: Path, package: Callable[..., Path]
 ) -> None:
     package("metrics", "broken_metric:METRICS", "raise KeyError('mine')\n")
     with warnings.catch_warnings(record=True, action="default") as caught:
-        build(two_tabs)
+        build(two_splits)
     (warning,) = caught
     assert warning.category is PluginWarning
     assert "mine adds no metric" in str(warning.message)
@@ -490,14 +491,14 @@ def test_workers_name_a_broken_package_once(
 @pytest.mark.slow
 @pytest.mark.usefixtures("two_workers")
 def test_a_lost_worker_is_no_finding_of_the_check(
-    two_tabs: Path, package: Callable[..., Path]
+    two_splits: Path, package: Callable[..., Path]
 ) -> None:
     """Where the machine fails, nothing is known of the page."""
-    build(two_tabs)
+    build(two_splits)
     deadly = f"import os\nif os.getpid() != {os.getpid()}:\n    os._exit(9)\n"
     package("metrics", "deadly_metric:METRICS", f"{deadly}METRICS = ()\n")
     with pytest.raises(WorkFailedError, match="died"):
-        check_board(two_tabs, page=True, isolated=False)
+        check_board(two_splits, page=True, isolated=False)
 
 
 def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
