@@ -408,20 +408,22 @@ def main() -> int:
     lines = [
         "# Costs of large scenarios",
         "",
-        "q names a row of Table 3.1 of the thesis. The row gives the number of "
-        "particles, the grid and the substeps. The first table shows processor times "
-        "for one particle: for drawing the initial state, for one substep, and for "
-        "three kinds of work on a frame. *Writing a frame* includes hashing and "
+        "q names a row of Table 3.1 of the [thesis](../glossary.md). The row gives the "
+        "number of particles, the grid and the substeps. The first table shows "
+        "processor times for one particle: for drawing the initial state, for one "
+        "substep, and for three kinds of work on a frame. *Writing a frame* includes "
+        "hashing and "
         "compressing it. *Hashing a written frame* is the work of `lagbench verify`: "
         "it reads the frame from the file and hashes it again. The last column of the "
         "table is the number of bytes of one particle in one frame of the file.",
         "",
         *parts_table(measured),
         "",
-        "A *whole generation* makes one scenario of train and one of test, and repeats "
-        "the scenario of test as its perturbed run. In this measurement all three runs "
-        "have the same number of frames. So the sum of the parts counts three runs of "
-        "the solver and two written scenarios. A whole generation takes longer: it "
+        "A *whole generation* makes one scenario of train, one scenario of test, and "
+        "the [perturbed run](../glossary.md) of the test scenario. In this measurement "
+        "all three runs have the same number of frames. So the sum of the parts counts "
+        "three runs of the solver and two written scenarios. A whole generation takes "
+        "longer: it "
         "also imports and compiles, and it writes the manifest and draws the pictures. "
         "The *client* is the process that you start; it starts the workers.",
         "",

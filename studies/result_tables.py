@@ -176,7 +176,7 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
         )
     sentence = (
         f"{place}this model takes more time per frame than the simulator that made the"
-        f" data ({times})."
+        f" data ({times}, in the first ten frames)."
     )
     return [sentence[0].upper() + sentence[1:]]
 
@@ -295,8 +295,8 @@ def training_table(all_results: Sequence[SplitResults]) -> str:
         "skill",
         "validated",
         "validation at 1/4",
-        "1/2",
-        "1",
+        "validation at 1/2",
+        "validation at the end",
         "decrease in the second half",
     )
     rows = []

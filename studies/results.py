@@ -61,9 +61,10 @@ On this page you can look up three things: how well the reference models predict
 data set, which claims of the thesis are true on our data, and the cost of the
 trainings. (The thesis is D. Dharma, PhD thesis, University of Leeds, 2025.)
 
-The first table has the best learned model and the best hybrid of each data set. Then
-follow the claims, the trainings, and one chapter per data set. A chapter has all
-models, with the numbers of the thesis beside ours."""
+The first table has the best learned model and the best hybrid of each data set. (Some
+data sets have no hybrid, or no model at all.) Then follow the claims, the trainings,
+and one chapter for each data set that has a model. A chapter has all models, with the
+numbers of the thesis beside ours."""
 
 SUMMARY_NOTE = """\
 Each row compares the best learned model, or the best hybrid, of a data set with the
@@ -126,7 +127,7 @@ CLAIMS_NOTE = """\
 The table has one question per row, and one answer per data set. It has the data sets of
 the thesis: `cavity`, `curl-noise`, `fluid` and `multimaterial`. Tables, figures and
 sections in the questions are those of the thesis. The answers use the ranking metric
-over the horizon:
+over the horizon. These words have a fixed meaning in the answers:
 
 - "Yes" and "better" mean significantly better at 5 %. "No" and "worse" mean
   significantly worse. "Open" means that the test finds no difference.
@@ -141,9 +142,11 @@ over the horizon:
 The answers compare two models over the seeds that both have. If there are no such
 seeds, or if one of the models draws no random numbers, the answers use all seeds of
 both. They leave out models that fail a [gate](baselines.md#gates), and superseded and
-withdrawn entries. If an operator has an entry that is named after it, with
-", pushforward" at the end, the answers use this entry. It was trained with the recipe
-`pushforward`, or with the options of that recipe."""
+withdrawn entries.
+
+An *operator* is a kind of graph network ([glossary](glossary.md)). An operator may have
+a second entry, with ", pushforward" at the end of its name. The questions that compare
+operators use this second entry."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. If a line has a
@@ -152,18 +155,19 @@ command, this command trains the models. Then `lagbench submit` makes the entrie
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-Each of these questions compares a model with one or two others. To answer it, the model
-and one of the others need entries that count on the same data set. No data set of the
-thesis has such entries, so these questions have no answer:"""
+Each of these questions compares a model with one or two others. An answer needs a data
+set on which the model and one of the others have entries, active ones that fail no
+[gate](baselines.md#gates). No data set of the thesis has such entries, so these
+questions have no answer:"""
 
 TRAINING_NOTE = """\
-The three validation columns show the first seed. They have the lowest validation error
-in the first quarter, the first half and all of the steps. `validated` is the metric of
-this error. The last column shows how much the error decreased in the second half of the
-steps. If it decreased by more than 2 %, the training has not converged. Hours do not
-include hours on a GPU or validations. (Only those of the first seed of NeuralMPM on
-cavity mini include validations.) If a training started from the weights of earlier
-trainings, its steps, epochs and hours include the earlier trainings."""
+The three columns *validation at* show the first seed. They have the lowest validation
+error in the first quarter, the first half and all of the steps. `validated` is the
+metric of this error. The last column shows how much the error decreased in the second
+half of the steps. If it decreased by more than 2 %, the training has not converged.
+Hours do not include hours on a GPU or validations. (Only those of the first seed of
+NeuralMPM on cavity mini include validations.) If a training started from the weights of
+earlier trainings, its steps, epochs and hours include the earlier trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
@@ -191,7 +195,7 @@ lagbench submit predictions.nc --from meta.yaml
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
 and figures of a size. If you interrupt the command, the same command continues.
-`lagbench submit` makes entries from the trained models.
+`lagbench submit` makes entries from the predictions of the trained models.
 
 This page shows only results that have an entry. `python -m studies.results` can also
 show the results of two files that are not in the repository. Its options `--studies`

@@ -90,8 +90,8 @@ _CLAIMS = {
     "material, with at most as many training steps?": Claim(
         "neuralmpm", ("neuralmpm-unmixed",)
     ),
-    "Does NeuralMPM gain by three changes together: momentum is conserved, bundles "
-    "are shorter, and more training windows come from the first frames?": Claim(
+    "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
+    "predicts fewer frames, and more of the windows are from the first frames?": Claim(
         "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
     ),
     "Does NeuralMPM gain by shape matching and density projection?": Claim(

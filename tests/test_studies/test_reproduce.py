@@ -284,8 +284,8 @@ def test_the_page_shows_models_skill_and_training(sources: Sources) -> None:
     training = trainings["GNS"]
     assert training["epochs"] == "0.8"  # 40 steps of 2 of 100 windows
     assert training["validation at 1/4"] == "4"
-    assert training["1/2"] == "2"
-    assert training["1"] == "0.5"
+    assert training["validation at 1/2"] == "2"
+    assert training["validation at the end"] == "0.5"
     assert training["decrease in the second half"] == "75 %"
     for row in markdown_rows(page, "the first is"):
         assert row["the first is"] == "too few scenarios"
