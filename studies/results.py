@@ -118,7 +118,7 @@ HOW_TO_READ = """\
   to the second model. `lead` is the difference of the means in the units of the
   metric. It is positive if the first model is better. `won` is the number of scenarios
   in which the first model is better. The last column states whether the first model is
-  better or worse.
+  better or worse. *Open* means that the test finds no difference.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries and
 score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
@@ -155,10 +155,10 @@ command, this command trains the models. Then `lagbench submit` makes the entrie
 UNANSWERED_NOTE = """\
 ### Questions without an answer
 
-Each of these questions compares a model with one or two others. An answer needs a data
-set on which the model and one of the others have entries, active ones that fail no
-[gate](baselines.md#gates). No data set of the thesis has such entries, so these
-questions have no answer:"""
+Each of these questions compares a model with one or two others. A question has an
+answer on a data set if the model and at least one of the others have an active entry
+there that fails no [gate](baselines.md#gates). No data set of the thesis has such
+entries, so these questions have no answer:"""
 
 TRAINING_NOTE = """\
 The three columns *validation at* show the first seed. They have the lowest validation
@@ -179,8 +179,9 @@ divided by the time of the model on the same machine. The times are those of the
 mostly means over whole rollouts. The first table of this page has means over the first
 ten frames, which were measured in another run. So the two can differ. `trained on` is
 the machine on which the training ended. `s/frame` is the time on one core of a CPU.
-Hours do not include hours on a GPU or validations. (Only those of the first seed of
-NeuralMPM on cavity mini include validations.)"""
+A dash means that the entry does not state the value. Hours do not include hours on a
+GPU or validations. (Only those of the first seed of NeuralMPM on cavity mini include
+validations.)"""
 
 COMMANDS = """\
 ## How to make these results again
@@ -206,8 +207,9 @@ folder of runs. The second file is the output of
 `python -m studies.thesis.var_protocol --size mini --json`. Save it as
 `fluid/mini/var_protocol.json` in one of the two folders.
 
-`python -m studies.thesis` also has the following models. Each line has the name of a
-model in this program, and the options that make the model:"""
+Some models of `python -m studies.thesis` need more than the option `--baseline`. Each
+line has the name of such a model, and the options of `lagbench train` (or the command)
+that make it:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
