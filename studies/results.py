@@ -133,7 +133,8 @@ over the horizon. These words have a fixed meaning in the answers:
   significantly worse. "Open" means that the test finds no difference.
 - "Ahead of 3 of 5" means that the mean is better than the means of three of five
   models. "Better than 2, worse than 1" counts the significant differences.
-- "3 of 5 compared" means that two of the five other models have no entry that counts.
+- "3 of 5 compared" means that two of the five other models have no active entry that
+  passes all [gates](baselines.md#gates).
 - "These weights" means that a model has fewer than three trainings. Then the answer is
   about these weights, not about the methods. For a fit without random numbers one
   training is enough.
@@ -144,13 +145,15 @@ seeds, or if one of the models draws no random numbers, the answers use all seed
 both. They leave out models that fail a [gate](baselines.md#gates), and superseded and
 withdrawn entries.
 
-An *operator* is a kind of graph network ([glossary](glossary.md)). An operator may have
-a second entry, with ", pushforward" at the end of its name. The questions that compare
-operators use this second entry."""
+Graph networks differ in their *operator*, and are named after it
+([glossary](glossary.md)). A graph network may have a second entry, with ", pushforward"
+at the end of its name. Questions that only compare graph networks with each other, and
+the question that compares NeuralMPM with every graph network, use this second entry."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. If a line has a
-command, this command trains the models. Then `lagbench submit` makes the entries."""
+command, this command trains those of the models that have a recipe. Then
+`lagbench submit` makes the entries."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer
@@ -194,15 +197,17 @@ lagbench score predictions.nc
 lagbench submit predictions.nc --from meta.yaml
 ```
 
-`python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
-and figures of a size. If you interrupt the command, the same command continues.
-`lagbench submit` makes entries from the predictions of the trained models.
+`python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
+figures of the thesis at a size, and trains the models that they need. With the option
+`--split` it trains all models of the thesis for this split, and NeuralMPM. If you
+interrupt the command, the same command continues. `lagbench submit` makes entries from the predictions of the trained models.
 
 This page shows only results that have an entry. `python -m studies.results` can also
-show the results of two files that are not in the repository. Its options `--studies`
+show the results of two files that are not in the repository: `mlp_studies.json` and
+`var_protocol.json`. Its options `--studies`
 and `--runs` each name a folder. In both folders the files lie in the subfolder
-`<split>/<size>/`. If both folders have a file, the one in the folder of `--studies`
-counts. `python -m studies.thesis` writes the first file, `mlp_studies.json`, into the
+`<split>/<size>/`. If both folders have the same file, the one in the folder of
+`--studies` counts. `python -m studies.thesis` writes the first file, `mlp_studies.json`, into the
 folder of runs. The second file is the output of
 `python -m studies.thesis.var_protocol --size mini --json`. Save it as
 `fluid/mini/var_protocol.json` in one of the two folders.

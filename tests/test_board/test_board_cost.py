@@ -16,8 +16,14 @@ import pytest
 from sample_boards import make_board
 from typer.testing import CliRunner
 
-from lagbench.board.cost import CostPoint, draw, find_front, points_of
-from lagbench.board.entry import MeasuredCost, Verification
+from lagbench.board.cost import (
+    CostPoint,
+    draw,
+    find_front,
+    points_of,
+    simulator_seconds,
+)
+from lagbench.board.entry import EntryCost, MeasuredCost, Verification
 from lagbench.board.model import Tab
 from lagbench.cli.program import app
 from lagbench.data.registry import load
@@ -72,16 +78,57 @@ def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
     assert silent.isdisjoint(raw)
 
 
-def test_measured_costs_count_before_stated_ones(tab: Tab) -> None:
-    """The figure has the costs of the table."""
-    first_row, *others = tab.rows
-    measured = MeasuredCost.model_construct(
-        seconds_per_frame=0.5, machine="a machine", solver=0.25, classical={}
+def measured_in(run: int, seconds: float) -> Verification:
+    """Return a cost that was measured in a run, in which the solver took 0.25 s."""
+    cost = MeasuredCost(
+        machine="a machine",
+        date="2026-01-02",
+        repeats=run,
+        seconds_per_frame=seconds,
+        solver=0.25,
+        classical={"projection": 0.125},
     )
-    verified = Verification.model_construct(cost=measured, reproduced=(), blind=None)
-    row = replace(first_row, verified=verified)
-    with_measured = replace(tab, rows=(row, *others), solver_seconds=0.02)
-    assert seconds_by_name(with_measured)[row.entry.name] == pytest.approx(0.04)
+    return Verification.model_construct(cost=cost, reproduced=(), blind=None)
+
+
+def test_all_times_are_those_of_the_run_that_measured_the_entries(tab: Tab) -> None:
+    """As in the table of results: what the run lacks is converted by the solver."""
+    first, second, *others = [row for row in tab.rows if row.active]
+    rows = (
+        replace(first, verified=measured_in(1, 0.5)),
+        replace(second, verified=measured_in(1, 0.75)),
+        *others,
+    )
+    elsewhere = EntryCost(
+        seconds_per_frame=0.04, device="another", solver_seconds_per_frame=0.02
+    )
+    in_run, not_in_run = tab.references
+    references = (
+        replace(in_run, name="projection", cost=elsewhere),
+        replace(not_in_run, name="analog", cost=elsewhere),
+    )
+    measured_tab = replace(tab, rows=rows, references=references, solver_seconds=0.02)
+    assert simulator_seconds(measured_tab) == 0.25
+    seconds = seconds_by_name(measured_tab)
+    assert seconds[first.entry.name] == pytest.approx(0.5)
+    assert seconds[second.entry.name] == pytest.approx(0.75)
+    assert seconds["projection"] == 0.125
+    assert seconds["analog"] == pytest.approx(0.5)
+
+
+def test_times_of_two_runs_are_converted_by_the_solver(tab: Tab) -> None:
+    """Twice the time of the solver in its own run is twice that of the solver here."""
+    first, second, *others = [row for row in tab.rows if row.active]
+    rows = (
+        replace(first, verified=measured_in(1, 0.5)),
+        replace(second, verified=measured_in(2, 0.75)),
+        *others,
+    )
+    measured_tab = replace(tab, rows=rows, solver_seconds=0.02)
+    assert simulator_seconds(measured_tab) == 0.02
+    seconds = seconds_by_name(measured_tab)
+    assert seconds[first.entry.name] == pytest.approx(0.04)
+    assert seconds[second.entry.name] == pytest.approx(0.06)
 
 
 def test_the_front_holds_what_no_other_beats() -> None:
