@@ -200,15 +200,15 @@ lagbench submit predictions.nc --from meta.yaml
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
 figures of the thesis at a size, and trains the models that they need. With the option
 `--split` it trains all models of the thesis for this split, and NeuralMPM. If you
-interrupt the command, the same command continues. `lagbench submit` makes entries from the predictions of the trained models.
+interrupt the command, the same command continues. `lagbench submit` makes entries from
+the predictions of the trained models.
 
 This page shows only results that have an entry. `python -m studies.results` can also
 show the results of two files that are not in the repository: `mlp_studies.json` and
-`var_protocol.json`. Its options `--studies`
-and `--runs` each name a folder. In both folders the files lie in the subfolder
-`<split>/<size>/`. If both folders have the same file, the one in the folder of
-`--studies` counts. `python -m studies.thesis` writes the first file, `mlp_studies.json`, into the
-folder of runs. The second file is the output of
+`var_protocol.json`. Its options `--studies` and `--runs` each name a folder. In both
+folders the files lie in the subfolder `<split>/<size>/`. If both folders have the same
+file, the one in the folder of `--studies` counts. `python -m studies.thesis` writes
+`mlp_studies.json` into the folder of runs. The other file is the output of
 `python -m studies.thesis.var_protocol --size mini --json`. Save it as
 `fluid/mini/var_protocol.json` in one of the two folders.
 
