@@ -111,8 +111,9 @@ HOW_TO_READ = """\
   models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
   lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
-- **readme-network** is the small network of the program in the README. There is no
-  record of its training.
+- **readme-network** is the small network of the program in the README. It has no
+  `training.json`, so the columns of its training have a dash. Its entry states one
+  epoch and 0.05 processor hours.
 - **Comparisons** have two models, *first* and *second*. `where` is the data set. The
   first number of `means` and of `seeds` belongs to the first model, the second number
   to the second model. `lead` is the difference of the means in the units of the
@@ -182,7 +183,7 @@ divided by the time of the model on the same machine. The times are those of the
 mostly means over whole rollouts. The first table of this page has means over the first
 ten frames, which were measured in another run. So the two can differ. `trained on` is
 the machine on which the training ended. `s/frame` is the time on one core of a CPU.
-A dash means that the entry does not state the value. Hours do not include hours on a
+A dash means that there is no record of the value. Hours do not include hours on a
 GPU or validations. (Only those of the first seed of NeuralMPM on cavity mini include
 validations.)"""
 

@@ -87,7 +87,7 @@ _CLAIMS = {
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
     "Does NeuralMPM gain by one velocity grid for all materials instead of one per "
-    "material, if it does not take more training steps?": Claim(
+    "material, with no more training steps than the other model?": Claim(
         "neuralmpm", ("neuralmpm-unmixed",)
     ),
     "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
