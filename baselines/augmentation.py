@@ -47,7 +47,7 @@ class Symmetry(enum.StrEnum):
     MIRROR = "mirror"
     """x -> -x about the middle of the box, in 3-D z -> -z too: not with a stream."""
     SQUARE = "square"
-    """All eight images of the square, or 48 of the cube: splits without gravity."""
+    """All eight images of the square, or 48 of the cube: see :func:`check_symmetry`."""
 
 
 def check_symmetry(
@@ -55,7 +55,8 @@ def check_symmetry(
 ) -> None:
     """Refuse mirror images that are no motion of the split.
 
-    A split whose description names no gravity, as an imported one may, passes.
+    A split whose description names neither gravity nor a fringe, as that of an imported
+    split, passes.
 
     Args:
         symmetry: the images that are asked for.

@@ -22,7 +22,7 @@ class ProcessorLayer(nn.Module):
 
     .. math::
 
-        m_{ij} &= \mathrm{MLP}(e_{ij}, x_i, x_j) \\
+        m_{ij} &= \mathrm{LayerNorm}(\mathrm{MLP}(e_{ij}, x_i, x_j)) \\
         e_{ij} &\leftarrow e_{ij} + m_{ij} \\
         s_i &= [x_i \Vert \textstyle\sum_j m_{ij}] \\
         a_i &= \mathrm{Operator}(s, m)_i \\

@@ -152,10 +152,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         gain_head.append(f"gain, best of {tries:,}")
     swap_head = ["data set", "leading entry", "second entry", "lead in skill"]
     for tries in options.tries:
-        draws = "1"
+        place = "1 draw"
         if tries > 1:
-            draws = f"any of {tries:,}"
-        swap_head.append(f"second leads in {draws}")
+            place = f"one of {tries:,} draws"
+        swap_head.append(f"second leads in {place}")
     gain_table = markdown(gain_head, gains)
     swap_table = markdown(swap_head, swaps)
     sys.stdout.write(f"{gain_table}\n\n")

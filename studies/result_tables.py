@@ -78,7 +78,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     open_sets = []
     without_interval = []
     does_not_pay = []
-    unmatched = []
+    no_verdict = []
+    places: list[str] = []  # sentences on models without a verdict beside the solvers
     for results in all_results:
         model = deciding_model(results)
         if model is None:
@@ -90,7 +91,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             *against.interval, solver_costs_more=against.solver_costs_more
         )
         if verdict is LearningVerdict.NO_SOLVER:
-            unmatched.append(_cheaper_than_solvers(results, model))
+            no_verdict.append(results.where)
+            places += _place_of(results, model)
         elif verdict is LearningVerdict.PAYS:
             pays.append(results.where)
             time_ratios.append(time_over_simulator(results, model))
@@ -122,7 +124,14 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             " that costs no more is more accurate than the best learned or hybrid"
             " model."
         )
-    return " ".join([*sentences, *unmatched])
+    if no_verdict:
+        sentences.append(
+            f"On {_join(no_verdict)} there is no verdict, because no classical solver"
+            " is as cheap as the best model, and this model is not more accurate than"
+            " the cheapest solver."
+        )
+        sentences += places
+    return " ".join(sentences)
 
 
 def deciding_model(results: SplitResults) -> str | None:
@@ -137,14 +146,13 @@ def deciding_model(results: SplitResults) -> str | None:
 def time_over_simulator(results: SplitResults, model: str) -> float | None:
     """Return the time of a frame of a model over that of the solver of the data.
 
-    Both were measured on one machine, in one run if there is such a run. None where a
-    time is not known.
+    Both are times of the first ten frames, measured in one run. None without such a
+    run.
     """
-    method = results.methods[model]
-    for cost in (method.measured, method.cost):
-        if cost is not None and cost.speed_up is not None:
-            return 1.0 / cost.speed_up
-    return None
+    measured = results.methods[model].measured
+    if measured is None or measured.speed_up is None:
+        return None
+    return 1.0 / measured.speed_up
 
 
 def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
@@ -181,13 +189,8 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
     return [sentence[0].upper() + sentence[1:]]
 
 
-def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
-    """Return which solvers a model beats that is cheaper than all of them."""
-    name_of_model = label(model)
-    sentence = (
-        f"On {results.where} there is no verdict, because no classical solver is as"
-        f" cheap as the best model, {name_of_model}."
-    )
+def _place_of(results: SplitResults, model: str) -> list[str]:
+    """Return which classical solvers are better or worse than a model, in sentences."""
     error = results.methods[model].scores[results.ranking].mean
     behind = []
     equal = []
@@ -203,8 +206,8 @@ def _cheaper_than_solvers(results: SplitResults, model: str) -> str:
             ahead.append(label(name))
         else:
             equal.append(label(name))
-    places = place_among_solvers(name_of_model, behind=behind, equal=equal, ahead=ahead)
-    return " ".join([sentence, *places])
+    name_with_place = f"{label(model)} on {results.where}"
+    return place_among_solvers(name_with_place, behind=behind, equal=equal, ahead=ahead)
 
 
 def _join(names: Sequence[str]) -> str:

@@ -148,8 +148,8 @@ withdrawn entries.
 
 Graph networks differ in their *operator*, and are named after it
 ([glossary](glossary.md)). A graph network may have a second entry, with ", pushforward"
-at the end of its name. Questions that only compare graph networks with each other, and
-the question that compares NeuralMPM with every graph network, use this second entry."""
+at the end of its name. Two questions use this second entry: which operator is the most
+accurate, and whether NeuralMPM is better than every graph network."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. If a line has a

@@ -59,7 +59,7 @@ from lagbench.work.pool import Report
 from lagbench.work.run import run_all
 
 from .columns import PRESETS
-from .entry import Entry, EntryCost, Status, Verification
+from .entry import Entry, EntryCost, MeasuredCost, Status, Verification
 from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
 from .gates import gates_failed_by, read_failed_gates
@@ -612,6 +612,10 @@ def _make_tab(
         shift_references=shift_references,
         solver_time=solver_time,
     )
+    run = _run_of(rows)
+    if run is not None:
+        reference_rows = tuple(_with_times_of(run, row) for row in reference_rows)
+        solver_time = run.solver
     return Tab(
         size=size,
         title=title,
@@ -626,6 +630,7 @@ def _make_tab(
         truth=truth.pictures,
         rows=tuple(rows),
         references=reference_rows,
+        run=run,
         solver_seconds=solver_time,
     )
 
@@ -691,6 +696,43 @@ def _reference_rows(
             row = replace(row, on_shift=_on_shift([shift_score], shift_references))
         rows.append(row)
     return tuple(rows)
+
+
+def _run_of(rows: Sequence[BoardRow]) -> MeasuredCost | None:
+    """Return a cost of the run in which all measured active entries were measured.
+
+    None if no active entry was measured, if they were measured in several runs, or if
+    the run has no time of the solver.
+    """
+    costs = []
+    for row in rows:
+        if row.active and row.verified is not None and row.verified.cost is not None:
+            costs.append(row.verified.cost)
+    if not costs or costs[0].solver is None:
+        return None
+    run = costs[0]
+    if all(cost.is_of_same_run(run) for cost in costs):
+        return run
+    return None
+
+
+def _with_times_of(run: MeasuredCost, row: ReferenceRow) -> ReferenceRow:
+    """Return the row of a reference predictor with its time in a run.
+
+    A run has no time of predictors that read train. Theirs are converted by the times
+    of the solver.
+    """
+    seconds = {**run.classical, **run.naive}.get(row.name)
+    if seconds is None:
+        if row.cost is None or row.cost.speed_up is None or run.solver is None:
+            return row
+        seconds = run.solver / row.cost.speed_up
+    cost = EntryCost.model_construct(
+        seconds_per_frame=seconds,
+        device=run.machine,
+        solver_seconds_per_frame=run.solver,
+    )
+    return replace(row, cost=cost)
 
 
 def _find_variants(methods: Sequence[ScoredMethod]) -> Mapping[str, str]:

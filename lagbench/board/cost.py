@@ -1,9 +1,8 @@
 """Accuracy against cost: time of a frame and error of entries, references, simulator.
 
-Both axes are logarithmic. Times are processor times on one core. If all entries that we
-measured were measured in one run, all times are those of this run; else they are those
-of the machine on which we timed the reference predictors. A time from elsewhere is
-converted by the time of the simulator there, where it is known. The figure needs no
+Both axes are logarithmic. Times of reference predictors and simulator are those of the
+tab: processor times on one core. The time of an entry that comes from elsewhere is
+converted by its speed-up over the simulator, where one is known. The figure needs no
 script; dots are links or can be focused, and say in words what they show.
 """
 
@@ -29,8 +28,8 @@ from lagbench.references.shipped import shipped, solver_seconds
 from lagbench.references.table import REFERENCES
 
 from .columns import cost_of
-from .entry import EntryCost, MeasuredCost
-from .model import Board, ReferenceRow, Tab
+from .entry import EntryCost
+from .model import Board, Tab
 
 HEIGHT = 400  # of the chart without its key [pixel]
 
@@ -97,8 +96,6 @@ class CostPoint:
 
 def points_of(tab: Tab) -> list[CostPoint]:
     """Return active entries of known cost, then reference predictors."""
-    run = run_of(tab)
-    simulator = simulator_seconds(tab)
     points = []
     for row in tab.rows:
         cost = cost_of(row)
@@ -106,7 +103,7 @@ def points_of(tab: Tab) -> list[CostPoint]:
             continue
         point = CostPoint(
             name=row.entry.name,
-            seconds=_seconds_here(cost, simulator),
+            seconds=_seconds_here(cost, tab.solver_seconds),
             error=row.values[tab.ranking].mean,
             kind=str(row.entry.kind),
             href=f"#tab={tab.id}&entry={row.id}",
@@ -116,7 +113,7 @@ def points_of(tab: Tab) -> list[CostPoint]:
         if reference.cost is not None and tab.ranking in reference.values:
             point = CostPoint(
                 name=reference.name,
-                seconds=_reference_seconds(reference, reference.cost, run, simulator),
+                seconds=reference.cost.seconds_per_frame,
                 error=reference.values[tab.ranking].mean,
                 kind=str(reference.kind),
             )
@@ -133,53 +130,11 @@ def _drawable(points: Iterable[CostPoint]) -> list[CostPoint]:
     return drawable_points
 
 
-def run_of(tab: Tab) -> MeasuredCost | None:
-    """Return a cost of the run in which all measured entries of a tab were measured.
-
-    None if no active entry was measured, or if they were measured in several runs.
-    """
-    costs = []
-    for row in tab.rows:
-        if row.active and row.verified is not None and row.verified.cost is not None:
-            costs.append(row.verified.cost)
-    if not costs:
-        return None
-    run = costs[0]
-    if all(cost.is_of_same_run(run) for cost in costs):
-        return run
-    return None
-
-
-def simulator_seconds(tab: Tab) -> float | None:
-    """Return the time of a frame of the simulator in the figure [s], if it is known."""
-    run = run_of(tab)
-    if run is not None and run.solver is not None:
-        return run.solver
-    return tab.solver_seconds
-
-
-def _reference_seconds(
-    reference: ReferenceRow,
-    cost: EntryCost,
-    run: MeasuredCost | None,
-    simulator: float | None,
-) -> float:
-    """Return the time of a frame of a reference predictor in the figure [s].
-
-    Runs have no times of predictors that read train; these are converted.
-    """
-    if run is not None:
-        times = {**run.classical, **run.naive}
-        if reference.name in times:
-            return times[reference.name]
-    return _seconds_here(cost, simulator)
-
-
-def _seconds_here(cost: EntryCost, simulator: float | None) -> float:
-    """Return the time of a frame where the simulator has this time [s], if known."""
-    if simulator is None or cost.speed_up is None:
+def _seconds_here(cost: EntryCost, solver_seconds_here: float | None) -> float:
+    """Return the time of a frame where the solver has this time [s], if known."""
+    if solver_seconds_here is None or cost.speed_up is None:
         return cost.seconds_per_frame
-    return simulator / cost.speed_up
+    return solver_seconds_here / cost.speed_up
 
 
 def find_front(points: Iterable[CostPoint]) -> list[CostPoint]:
@@ -293,9 +248,10 @@ def cost_figure(tab: Tab) -> Markup:
         "than every cheaper one: an entry below it is more accurate than every solver "
         "that costs no more per frame. "
         "The upright line is the time of the simulator that made the data. If all "
-        "measured entries were measured in one run, all times are those of this run. "
-        "Otherwise they are those of the machine of the reference predictors. Other "
-        "times are converted by the simulator's time on both machines."
+        "measured entries were measured in one run, the figure has the times of this "
+        "run, else those of the machine of the reference predictors. It converts "
+        "other times by the simulator's time on both machines, if an entry states it. "
+        "The table says which times are self-reported."
     )
     silent_count = sum(row.active and cost_of(row) is None for row in tab.rows)
     if silent_count == 1:
@@ -306,7 +262,7 @@ def cost_figure(tab: Tab) -> Markup:
     title = "Accuracy against cost"
     body = tag("p", "No costs are known.")
     if points:
-        body = draw(points, simulator_seconds(tab), tab.ranking, title)
+        body = draw(points, tab.solver_seconds, tab.ranking, title)
     return tag(
         "figure",
         tag("div", tag("h3", title), class_="figure-head"),
@@ -336,7 +292,7 @@ def picture(board: Board, size: Size) -> str:
         points = _shipped_points(size, ranking)
     else:
         ranking = tab.ranking
-        simulator = simulator_seconds(tab)
+        simulator = tab.solver_seconds
         points = []
         for point in points_of(tab):
             # In a file of its own the links of the page lead nowhere.

@@ -17,7 +17,7 @@ from lagbench.data.registry import Size
 from lagbench.metrics.metric import Metric
 from lagbench.references.predictor import Kind
 
-from .entry import Entry, EntryCost, EntryFlag, Status, Verification
+from .entry import Entry, EntryCost, EntryFlag, MeasuredCost, Status, Verification
 
 Floats = NDArray[np.float64]
 
@@ -96,7 +96,8 @@ class ReferenceRow:
     kind: Kind  # naive or classical
     # 1 - score / score of the best naive baseline; 0 for that one itself
     skill: Value | None = None
-    # cost of a frame, and that of the solver, on the machine that measured
+    # cost of a frame, and that of the solver: in the run of the tab, or where the
+    # reference predictors were timed
     cost: EntryCost | None = None
     on_shift: OnShift | None = None
 
@@ -209,7 +210,11 @@ class Tab:
     truth: Pictures | None
     rows: tuple[BoardRow, ...]  # ranked ones by rank, then the others
     references: tuple[ReferenceRow, ...]
-    # processor time of a frame of the solver itself [s]
+    # the run in which all active entries that we measured were measured, by the cost of
+    # one of them; None if there is no such run
+    run: MeasuredCost | None = None
+    # processor time of a frame of the solver itself, in the run or where the reference
+    # predictors were timed [s]
     solver_seconds: float | None = None
     # methods from the first on that have pictures; None where all rows have them
     pictured: int | None = None

@@ -940,8 +940,8 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "nobody computes them again. So are times, except where the column says "
         "measured: then we timed the entry, the simulator that made the data and the "
         "classical solvers in one run on one core, and “÷ classical” compares these "
-        "times. Those of the shaded rows are of another run. A speed-up below 1× means "
-        "slower than the simulator."
+        f"times. {_times_of_references(tab)} A speed-up below 1× means slower than the "
+        "simulator."
     )
     if any(is_beside_dearer_solver(row) for row in tab.rows):
         yield escaped(
@@ -957,6 +957,16 @@ def _notes(tab: Tab) -> Iterator[Markup]:
             raised.add(flag.name)
     for name in sorted(raised.intersection(LABELS)):
         yield _explain(*LABELS[name])
+
+
+def _times_of_references(tab: Tab) -> str:
+    """Return where the times of the shaded rows come from."""
+    if tab.run is None:
+        return "Those of the shaded rows are of another run."
+    return (
+        "Those of the shaded rows are of the same run. Of naive baselines that read "
+        "train they are converted from another run by the time of the simulator."
+    )
 
 
 def _explain(label: str, meaning: str) -> Markup:

@@ -123,7 +123,8 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
             f"{HEADINGS[AGAINST_CLASSICAL.key]}: score over that of the best classical "
             "solver that costs no more"
         )
-        legend.append("s/frame of classical and naive rows: measured in other runs")
+        if tab.run is None:
+            legend.append("s/frame of classical and naive rows: measured in other runs")
     if any(is_beside_dearer_solver(row) for row in rows):
         legend.append(
             f"{SOLVER_COSTS_MORE}: all classical solvers cost more than the model"

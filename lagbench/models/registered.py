@@ -66,12 +66,12 @@ def export_safetensors(
         model: a model of :func:`build_registered`.
         path: file to write, named ``.safetensors``.
         baseline: name of its architecture.
-        seed: seed of the training; not negative.
-        step: steps of the training; not negative.
+        seed: seed of the training, below 2^63.
+        step: steps of the training, below 2^63.
 
     Raises:
         UsageError: the file has another suffix, no such architecture is installed, or
-            the seed or the step is negative.
+            the seed or the step is negative or too large.
         UnreadableFileError: weights are not finite, the model is of another
             architecture, or the file is longer than an entry may carry.
         WorkFailedError: the file cannot be written.
@@ -86,11 +86,11 @@ def export_safetensors(
             fix=f"name it {target.stem}{SUFFIX}",
         )
     for name, number in (("seed", seed), ("step", step)):
-        if number < 0:
+        if not 0 <= number < 2**63:
             raise UsageError(
-                f"a negative {name}",
+                f"an impossible {name}",
                 where=name,
-                expected="a whole number from 0 on",
+                expected="a whole number from 0 to 2^63 - 1",
                 got=number,
                 fix=f"give the {name} of the training",
             )

@@ -267,14 +267,14 @@ def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
     """Return all comparisons of a claim, those by the ranking metric first.
 
     A claim that names no first model is about the best naive baseline. Under-trained
-    models, which fail a gate, take no part. If operators are compared with each other,
-    the variant that is trained with pushforward stands in, where it has scores.
+    models, which fail a gate, take no part. If the rivals are several operators, the
+    variants that are trained with pushforward stand in, where they have scores.
     """
     first = claim.first or results.best_naive
     if first is None:
         return []
     rivals = claim.rivals
-    if rivals and set(rivals) <= set(OPERATORS):
+    if len(rivals) > 1 and set(rivals) <= set(OPERATORS):
         first = results.stand_in(first)
         rivals = tuple(results.stand_in(name) for name in rivals)
     if first in results.under_trained:

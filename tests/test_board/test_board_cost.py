@@ -4,26 +4,25 @@ are told.
 
 from __future__ import annotations
 
+import datetime
 import math
 import re
+import shutil
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import yaml
 from sample_boards import make_board
 from typer.testing import CliRunner
 
-from lagbench.board.cost import (
-    CostPoint,
-    draw,
-    find_front,
-    points_of,
-    simulator_seconds,
-)
-from lagbench.board.entry import EntryCost, MeasuredCost, Verification
+from lagbench.board.build import Scope, collect
+from lagbench.board.cost import CostPoint, draw, find_front, points_of
+from lagbench.board.entry import MeasuredCost, Verification
 from lagbench.board.model import Tab
 from lagbench.cli.program import app
 from lagbench.data.registry import load
@@ -78,57 +77,112 @@ def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
     assert silent.isdisjoint(raw)
 
 
-def measured_in(run: int, seconds: float) -> Verification:
-    """Return a cost that was measured in a run, in which the solver took 0.25 s."""
-    cost = MeasuredCost(
-        machine="a machine",
-        date="2026-01-02",
-        repeats=run,
-        seconds_per_frame=seconds,
-        solver=0.25,
-        classical={"projection": 0.125},
+def test_measured_costs_count_before_stated_ones(tab: Tab) -> None:
+    """The figure has the costs of the table."""
+    first_row, *others = tab.rows
+    measured = MeasuredCost.model_construct(
+        seconds_per_frame=0.5, machine="a machine", solver=0.25, classical={}
     )
-    return Verification.model_construct(cost=cost, reproduced=(), blind=None)
+    verified = Verification.model_construct(cost=measured, reproduced=(), blind=None)
+    row = replace(first_row, verified=verified)
+    with_measured = replace(tab, rows=(row, *others), solver_seconds=0.02)
+    assert seconds_by_name(with_measured)[row.entry.name] == pytest.approx(0.04)
 
 
-def test_all_times_are_those_of_the_run_that_measured_the_entries(tab: Tab) -> None:
-    """As in the table of results: what the run lacks is converted by the solver."""
-    first, second, *others = [row for row in tab.rows if row.active]
-    rows = (
-        replace(first, verified=measured_in(1, 0.5)),
-        replace(second, verified=measured_in(1, 0.75)),
-        *others,
-    )
-    elsewhere = EntryCost(
-        seconds_per_frame=0.04, device="another", solver_seconds_per_frame=0.02
-    )
-    in_run, not_in_run = tab.references
-    references = (
-        replace(in_run, name="projection", cost=elsewhere),
-        replace(not_in_run, name="analog", cost=elsewhere),
-    )
-    measured_tab = replace(tab, rows=rows, references=references, solver_seconds=0.02)
-    assert simulator_seconds(measured_tab) == 0.25
-    seconds = seconds_by_name(measured_tab)
-    assert seconds[first.entry.name] == pytest.approx(0.5)
-    assert seconds[second.entry.name] == pytest.approx(0.75)
-    assert seconds["projection"] == 0.125
-    assert seconds["analog"] == pytest.approx(0.5)
+BOARD = Path(__file__).parents[2] / "leaderboard"
+MINI = "submissions/poiseuille/mini"
 
 
-def test_times_of_two_runs_are_converted_by_the_solver(tab: Tab) -> None:
-    """Twice the time of the solver in its own run is twice that of the solver here."""
-    first, second, *others = [row for row in tab.rows if row.active]
-    rows = (
-        replace(first, verified=measured_in(1, 0.5)),
-        replace(second, verified=measured_in(2, 0.75)),
-        *others,
-    )
-    measured_tab = replace(tab, rows=rows, solver_seconds=0.02)
-    assert simulator_seconds(measured_tab) == 0.02
-    seconds = seconds_by_name(measured_tab)
-    assert seconds[first.entry.name] == pytest.approx(0.04)
-    assert seconds[second.entry.name] == pytest.approx(0.06)
+@pytest.fixture
+def committed(tmp_path: Path) -> Path:
+    """A copy of poiseuille of the committed leaderboard, measured in one run."""
+    for folder in ("submissions", "scores"):
+        shutil.copytree(BOARD / folder / "poiseuille", tmp_path / folder / "poiseuille")
+    lines = yaml.safe_load((BOARD / "verified.yaml").read_text())
+    of_mini = {path: line for path, line in lines.items() if path.startswith(MINI)}
+    (tmp_path / "verified.yaml").write_text(yaml.safe_dump(of_mini))
+    return tmp_path
+
+
+def read_tab(board: Path) -> Tab:
+    """Return the tab of poiseuille mini, without pictures."""
+    scope = Scope(metrics=(), intervals=(), has_pictures=False)
+    (only_tab,) = collect(board, only=[("poiseuille", "mini")], scope=scope).tabs
+    return only_tab
+
+
+def costs_of_references(tab: Tab) -> dict[str, float]:
+    """Return the times of the reference predictors in the table."""
+    seconds = {}
+    for row in tab.references:
+        assert row.cost is not None
+        seconds[row.name] = row.cost.seconds_per_frame
+    return seconds
+
+
+def test_all_times_are_those_of_the_run_that_measured_the_entries(
+    committed: Path,
+) -> None:
+    """In the table and in the figure; what a run lacks is converted by the solver."""
+    lines = yaml.safe_load((committed / "verified.yaml").read_text())
+    run = lines[f"{MINI}/neuralmpm.yaml"]["cost"]
+    size = load().size("poiseuille", "mini")
+    elsewhere = shipped(size)
+    solver_elsewhere = solver_seconds(size)
+    assert elsewhere is not None
+    assert solver_elsewhere is not None
+
+    tab = read_tab(committed)
+    assert tab.run is not None
+    assert tab.solver_seconds == run["solver"]
+    costs = costs_of_references(tab)
+    times = {**run["classical"], **run["naive"]}
+    assert times
+    assert costs.keys() > times.keys()
+    for name, seconds in costs.items():
+        converted = elsewhere[name].seconds_per_frame / solver_elsewhere * run["solver"]
+        assert seconds == pytest.approx(times.get(name, converted))
+    in_figure = seconds_by_name(tab)
+    for row in tab.rows:
+        line = lines[f"{MINI}/{row.entry.method}.yaml"]
+        seconds = line["cost"]["seconds_per_frame"]
+        assert in_figure[row.entry.name] == pytest.approx(seconds)
+    for name, seconds in costs.items():
+        assert in_figure[name] == pytest.approx(seconds)
+
+
+def other_run(cost: dict[str, Any]) -> None:
+    """Make the cost one of another run."""
+    cost["date"] = datetime.date(2026, 1, 2)
+
+
+def no_solver(cost: dict[str, Any]) -> None:
+    """Leave out the time of the solver."""
+    del cost["solver"]
+
+
+@pytest.mark.parametrize("change", [other_run, no_solver])
+def test_without_one_run_the_times_of_the_references_stay(
+    committed: Path, change: Callable[[dict[str, Any]], None]
+) -> None:
+    """Two runs, or a run without a time of the solver."""
+    verified = committed / "verified.yaml"
+    lines = yaml.safe_load(verified.read_text())
+    changed = list(lines.values())
+    if change is other_run:
+        changed = changed[:1]
+    for line in changed:
+        change(line["cost"])
+    verified.write_text(yaml.safe_dump(lines))
+
+    size = load().size("poiseuille", "mini")
+    elsewhere = shipped(size)
+    assert elsewhere is not None
+    tab = read_tab(committed)
+    assert tab.run is None
+    assert tab.solver_seconds == solver_seconds(size)
+    for name, seconds in costs_of_references(tab).items():
+        assert seconds == elsewhere[name].seconds_per_frame
 
 
 def test_the_front_holds_what_no_other_beats() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -116,25 +117,26 @@ def test_options_that_do_not_fit_have_an_error_of_all_parts(
 def test_what_cannot_be_exported_is_refused(
     tmp_path: Path, generated: GenerationResult
 ) -> None:
-    """Another suffix, another architecture, weights that are not finite."""
+    """Another suffix, another architecture, a negative or a huge seed or step, weights
+    that are not finite.
+    """
     model = small_model(generated)
     with pytest.raises(UsageError):
         export_safetensors(model, tmp_path / "model.pt", baseline="gns")
     with pytest.raises(UnreadableFileError):
         export_safetensors(model, tmp_path / "a.safetensors", baseline="neuralmpm")
-    for negative in ("seed", "step"):
+    for name, number in itertools.product(("seed", "step"), (-1, 2**63)):
         with pytest.raises(UsageError) as caught:
             export_safetensors(
-                model, tmp_path / "a.safetensors", baseline="gns", **{negative: -1}
+                model, tmp_path / "a.safetensors", baseline="gns", **{name: number}
             )
-        assert caught.value.where == negative
+        assert caught.value.where == name
     next(model.parameters()).data[:] = torch.nan
     with pytest.raises(UnreadableFileError):
         export_safetensors(model, tmp_path / "a.safetensors", baseline="gns")
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_seed_and_step_may_be_integers_of_numpy(
     tmp_path: Path, generated: GenerationResult
 ) -> None:
@@ -150,6 +152,7 @@ def test_seed_and_step_may_be_integers_of_numpy(
     assert training["recipe"]["training"]["seed"] == 3
 
 
+@pytest.mark.slow
 def test_an_entry_carries_a_file_of_safetensors(
     tmp_path: Path, sound: Path, generated: GenerationResult
 ) -> None:
