@@ -148,8 +148,9 @@ withdrawn entries.
 
 Graph networks differ in their *operator*, and are named after it
 ([glossary](glossary.md)). A graph network may have a second entry, with ", pushforward"
-at the end of its name. Two questions use this second entry: which operator is the most
-accurate, and whether NeuralMPM is better than every graph network."""
+at the end of its name. In two questions the second entry takes the place of the first:
+which operator is the most accurate, and whether NeuralMPM is better than every graph
+network. The question about the best naive baseline counts both."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. If a line has a
@@ -165,13 +166,16 @@ there that fails no [gate](baselines.md#gates). No data set of the thesis has su
 entries, so these questions have no answer:"""
 
 TRAINING_NOTE = """\
-The three columns *validation at* show the first seed. They have the lowest validation
-error in the first quarter, the first half and all of the steps. `validated` is the
-metric of this error. The last column shows how much the error decreased in the second
-half of the steps. If it decreased by more than 2 %, the training has not converged.
-Hours do not include hours on a GPU or validations. (Only those of the first seed of
-NeuralMPM on cavity mini include validations.) If a training started from the weights of
-earlier trainings, its steps, epochs and hours include the earlier trainings."""
+A training takes steps, and each step uses some windows. An epoch is one pass over all
+windows of train. VAR and the hybrids are fitted instead, without steps. The three
+columns *validation at* show the first seed. They have the lowest validation error in
+the first quarter, the first half and all of the steps. `validated` is the metric of
+this error (`rmse`: the position error, in early trainings). The last column shows how
+much the error decreased in the second half of the steps. If it decreased by more than
+2 %, the training has not converged. Hours do not include hours on a GPU or validations.
+(Only those of the first seed of NeuralMPM on cavity mini include validations.) If a
+training started from the weights of earlier trainings, its steps, epochs and hours
+include the earlier trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ

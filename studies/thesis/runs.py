@@ -354,7 +354,7 @@ def describe_run(plan: Plan, split: str, *, model: RosterModel, seed: int) -> st
     elif recipe.training.epochs is not None:
         budget = f"{recipe.training.epochs:g} epochs"
     else:
-        budget = "closed form"
+        budget = "a fit"
     return f"to train, {recipe.name}: {budget}"
 
 

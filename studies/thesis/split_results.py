@@ -632,7 +632,7 @@ def format_budget(record: Mapping[str, Any]) -> str:
         steps = count_start_steps(record) + record["step"]
         return f"{steps:,} x {record['recipe']['training']['batch']}"
     if record.get("step") == 1:
-        return "closed form"
+        return "a fit"
     return "-"
 
 

@@ -276,7 +276,7 @@ def test_plans_for_full_are_listed_without_data(
     assert command.main([*places, "--dry-run", "--split", "fluid"]) == 0
     output = capsys.readouterr()
     assert "fluid/full: 600 epochs" in line_of("fluid full mlp-0", output.out)
-    assert "closed form" in line_of("fluid full var-0", output.out)
+    assert "a fit" in line_of("fluid full var-0", output.out)
     assert "studies of table_4_2\n" in output.out
     assert "lagbench generate --split fluid --size full" in output.err
     assert not list(tmp_path.iterdir())
