@@ -206,8 +206,13 @@ def _place_of(results: SplitResults, model: str) -> list[str]:
             ahead.append(label(name))
         else:
             equal.append(label(name))
-    name_with_place = f"{label(model)} on {results.where}"
-    return place_among_solvers(name_with_place, behind=behind, equal=equal, ahead=ahead)
+    sentences = place_among_solvers(
+        label(model), behind=behind, equal=equal, ahead=ahead
+    )
+    if sentences:
+        first = sentences[0]
+        sentences[0] = f"On {results.where} {first[0].lower()}{first[1:]}"
+    return sentences
 
 
 def _join(names: Sequence[str]) -> str:

@@ -86,8 +86,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Does NeuralMPM gain by one velocity grid for all materials instead of one per "
-    "material, with no more training steps than the other model?": Claim(
+    "Is NeuralMPM with one velocity grid for all materials better than NeuralMPM with "
+    "one grid per material, which trains for at least as many steps?": Claim(
         "neuralmpm", ("neuralmpm-unmixed",)
     ),
     "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
