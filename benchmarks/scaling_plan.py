@@ -272,7 +272,7 @@ def read_rows(text: str) -> list[ThesisRow]:
 def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs per particle."""
     lines = [
-        "| q | particles | drawing the start [ns] | a substep [ns] "
+        "| q | particles | drawing the initial state [ns] | a substep [ns] "
         "| writing a frame [ns] | hashing a written frame [ns] "
         "| statistics of a frame [ns] | bytes in the file, per particle and frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|",
