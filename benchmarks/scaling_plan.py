@@ -295,7 +295,7 @@ def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs of whole generations, beside the sum of the parts."""
     lines = [
         "| q | frames | whole generation [core s] | sum of the parts [core s] "
-        "| one frame [MB] | peak memory of the client [MB] "
+        "| one frame before compression [MB] | peak memory of the client [MB] "
         "| peak memory of a worker [MB] |",
         "|--:|--:|--:|--:|--:|--:|--:|",
     ]
