@@ -77,7 +77,7 @@ score is better.
 - `skill` is 1 - (score of the model) / (score of the best naive baseline).
 - `against_classical` is (score of the model) / (score of the best classical solver that
   costs no more per frame than the model). If every classical solver costs more, the
-  solver is the cheapest one, and the cell says so. The brackets contain the 95 %
+  ratio uses the cheapest one, and the cell says so. The brackets contain the 95 %
   interval. The name of the solver follows. If the whole interval is below 1,
   [learning pays](glossary.md). A dash means that the cost of the model was not measured
   beside the solvers."""
