@@ -217,6 +217,16 @@ def test_an_ablation_is_compared_by_its_own_recipe() -> None:
     assert {row.first for row in rows} == {"gns"}
 
 
+@pytest.mark.parametrize("variant", ["gns-tenfold", "gns-unrolled"])
+def test_a_variant_is_compared_with_the_plain_operator(variant: str) -> None:
+    """Another recipe in place of the only rival would answer another question."""
+    (claim,) = (claim for claim in CLAIMS if claim.first == variant)
+    results = made_up_results({"gns": EQUAL, variant: equal(0.9)})
+    results.methods["gns-pushforward"] = a_method("gns-pushforward", equal(0.1))
+    rows = claim_rows(claim, results)
+    assert {row.second for row in rows} == {"gns"}
+
+
 def test_seeds_that_only_one_has_do_not_count() -> None:
     """Two models are compared over common seeds; where there are none, over all."""
     results = made_up_results({})
