@@ -125,9 +125,9 @@ def _describe(name: str, resolution: int) -> ReferencePredictor:
         name=name,
         title=f"Projection solver, {resolution} x the score grid",
         kind=Kind.CLASSICAL,
-        definition="Incompressible Navier-Stokes on a staggered grid with"
-        f" {resolution} times the cells of the score grid along each axis; it knows the"
-        " viscosity and the motion of the walls.",
+        definition="Incompressible Navier-Stokes on a staggered grid; the width of its"
+        f" cells is that of the cells of the score grid, divided by {resolution}. It"
+        " knows the viscosity and the motion of the walls.",
         applies=lambda size: size.is_full_box,
         predict=predict_at(resolution),
     )

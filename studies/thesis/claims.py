@@ -86,8 +86,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Is NeuralMPM with one velocity grid for all materials better than NeuralMPM with "
-    "one grid per material, which trains for at least as many steps?": Claim(
+    "Is one velocity grid for all materials better for NeuralMPM than one grid per "
+    "material with at least as many training steps?": Claim(
         "neuralmpm", ("neuralmpm-unmixed",)
     ),
     "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
