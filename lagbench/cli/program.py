@@ -553,7 +553,10 @@ def _interruption_message(command: str | None) -> str:
     for option in ("--force", "--again", "--fresh"):
         if option in sys.argv:
             same_command += f", without {option},"
-    return f"lagbench: interrupted; {same_command} goes on where it stopped"
+    return (
+        f"lagbench: interrupted; {same_command} goes on where it stopped, or begins "
+        "anew if nothing was saved yet"
+    )
 
 
 def _unexpected_error_message(error: Exception) -> str:

@@ -107,7 +107,8 @@ def train_command(
 ) -> None:
     """Train a reference model.
 
-    An interrupted call goes on where it stopped.
+    An interrupted training goes on at its last checkpoint, by the same command. A fit
+    (VAR, the hybrids) begins anew.
     """
     if baseline is None:
         raise UsageError(
