@@ -390,7 +390,7 @@ def _error_of(row: BoardRow | ReferenceRow, tab: Tab) -> float:
 
 
 def _format_ratio(ratio: Value) -> str:
-    return f"{text(ratio.mean, 2)}×"
+    return f"{text(ratio.mean)}×"
 
 
 def is_open(ratio: Value) -> bool:
@@ -399,7 +399,7 @@ def is_open(ratio: Value) -> bool:
 
 
 def format_comparison(row: BoardRow) -> str:
-    """Return the ratio to a classical solver, as in "0.86× (0.8 to 0.9)".
+    """Return the ratio to a classical solver, as in "0.863× (0.812 to 0.915)".
 
     The sign ‡ says that the solver costs more.
     """
@@ -409,7 +409,7 @@ def format_comparison(row: BoardRow) -> str:
     sign = SOLVER_COSTS_MORE if row.solver_costs_more else ""
     if math.isnan(ratio.low + ratio.high):
         return f"{_format_ratio(ratio)}{sign}"
-    interval = f"({text(ratio.low, 2)} to {text(ratio.high, 2)})"
+    interval = f"({text(ratio.low)} to {text(ratio.high)})"
     return f"{_format_ratio(ratio)}{sign} {interval}"
 
 
@@ -417,7 +417,7 @@ def _compare(row: BoardRow, ratio: Value) -> str:
     """Return a ratio with its interval and its solver, in words."""
     interval = ""
     if not math.isnan(ratio.low + ratio.high):
-        interval = f" (95\u00a0%: {text(ratio.low, 2)} to {text(ratio.high, 2)})"
+        interval = f" (95\u00a0%: {text(ratio.low)} to {text(ratio.high)})"
     solver = f"{row.solver}, the best classical solver that costs no more per frame"
     if row.solver_costs_more:
         solver = f"{row.solver}, the cheapest classical solver, which costs more"

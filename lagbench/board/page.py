@@ -682,7 +682,7 @@ def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row.rank is not None:
         remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
     if row.against_classical is not None:
-        ratio = f"{text(row.against_classical.mean, 2)}×"
+        ratio = f"{text(row.against_classical.mean)}×"
         if row.solver_costs_more:
             ratio += SOLVER_COSTS_MORE
         if is_open(row.against_classical):
@@ -795,7 +795,7 @@ def _leader_tiles(
     yield _tile(f"leader by {ranking.quantity}", text(value), name)
 
     if leader.against_classical is not None and leader.solver is not None:
-        ratio = f"{text(leader.against_classical.mean, 2)}×"
+        ratio = f"{text(leader.against_classical.mean)}×"
         label = (
             "error of the leader beside the best classical solver that costs no more "
             "per frame"

@@ -475,7 +475,7 @@ def test_a_sentence_says_whether_learning_pays(
     assert verdict in judgement
     assert ("open" in judgement) is (verdict == "open")
     assert "Model" in sentence
-    assert f"{ratio:.2f}×".replace("1.50", "1.5") in sentence
+    assert f"{ratio:#.3g}×" in sentence
     assert ("(95\u00a0%: " in sentence) is not math.isnan(low)
     assert conclude(first_tab(board, board.tabs[0].rows[0])) == ""
 
@@ -513,7 +513,15 @@ def test_the_most_accurate_model_decides_whether_learning_pays(board: Board) -> 
     accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
     cheap = compared(board, "Cheap", error=2.0, ratio=GOOD)
     sentences = conclude(first_tab(board, cheap, accurate))
-    assert re.search("does not pay on cavity full.*Accurate.*Cheap.*0.50×", sentences)
+    assert re.search("does not pay on cavity full.*Accurate.*Cheap.*0.500×", sentences)
+
+
+def test_a_ratio_near_one_keeps_its_interval_apart(board: Board) -> None:
+    """With two digits 1.12 (1.09 to 1.15) would read 1.1 (1.1 to 1.1)."""
+    row = compared(board, "Model", error=1.0, ratio=(1.09, 1.12, 1.15))
+    tab = first_tab(board, row)
+    assert "1.12× (95\u00a0%: 1.09 to 1.15) the error" in conclude(tab)
+    assert "1.12× (1.09 to 1.15)" in text_of_overview(page_of(board, tab))
 
 
 def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
@@ -527,7 +535,7 @@ def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
     assert "model of known cost" in shown
     shown = text_of_overview(page_of(board, first_tab(board, accurate)))
     assert "model of known cost" not in shown
-    assert "cavityyesAccuratelearned0.50× (0.40 to 0.60)" in shown
+    assert "cavityyesAccuratelearned0.500× (0.400 to 0.600)" in shown
 
 
 def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
@@ -545,8 +553,8 @@ def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
         "Purely learned models pay on 0 of 1 data sets; on 1 the question is open"
         in shown
     )
-    winner_cells = "Winnerhybrid0.50× (0.40 to 0.60)2×, slower"
-    assert f"cavityyes{winner_cells}Net0.90× (0.80 to 1.1)" in shown
+    winner_cells = "Winnerhybrid0.500× (0.400 to 0.600)2×, slower"
+    assert f"cavityyes{winner_cells}Net0.900× (0.800 to 1.10)" in shown
 
     cost = EntryCost(seconds_per_frame=1.0, device="a", solver_seconds_per_frame=0.99)
     shown = text_of_overview(
@@ -564,7 +572,7 @@ def test_the_overview_says_where_learning_does_not_pay(board: Board) -> None:
     shown = text_of_overview(page_of(board, first_tab(board, row)))
     assert "Learning does not pay on the only data set." in shown
     assert "Learning pays" not in shown
-    assert "cavitynoModellearned1.5× (1.2 to 1.9)" in shown
+    assert "cavitynoModellearned1.50× (1.20 to 1.90)" in shown
     assert "hybrid:" not in shown
 
 
@@ -694,7 +702,7 @@ def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> 
     sentences = conclude(tab)
     assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
     shown = text_of_overview(page_of(board, tab))
-    assert "cavityno solver is as cheapModellearned1.5×‡ (1.2 to 1.9)" in shown
+    assert "cavityno solver is as cheapModellearned1.50×‡ (1.20 to 1.90)" in shown
     statement = "There is no verdict on the only data set"
     assert statement in shown
     assert "Learning" not in shown
