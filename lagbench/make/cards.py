@@ -203,10 +203,23 @@ def _yaml_head(size: Size, split: Split, manifest: Manifest) -> str:
     }
     lines = ["---"]
     for key, value in values.items():
-        # JSON strings and lists are YAML, too
-        lines.append(f"{key}: {json.dumps(value, ensure_ascii=False)}")
+        lines.append(f"{key}: {_yaml_value(value)}")
     lines.append("---")
     return "\n".join(lines)
+
+
+def _yaml_value(value: object) -> str:
+    """Return a string or a list as YAML on one line.
+
+    JSON is YAML, except for characters that do not print: YAML takes some of them for
+    line breaks, and forbids others. So they are escaped.
+    """
+    characters = []
+    for character in json.dumps(value, ensure_ascii=False):
+        if not character.isprintable():
+            character = f"\\U{ord(character):08x}"
+        characters.append(character)
+    return "".join(characters)
 
 
 def _summary_table(size: Size, manifest: Manifest) -> str:

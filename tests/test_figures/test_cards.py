@@ -381,6 +381,27 @@ def test_the_predictability_limit_is_the_mean_over_test(tmp_path: Path) -> None:
     assert "2e-06 at the first predicted frame, 0.003 at the last" in text
 
 
+@pytest.mark.parametrize(
+    "title",
+    [
+        "Fluß: größer",
+        "a\x7fb\x9f",
+        "a\u2028b\x85c",
+        "a\ufffeb",
+        'tab\t"\\',
+        "\U0001f30a",
+    ],
+)
+def test_the_head_of_a_card_is_yaml_with_any_title(title: str) -> None:
+    """YAML forbids some characters, and takes others for line breaks."""
+    size = registry.load().size("cavity", "tiny")
+    split = registry.load().split("cavity").model_copy(update={"title": title})
+    manifest = Manifest(split="cavity", size="tiny", version="1.0.0")
+    text = cards.dataset_card(size, split, manifest, pictures=[])
+    _, head, _ = text.split("---\n", 2)
+    assert yaml.safe_load(head)["pretty_name"] == f"{title} (cavity tiny)"
+
+
 def test_hostile_text_of_a_registry_stays_text() -> None:
     """Titles and citations of other packages can hold no links, HTML or table cells of
     their own.
