@@ -91,9 +91,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         # offset from the middle node of the stencil [cells]; the fourth entry has the
         # bits of the number of the lowest node
         self.stencil_place = vec4.field()
-        # v and Jbar of the nodes, at the particle
-        self.grid_state = vec4.field()
-        self.grid_density = ti.field(f32)  # r of the nodes, at the particle
+        # v, Jbar and r of the nodes, at the particle, and three zeros
+        self.grid_state = ti.Vector.field(8, f32)
+        # slopes of v and Jbar of the nodes at the particle: along x, then along y
+        self.grid_slopes = ti.Vector.field(8, f32)
         # Kirchhoff stress of a solid without damping [mass/(length s^2)]: entries xx,
         # yy and zz; entries yz, xz and xy; the fourth entries are 0
         self.elastic_diagonal = vec4.field()
@@ -125,7 +126,7 @@ class ParticleStress3D(FreeSurfaceKernels):
             *self.weights,
             self.stencil_place,
             self.grid_state,
-            self.grid_density,
+            self.grid_slopes,
             self.elastic_diagonal,
             self.elastic_off_diagonal,
         )
@@ -492,17 +493,19 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
-        """Interpolate v, Jbar and r of the nodes at a particle, and the slopes of v."""
+        """Interpolate v, Jbar and r of the nodes at a particle, and the slopes of v.
+
+        A vector register takes eight numbers. So all numbers of a node are one vector,
+        and the slopes along x and along y are one. :meth:`flow` separates them.
+        """
         place = self.stencil_place[s, p]
         lowest = node_number(place[3], self.node_count)
         weight_x = self.weights[0][s, p]
         weight_y = self.weights[1][s, p]
         weight_z = self.weights[2][s, p]
-        state = vec4(0.0)
-        slope_x = vec4(0.0)
-        slope_y = vec4(0.0)
+        state = ti.Vector.zero(f32, 8)
+        slopes_xy = ti.Vector.zero(f32, 8)
         slope_z = vec4(0.0)
-        density = 0.0
         for i, j in ti.static(ti.ndrange(3, 3)):
             across = weight_x[i] * weight_y[j]
             row = lowest + (i * self.width + j) * self.width
@@ -510,27 +513,26 @@ class ParticleStress3D(FreeSurfaceKernels):
             distance_y = (j - 1.0) - place.y
             for k in ti.static(range(3)):
                 weight = across * weight_z[k]
-                node_state = self.node_state[s, row + k]
-                share = weight * node_state[:4]
+                share = weight * self.node_state[s, row + k]
                 distance_z = (k - 1.0) - place.z
                 state += share
-                slope_x += distance_x * share
-                slope_y += distance_y * share
-                slope_z += distance_z * share
-                density += weight * node_state[4]
+                for entry in ti.static(range(4)):
+                    slopes_xy[entry] += distance_x * share[entry]
+                for entry in ti.static(range(4)):
+                    slopes_xy[4 + entry] += distance_y * share[entry]
+                slope_z += distance_z * share[:4]
         slope_factor = 4.0 * self.inv_dx
-        self.slopes[0][s, p] = slope_factor * slope_x
-        self.slopes[1][s, p] = slope_factor * slope_y
+        self.grid_slopes[s, p] = slope_factor * slopes_xy
         self.slopes[2][s, p] = slope_factor * slope_z
         self.grid_state[s, p] = state
-        self.grid_density[s, p] = density
 
     @ti.func
     def flow(self, s: i32, p: i32, solid: Template) -> None:
         """Move a particle with the grid's velocity, and update J of a liquid."""
         grid_state = self.grid_state[s, p]
+        velocity = vec3(grid_state[0], grid_state[1], grid_state[2])
         grid_jacobian = grid_state[3]
-        velocity = grid_state.xyz
+        grid_density = grid_state[4]
         old_x = self.x[s, p].xyz
         x = old_x + self.dt * velocity
         x = bounded(x, self.position_min, self.position_max)
@@ -538,11 +540,13 @@ class ParticleStress3D(FreeSurfaceKernels):
 
         kind = self.matter[s, p][0]
         old_ratio = self.matter[s, p][1]
-        slope_x = self.slopes[0][s, p]
-        slope_y = self.slopes[1][s, p]
+        slopes_xy = self.grid_slopes[s, p]
+        slope_x = slopes_xy[:4]
+        slope_y = slopes_xy[4:]
         slope_z = self.slopes[2][s, p]
-        divergence = slope_x.x + slope_y.y + slope_z.z
-        grid_density = self.grid_density[s, p]
+        self.slopes[0][s, p] = slope_x
+        self.slopes[1][s, p] = slope_y
+        divergence = slope_x[0] + slope_y[1] + slope_z[2]
         j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
         ratio = j
         spread_jacobian = j
