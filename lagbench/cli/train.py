@@ -107,8 +107,8 @@ def train_command(
 ) -> None:
     """Train a reference model.
 
-    An interrupted training goes on at its last checkpoint, by the same command. A fit
-    (VAR, the hybrids) begins anew.
+    An interrupted call goes on where it stopped.
+    Only a fit (VAR, hybrids) begins anew.
     """
     if baseline is None:
         raise UsageError(
