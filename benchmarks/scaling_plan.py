@@ -337,8 +337,9 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
     perturbed_runs = (
-        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all); "
-        f"each has {HORIZON} frames, the horizon of fluid full"
+        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all). "
+        f"A perturbed run covers only the horizon, here {HORIZON} frames as in "
+        "fluid full"
     )
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
