@@ -163,7 +163,8 @@ def train(
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
-        KeyboardInterrupt: interrupted; the state after the last step is stored.
+        KeyboardInterrupt: interrupted; the state after the last step is stored. Of a
+            model that is fitted as a whole nothing is stored; the exception says so.
     """
     entry = find(baseline)
     tier, root_folder, known_splits = locate(split, size, root=root, registry=registry)
@@ -232,7 +233,11 @@ def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
     if job.earlier is None and not is_helper():
         job.folder.clear()
     if model.closed_form:
-        log, steps = fit(job, model)
+        try:
+            log, steps = fit(job, model)
+        except KeyboardInterrupt:
+            advice = "a fit stores nothing before its end: the same command begins anew"
+            raise KeyboardInterrupt(advice) from None
     else:
         log, steps = descend(job, model)
     return _result(job, model, log, steps)

@@ -10,7 +10,7 @@ neither the order of particles nor threads nor devices can change a bit of the s
 
 A particle is stored as vectors of four, each in an array of its own. Loops that only
 look at one particle (stencil, stress, motion) then have one stride, and LLVM takes
-eight particles at a time; P2G and G2P, whose nodes lie anywhere, take the four numbers
+eight particles at a time; P2G and G2P, whose nodes lie anywhere, take several numbers
 of a node at a time.
 
 In the signatures of Taichi functions ``Template`` is a field or a compile-time constant

@@ -106,7 +106,7 @@ HOW_TO_READ = """\
   no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
   GPUs. Each value in its tables comes from one scenario. So compare its numbers with
-  ours only roughly. On the data of the thesis, size `mini` has about a quarter of the
+  ours only roughly. On the splits of the thesis, size `mini` has about a quarter of the
   particles and half the cells along an axis (on cavity 36 % and 60 %). So at `mini`
   compare only the order of the models.
 - **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that

@@ -258,8 +258,11 @@ class _Program(_LazyGroup):
                 _command_line_errors(),
             ):
                 return super().invoke(ctx)
-        except KeyboardInterrupt:
-            print_on_stderr(_interruption_message(ctx.invoked_subcommand))
+        except KeyboardInterrupt as interruption:
+            message = _interruption_message(ctx.invoked_subcommand)
+            if interruption.args:
+                message = f"lagbench: interrupted; {interruption}"
+            print_on_stderr(message)
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise
@@ -553,10 +556,7 @@ def _interruption_message(command: str | None) -> str:
     for option in ("--force", "--again", "--fresh"):
         if option in sys.argv:
             same_command += f", without {option},"
-    return (
-        f"lagbench: interrupted; {same_command} goes on where it stopped, or begins "
-        "anew if nothing was saved yet"
-    )
+    return f"lagbench: interrupted; {same_command} goes on where it stopped"
 
 
 def _unexpected_error_message(error: Exception) -> str:

@@ -103,6 +103,22 @@ def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) ->
     assert validate("predictions.nc", isolated=False).valid
 
 
+def test_an_interrupted_fit_begins_anew(
+    lagbench: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unlike a training by steps it stores nothing on its way, and says so."""
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("scipy.optimize._minimize._minimize_neldermead", interrupt)
+    result = lagbench("train", "--baseline", "hybrid-projection", *TINY)
+    assert result.exit_code == 130
+    assert "the same command begins anew" in result.stderr
+    assert "goes on" not in result.stderr
+    assert not list(Path("runs").rglob("weights.pt"))
+
+
 @pytest.mark.slow
 def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     """Without --json each command says what it did and which one comes next, down to
