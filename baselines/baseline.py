@@ -12,6 +12,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
@@ -24,7 +25,7 @@ from pydantic import (
 )
 from torch import Tensor, nn
 
-from lagbench.data.box import Box, parse_periodic
+from lagbench.data.box import AXES, Box, parse_periodic
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
 
@@ -137,33 +138,61 @@ class Baseline(nn.Module):
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
-        if info.periodic and not self.any_box:
-            raise UsageError(
-                f"{self.method} knows boxes with walls only",
-                where=f"the box of {info.split} {info.size}",
-                expected="walls along every axis",
-                got=f"periodic along {', '.join(info.periodic)}",
-                fix=self._fix_box(),
-            )
-        if len(info.bounds) != 2 and not self.any_box:
-            raise UsageError(
-                f"{self.method} knows two dimensions only",
-                where=f"the box of {info.split} {info.size}",
-                expected="bounds of x and y",
-                got=f"{len(info.bounds)} axes",
-                fix=self._fix_box(),
-            )
+        self._check_box(info.box, where=f"the box of {info.split} {info.size}")
         self.options = options
         self.info = info
         self.box = TensorBox(info.box)
 
-    def _fix_box(self) -> str:
+    @classmethod
+    def check_data_set(
+        cls, split: str, size: str, box: Box, *, is_full_box: bool
+    ) -> None:
+        """Refuse a data set that no recipe makes fit for the model.
+
+        A training calls it before it looks for a recipe.
+
+        Args:
+            split: name of the split.
+            size: name of the size.
+            box: box of the data set.
+            is_full_box: whether the matter fills the box.
+
+        Raises:
+            UsageError: the model does not know such data.
+        """
+        cls._check_box(box, where=f"the box of {split} {size}")
+
+    @classmethod
+    def _check_box(cls, box: Box, *, where: str) -> None:
+        """Refuse a periodic box or a cube if the model does not know them."""
+        if cls.any_box:
+            return
+        if box.is_periodic:
+            periodic = compress(AXES, box.periodic)
+            raise UsageError(
+                f"{cls.method} knows boxes with walls only",
+                where=where,
+                expected="walls along every axis",
+                got=f"periodic along {', '.join(periodic)}",
+                fix=cls._fix_box(),
+            )
+        if box.dimension != 2:
+            raise UsageError(
+                f"{cls.method} knows two dimensions only",
+                where=where,
+                expected="bounds of x and y",
+                got=f"{box.dimension} axes",
+                fix=cls._fix_box(),
+            )
+
+    @classmethod
+    def _fix_box(cls) -> str:
         """Return what helps where the model does not know a box."""
         advice = "train neuralmpm, or a graph network such as gns"
-        package = type(self).__module__
+        package = cls.__module__
         if not package.startswith("lagbench."):
             advice += (
-                f"; or, if {type(self).__name__} of {package} knows such boxes, state "
+                f"; or, if {cls.__name__} of {package} knows such boxes, state "
                 "any_box = True in its class"
             )
         return advice

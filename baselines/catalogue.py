@@ -15,7 +15,12 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning, list_entry_points, package_of
+from lagbench.data.registry import (
+    PluginWarning,
+    Size,
+    list_entry_points,
+    package_of,
+)
 from lagbench.errors import (
     LagbenchError,
     UsageError,
@@ -76,6 +81,21 @@ def find(name: str) -> CatalogueEntry:
             got=_describe_error(error),
             fix="mend or uninstall that package",
         ) from error
+
+
+def check_data_set(entry: CatalogueEntry, size: Size) -> None:
+    """Refuse a data set that no recipe makes fit for a baseline.
+
+    Args:
+        entry: the baseline.
+        size: description of the data set.
+
+    Raises:
+        UsageError: the baseline does not know such data.
+    """
+    entry.model.check_data_set(
+        size.split, size.name, size.box, is_full_box=size.is_full_box
+    )
 
 
 def load_all() -> dict[str, CatalogueEntry]:

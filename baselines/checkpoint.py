@@ -550,13 +550,17 @@ def _check_other_size(
     size = registry.size(trained.split, size).name
     entry = find(checkpoint.baseline)
     command = f"lagbench train --baseline {entry.name} {trained.split} --size {size}"
+    advice = (
+        f"train it there: {command}; if the model has no recipe for this size, write "
+        "one and add --recipe FILE.yaml (docs/baselines.md)"
+    )
     if not entry.model.any_size:
         raise UsageError(
             f"{entry.model.method} predicts only the size that it was trained on",
             where="--size",
             expected=trained.size,
             got=size,
-            fix=f"train it there: {command}",
+            fix=advice,
         )
     target = read_dataset_info(trained.split, size, root=root, registry=registry)
     same_box = target.box == trained.box
@@ -569,7 +573,7 @@ def _check_other_size(
             expected=f"box {trained.bounds}, {trained.frame_interval:g} s between "
             f"frames",
             got=f"box {target.bounds}, {target.frame_interval:g} s",
-            fix=f"train it there: {command}",
+            fix=advice,
         )
     return target
 

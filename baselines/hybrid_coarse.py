@@ -38,6 +38,7 @@ from scipy.optimize import Bounds, minimize
 from scipy.stats.qmc import Halton
 from torch import Tensor
 
+from lagbench.data.box import Box
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
@@ -111,7 +112,8 @@ class HybridCoarse(Hybrid):
 
     def __init__(self, options: HybridCoarseOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        self.size = _described(info)
+        _check_split(info.split, info.size)
+        self.size = load_registry().size(info.split, info.size)
         coarse = coarser(self.size, options.times)
         if coarse is None:
             raise UsageError(
@@ -123,6 +125,20 @@ class HybridCoarse(Hybrid):
             )
         self.coarse = coarse
         self.register_buffer("coefficients", torch.zeros(len(COEFFICIENTS)))
+
+    @classmethod
+    def check_data_set(
+        cls, split: str, size: str, box: Box, *, is_full_box: bool
+    ) -> None:
+        """Refuse a data set other than the free surfaces of lagbench.
+
+        :meth:`Baseline.check_data_set` describes the arguments.
+
+        Raises:
+            UsageError: the solver does not know the data set.
+        """
+        super().check_data_set(split, size, box, is_full_box=is_full_box)
+        _check_split(split, size)
 
     # --- the solver ---------------------------------------------------------------
 
@@ -270,21 +286,25 @@ def _next_position(rollout: CoarseRollout) -> Floats:
         return np.full_like(rollout.position, np.nan)
 
 
-def _described(info: DatasetInfo) -> Size:
-    """Return the description of the data set in datasets.yaml.
+def _check_split(split: str, size: str) -> None:
+    """Refuse a split that the solver does not know.
+
+    Args:
+        split: name of the split.
+        size: name of the size, for the message.
 
     Raises:
-        UsageError: the solver does not know it.
+        UsageError: it is no split of free surfaces of lagbench.
     """
-    if info.split not in SOLVED:
-        raise UsageError(
-            "the hybrid coarse solver knows the free surfaces of lagbench only",
-            where=f"{info.split} {info.size}",
-            expected=", ".join(SOLVED),
-            got=info.split,
-            fix="train neuralmpm, or a graph network such as gns",
-        )
-    return load_registry().size(info.split, info.size)
+    if split in SOLVED:
+        return
+    raise UsageError(
+        "the hybrid coarse solver knows the free surfaces of lagbench only",
+        where=f"{split} {size}",
+        expected=", ".join(SOLVED),
+        got=split,
+        fix="train neuralmpm, or a graph network such as gns",
+    )
 
 
 def has_solids(size: Size) -> bool:

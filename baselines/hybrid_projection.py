@@ -306,6 +306,28 @@ class HybridProjection(Hybrid):
             count += 1
         self.register_buffer("coefficients", torch.zeros(count))  # a, b, c, d
 
+    @classmethod
+    def check_data_set(
+        cls, split: str, size: str, box: Box, *, is_full_box: bool
+    ) -> None:
+        """Refuse a data set whose matter does not fill its box.
+
+        :meth:`Baseline.check_data_set` describes the arguments.
+
+        Raises:
+            UsageError: the data set has a free surface.
+        """
+        super().check_data_set(split, size, box, is_full_box=is_full_box)
+        if is_full_box:
+            return
+        raise UsageError(
+            "the hybrid projection solver knows full boxes only",
+            where=f"{split} {size}",
+            expected="fluid that fills its box",
+            got="a free surface",
+            fix="train neuralmpm, or a graph network such as gns",
+        )
+
     @property
     def forcing_seen(self) -> frozenset[str]:
         """The force that drives the flow, and the obstacle of a channel."""

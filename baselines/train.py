@@ -32,7 +32,7 @@ from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters
-from .catalogue import find
+from .catalogue import check_data_set, find
 from .checkpoint import check_weights, load_weights, round_weights, save
 from .dataset_info import find_forcing, read_dataset_info
 from .job import TrainingJob
@@ -59,6 +59,7 @@ MEMORY_HINT = (
     ".lags"
 )
 FIT_STEPS = 1  # a closed form counts as one step
+FITTING = "fitting"  # the stage in which a fit evaluates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +176,7 @@ def train(
             start, entry, tier, root=root_folder, registry=known_splits
         )
         learned_options = initial.options
+    check_data_set(entry, tier)
     plan = recipe_for(
         entry,
         tier.split,
@@ -497,15 +499,10 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         )
 
     if model.fits_batches:
-        scenarios = _read_scenarios(
-            job,
-            most=getattr(model.options, "scenarios", None),
-            evaluations=int(getattr(model, "evaluations", 0)),
-        )
-
-        def count(evaluated: int) -> None:
-            job.meter.count(evaluated, scenarios=evaluated)
-
+        most = getattr(model.options, "scenarios", None)
+        scenarios = _read_scenarios(job, most=most)
+        evaluations = int(getattr(model, "evaluations", 0))
+        count = functools.partial(_count_evaluations, job.meter, evaluations)
         numbers = model.fit(scenarios, count=count)  # type: ignore[operator]
     else:
         positions = _positions(_read_scenarios(job))
@@ -541,15 +538,35 @@ def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
         yield scenario.position.transpose(0, 1).numpy()
 
 
-def _read_scenarios(
-    job: TrainingJob, *, most: int | None = None, evaluations: int = 0
-) -> Iterator[Batch]:
+def _count_evaluations(meter: Meter, evaluations: int, evaluated: int) -> None:
+    """Count what a fit has evaluated. The first count begins a stage of its own.
+
+    A scenario is read in less time than an evaluation takes, so they are not counted
+    together: the rate would be of both.
+
+    Args:
+        meter: counts the work of the training.
+        evaluations: how many evaluations the fit makes, at most.
+        evaluated: how many were made since the last count.
+    """
+    if meter.stage == FITTING:
+        meter.count(evaluated, scenarios=evaluated)
+        return
+    meter.begin(
+        FITTING,
+        total=evaluations,
+        scenarios=evaluations,
+        done=evaluated,
+        unit="evaluations",
+    )
+
+
+def _read_scenarios(job: TrainingJob, *, most: int | None = None) -> Iterator[Batch]:
     """Yield each training scenario as a batch of one window.
 
     Args:
         job: the training.
         most: scenarios to read, the first ones; all when None.
-        evaluations: units of work that the fit counts after the reading.
     """
     size = job.registry.size(job.info.split, job.info.size)
     viscosity = size.viscosity()
@@ -565,9 +582,7 @@ def _read_scenarios(
         check_contents(size, job.root, files)
         paths += files.values()
     paths = paths[:most]
-    total = len(paths) + max(evaluations, 1)
-    # The command line shows the steps of a training: each scenario and each evaluation.
-    job.meter.begin("fitting", total=total, scenarios=total)
+    job.meter.begin("reading", total=len(paths), scenarios=len(paths), unit="scenarios")
     for path in paths:
         scenario = scenario_batch(path, viscosity=viscosity)
         job.meter.count(1, scenarios=1)

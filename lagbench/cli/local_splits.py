@@ -107,10 +107,15 @@ def import_command(
             metavar="FOLDER", help="Folder of train, valid, test and metadata."
         ),
     ],
-    file_format: Annotated[
-        str, option("--format NAME", "gns-npz or lagrangebench-h5.")
-    ],
     output: OutputOption,
+    file_format: Annotated[
+        str | None,
+        option(
+            "--format NAME",
+            "gns-npz or lagrangebench-h5; by default the one whose files the folder "
+            "holds.",
+        ),
+    ] = None,
     kinds: Annotated[
         str | None,
         option(
@@ -133,6 +138,8 @@ def import_command(
     quiet: QuietFlag = False,
 ) -> None:
     """Make a local split from the data of another code base.
+
+    For files in neither format there is `lagbench adopt`.
 
     You train and score models on a local split as on any other split.
     """

@@ -43,7 +43,7 @@ def progress_bar(
 
     Args:
         quiet: whether to show nothing; None is yielded then.
-        unit: what the work is counted in.
+        unit: what the work is counted in, where its stage has no word of its own.
         seconds_per_line: time between two lines that go to a file or a pipe [s].
     """
     if quiet:
@@ -139,6 +139,7 @@ def _format_rate(progress: Progress, unit: str) -> str:
     """
     if not progress.scenarios and not progress.scenarios_done:
         return ""
+    unit = progress.unit or unit
     count = f"{progress.scenarios_done}"
     if progress.scenarios:
         count = f"{count}/{progress.scenarios}"

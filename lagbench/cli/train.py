@@ -173,15 +173,15 @@ def _warn_of_scorability(
     changes: tuple[str, ...],
 ) -> None:
     """Warn before the training where a user's own data cannot be scored."""
-    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.catalogue import check_data_set, find
     from lagbench.baselines.recipe import recipe_for
 
     tier, folder, _ = locate(split, size, root=root)
     if tier.simulated:
         return
-    plan = recipe_for(
-        find(baseline), tier.split, tier.name, variant=recipe, settings=changes
-    )
+    entry = find(baseline)
+    check_data_set(entry, tier)
+    plan = recipe_for(entry, tier.split, tier.name, variant=recipe, settings=changes)
     is_validated = plan.training.validate_every != 0
     reasons = list(check_scorability(tier, folder, validated=is_validated))
     if reasons:
@@ -226,7 +226,7 @@ def _describe(result: TrainingResult, data_option: str) -> Iterator[str]:
             "hours and track count the training of these weights too"
         )
     yield f"  parameters {result.parameters}"
-    yield f"  loss       {_describe_loss(result)}"
+    yield _describe_learning(result)
     if result.best_value is not None:
         best = f"{result.best_value:.4g} on valid, step {result.best_step}"
         if result.best_step == 0:
@@ -256,13 +256,20 @@ def _describe_time(result: TrainingResult) -> str:
     return text
 
 
-def _describe_loss(result: TrainingResult) -> str:
-    """Return all terms of the loss, their sum last."""
+def _describe_learning(result: TrainingResult) -> str:
+    """Return the terms of the loss, their sum last; of a fit the learned numbers."""
+    from lagbench.baselines.catalogue import find
+
+    if find(result.baseline).model.closed_form:
+        numbers = [f"{name} {value:.4g}" for name, value in result.loss.items()]
+        return f"  fit        {', '.join(numbers)}"
+
     terms = sorted(result.loss)
     if "total" in terms:
         terms.remove("total")
         terms.append("total")
-    return ", ".join(f"{term} {result.loss[term]:.4g}" for term in terms)
+    values = [f"{term} {result.loss[term]:.4g}" for term in terms]
+    return f"  loss       {', '.join(values)}"
 
 
 def _describe_budget(result: TrainingResult) -> str:

@@ -289,8 +289,8 @@ def _refuse_duplicates(rows: Sequence[Row]) -> None:
 def import_split(
     source: str | Path,
     *,
-    format: str,
     output: str | Path,
+    format: str | None = None,
     kinds: Mapping[int, str] | None = None,
     progress: Callable[[Progress], None] | None = None,
     **options: Unpack[DataOptions],
@@ -303,8 +303,9 @@ def import_split(
 
     Args:
         source: folder of the three files and metadata.json.
-        format: "gns-npz" or "lagrangebench-h5".
         output: folder to make; its last part is the name of the split.
+        format: "gns-npz" or "lagrangebench-h5"; by default the one whose files the
+            folder holds.
         kinds: number of a kind of particles to the material that it stands for, or to
             "drop".
         progress: called as the work advances.
@@ -312,7 +313,8 @@ def import_split(
             :class:`lagbench.exchange.trajectory.Description`.
 
     Raises:
-        UsageError: unknown format, a folder that is there, a task that does not fit the
+        UsageError: unknown format, a folder whose files are of no format or of both
+            and none is named, an output folder that is there, a task that does not fit the
             data, a period that the positions contradict.
         UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
             pickle of more than arrays, or particles of a kind that no material is
@@ -330,8 +332,11 @@ def import_split(
             got="axes",
             fix="leave it out; adopt takes it",
         )
-    form = parse_format(format)
     folder = Path(source)
+    if format is None:
+        form = _recognise_format(folder)
+    else:
+        form = parse_format(format)
     names = _file_names(form)
     _require_files(folder, names)
     metadata = read_metadata(folder, form)
@@ -366,6 +371,32 @@ def _file_names(form: Format) -> list[str]:
 
 def _missing_files(folder: Path, names: Sequence[str]) -> list[str]:
     return [name for name in names if not (folder / name).is_file()]
+
+
+def _recognise_format(folder: Path) -> Format:
+    """Return the format whose three files a folder holds; refuse none, and several."""
+    present = []
+    layouts = []
+    for form in Format:
+        names = _file_names(form)
+        layouts.append(f"{', '.join(names)} ({form.value})")
+        if not _missing_files(folder, names):
+            present.append(form.value)
+    if len(present) == 1:
+        return Format(present[0])
+    if present:
+        got = "files of both formats"
+        fix = f"name one: --format {present[0]}"
+    else:
+        got = "no such files"
+        fix = "name their folder; `lagbench adopt` takes other files"
+    raise UsageError(
+        "the format of the data is not clear",
+        where=str(folder),
+        expected=" or ".join(layouts),
+        got=got,
+        fix=fix,
+    )
 
 
 def _require_files(folder: Path, names: Sequence[str]) -> None:

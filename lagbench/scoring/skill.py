@@ -243,8 +243,9 @@ def compare_with_solvers(
             if getattr(header, label) is None:
                 missing.append(label)
         return None, (
-            f"the predictions do not state {' and '.join(missing)}; `lagbench bench "
-            f"solver` measures our solver on the machine of the model"
+            f"the predictions do not state {' and '.join(missing)}; `lagbench "
+            "predict` without --no-bench states both, and `lagbench bench solver` "
+            "measures our solver on the machine of any other model"
         )
     ratio = compute_against_classical(
         [submission], solvers, seconds=costs, seconds_per_frame=seconds

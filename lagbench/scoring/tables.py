@@ -258,7 +258,10 @@ def _flag_line(flag: Flag) -> str:
 
 def _warning_lines(card: ScoreCard) -> Iterator[str]:
     for warning in card.warnings:
-        yield f"warning [{warning.check}] {warning.what}: {warning.got}"
+        place = ""
+        if warning.where not in warning.got:
+            place = f" ({warning.where})"
+        yield f"warning [{warning.check}] {warning.what}{place}: {warning.got}"
         if warning.fix:
             yield f"  fix: {warning.fix}"
 

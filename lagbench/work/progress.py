@@ -25,6 +25,8 @@ class Progress:
     seconds: float  # time since the start [s]
     # scenarios that an earlier run had finished; they took none of that time
     before: int = 0
+    # what is counted as scenarios, in the plural; empty for the command's own word
+    unit: str = ""
 
     @property
     def rate(self) -> float:
@@ -45,10 +47,18 @@ class Meter:
         )
         self._started = time.monotonic()
 
-    def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
+    def begin(
+        self, stage: str, *, total: int, scenarios: int, done: int = 0, unit: str = ""
+    ) -> None:
         """Start a stage with counts at zero, or where an earlier run stopped.
 
-        ``done`` counts units and scenarios alike: it suits stages of one unit each.
+        Args:
+            stage: the stage, in a word or two.
+            total: units of work to do.
+            scenarios: scenarios to finish.
+            done: units that are done, and scenarios likewise: it suits stages of one
+                unit each.
+            unit: what is counted as scenarios, in the plural.
         """
         self.stage = stage
         self._progress = Progress(
@@ -59,6 +69,7 @@ class Meter:
             scenarios=scenarios,
             seconds=0.0,
             before=done,
+            unit=unit,
         )
         self._started = time.monotonic()
         self.count()

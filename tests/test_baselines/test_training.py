@@ -873,12 +873,18 @@ def test_a_users_fit_gets_whole_scenarios_as_batches(
     assert read_training_log(result.folder)["loss"]["best"] == pytest.approx(best)
     exact = load(result.folder / "checkpoint.pt").weights["a"]
     assert float(exact) == pytest.approx(best)
+    reading = [report for report in reports if report.stage == "reading"]
+    assert reading[-1].total == reading[-1].done == len(paths)
     fitting = [report for report in reports if report.stage == "fitting"]
-    assert fitting[-1].total == fitting[-1].done == len(paths) + 3
+    assert [report.done for report in fitting] == [1, 2, 3]
+    assert fitting[-1].total == 3
 
 
 def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
-    """A fit that measures rollouts takes minutes; each measurement is reported."""
+    """A fit that measures rollouts takes minutes; each measurement is reported.
+
+    The rate is that of the evaluations alone, of which the first starts the clock.
+    """
     reports: list[Progress] = []
     evaluations = 4
     run(
@@ -888,9 +894,33 @@ def test_a_fit_counts_scenarios_and_evaluations(run: Run) -> None:
         "model.scenarios=1",
         progress=reports.append,
     )
+    reading = [report for report in reports if report.stage == "reading"]
+    assert reading[0].unit == "scenarios"
+    assert reading[-1].done == reading[-1].scenarios == 1  # of two in train
     fitting = [report for report in reports if report.stage == "fitting"]
-    scenarios = 1  # of two in train
-    assert fitting[0].total == fitting[0].scenarios == scenarios + evaluations + 1
-    assert fitting[0].done == 0
+    first = fitting[0]
+    assert first.unit == "evaluations"
+    assert first.done == 1
+    assert first.rate == 0.0
+    assert first.total == first.scenarios == evaluations + 1
     last = fitting[-1]
-    assert scenarios + evaluations <= last.done <= last.total
+    assert evaluations <= last.done <= last.total
+
+
+@pytest.mark.parametrize(
+    ("baseline", "split", "words"),
+    [
+        ("hybrid-coarse", "cylinder", "free surfaces of lagbench only"),
+        ("hybrid-projection", "fluid-3d", "full boxes only"),
+        ("var", "poiseuille", "boxes with walls only"),
+        ("var", "cavity-3d", "two dimensions only"),
+    ],
+)
+def test_no_recipe_is_asked_for_where_none_can_help(
+    tmp_path: Path, baseline: str, split: str, words: str
+) -> None:
+    """The model does not know such data; no file of recipes would change that."""
+    with pytest.raises(UsageError, match=words) as caught:
+        train(baseline, split, "tiny", root=tmp_path)
+    assert "recipe" not in str(caught.value)
+    assert "neuralmpm" in str(caught.value.fix)

@@ -18,7 +18,7 @@ from typer.testing import Result
 import lagbench
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import export, import_split
 from lagbench.make.generate import GenerationResult
 
@@ -256,3 +256,30 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError) as caught:
         import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
     assert "--format lagrangebench-h5" in str(caught.value)
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+def test_the_files_tell_their_format(tmp_path: Path, form: str) -> None:
+    """Without a format the split is the same."""
+    gns = form == "gns-npz"
+    source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
+    named = import_split(source, format=form, output=tmp_path / "named" / "own")
+    unnamed = import_split(source, output=tmp_path / "unnamed" / "own")
+    for subset in SUBSETS:
+        assert_array_equal(
+            positions(unnamed.folder, subset), positions(named.folder, subset)
+        )
+    assert (unnamed.folder / "split.yaml").read_text() == (
+        named.folder / "split.yaml"
+    ).read_text()
+
+
+def test_files_of_no_format_and_of_both_do_not_tell_it(tmp_path: Path) -> None:
+    """The message of the first names the command for other files."""
+    with pytest.raises(UsageError, match="adopt"):
+        import_split(tmp_path, output=tmp_path / "own")
+    for subset in SUBSETS:
+        (tmp_path / f"{subset}.h5").touch()
+        (tmp_path / f"{subset}.npz").touch()
+    with pytest.raises(UsageError, match="--format gns-npz"):
+        import_split(tmp_path, output=tmp_path / "own")

@@ -31,6 +31,7 @@ from lagbench.scoring.published_scores import read_scores
 from lagbench.scoring.score import scores_folder
 from lagbench.scoring.score_file_checks import read_published_scores
 from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.tables import flag_lines
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
 from lagbench.submission.predictions import Predictions
@@ -284,6 +285,24 @@ def test_a_wild_prediction_gets_finite_scores(
     checks = {warning["check"] for warning in content["warnings"]}
     assert checks >= {"in_domain", "max_displacement"}
     assert content["flags"]["physics"]["raised"]
+
+
+def test_a_printed_warning_says_where(bench: ScoreBench, tmp_path: Path) -> None:
+    """Its line names scenario, frames and particle of a jump."""
+
+    def jumping(truth: Any, n: int, h: int) -> Any:
+        positions = np.array(straight(truth, n, h))
+        positions[3:, 7] += 9.0
+        return positions
+
+    path = bench.submit(tmp_path / "predictions.nc", jumping)
+    card = bench.evaluate(path)
+    printed = "\n".join(flag_lines(card))
+    found = re.search(r"warning \[max_displacement\] .* \((.*)\): ", printed)
+    assert found is not None
+    warnings = {warning.check: warning for warning in card.warnings}
+    assert found.group(1) == warnings["max_displacement"].where
+    assert "particle 7" in found.group(1)
 
 
 def test_a_validated_file_is_not_validated_again(
