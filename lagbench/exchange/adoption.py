@@ -314,8 +314,8 @@ def import_split(
 
     Raises:
         UsageError: unknown format, a folder whose files are of no format or of both
-            and none is named, an output folder that is there, a task that does not fit the
-            data, a period that the positions contradict.
+            and none is named, an output folder that is there, a task that does not fit
+            the data, a period that the positions contradict.
         UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
             pickle of more than arrays, or particles of a kind that no material is
             known for.
