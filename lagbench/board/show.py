@@ -123,8 +123,7 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
             f"{HEADINGS[AGAINST_CLASSICAL.key]}: score over that of the best classical "
             "solver that costs no more"
         )
-        if tab.run is None:
-            legend.append("s/frame of classical and naive rows: measured in other runs")
+    legend += _legend_of_times(tab)
     if any(is_beside_dearer_solver(row) for row in rows):
         legend.append(
             f"{SOLVER_COSTS_MORE}: all classical solvers cost more than the model"
@@ -137,6 +136,16 @@ def _table_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> Table:
         tuple(table_rows),
         keys=KEYS,
     )
+
+
+def _legend_of_times(tab: Tab) -> Iterator[str]:
+    """Yield what the column of times means, and which times compare."""
+    if tab.run is not None:
+        yield "s/frame: time of a frame on one core, measured in one run"
+        return
+    yield "s/frame: time of a frame of one scenario"
+    if tab.references:
+        yield "s/frame of classical and naive rows: measured in other runs"
 
 
 def _format_lines(
