@@ -126,9 +126,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         )
     if no_verdict:
         sentences.append(
-            f"On {_join(no_verdict)} there is no verdict, because no classical solver"
-            " is as cheap as the best model, and this model is not significantly more"
-            " accurate than the cheapest solver."
+            f"On {_join(no_verdict)} there is no verdict. There every classical solver"
+            " costs more than the best model, and the test does not find this model"
+            " more accurate than the cheapest solver."
         )
         sentences += places
     return " ".join(sentences)

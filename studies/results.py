@@ -92,9 +92,9 @@ HOW_TO_READ = """\
   perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
 - **Tables of scores** contain models and reference predictors. A cell has the mean over
   the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
-  several seeds, the number after ± is the standard deviation over the seeds. The
-  leaderboard resamples the seeds too, so its intervals are wider for a model with few
-  seeds. "1440 undefined" means that the metric is undefined in 1440 frames. The column
+  several seeds, the number after ± is the standard deviation over the seeds. For such a
+  model the leaderboard resamples the seeds too, so its intervals are wider.
+  "1440 undefined" means that the metric is undefined in 1440 frames. The column
   `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
   seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
@@ -170,10 +170,10 @@ A training takes steps, and each step uses some windows. An epoch is one pass ov
 windows of train. VAR and the hybrids are fitted instead, without steps. The three
 columns *validation at* show the first seed. They have the lowest validation error in
 the first quarter, the first half and all of the steps. `validated` is the metric of
-this error (`rmse`: the position error, in early trainings). The last column shows how
-much the error decreased in the second half of the steps. If it decreased by more than
-2 %, the training has not converged. Hours do not include hours on a GPU or validations.
-(Only those of the first seed of NeuralMPM on cavity mini include validations.) If a
+this error. (`rmse` is the position error. Only our oldest trainings have it.) The last
+column shows how much the error decreased in the second half of the steps. If it
+decreased by more than 2 %, the training has not converged. Hours do not include hours on
+a GPU or validations. (Only those of the first seed of NeuralMPM on cavity mini include validations.) If a
 training started from the weights of earlier trainings, its steps, epochs and hours
 include the earlier trainings."""
 

@@ -152,4 +152,4 @@ def _format_rate(progress: Progress, unit: str) -> str:
     duration = f"{seconds:.1f} s"
     if seconds >= LONG:
         duration = format_seconds(seconds)
-    return f"{count} {unit}, {duration} a {unit.removesuffix('s')}"
+    return f"{count} {unit}, {duration} per {unit.removesuffix('s')}"
