@@ -82,7 +82,7 @@ def slow_scoring(done: int, seconds: float) -> Progress:
     ("done", "seconds", "told"),
     [
         (0, 12.0, "0%, 0/20 scenarios"),
-        (2, 250.0, "10%, 2/20 scenarios, 2 min a scenario, 38 min left"),
+        (2, 250.0, "10%, 2/20 scenarios, 2 min per scenario, 38 min left"),
         (2, 25.0, "10%, 2/20 scenarios, 12.5 s per scenario, 4 min left"),
         (5, 4.0, "25%, 5/20 scenarios, 1.25/s, 12 s left"),
     ],
