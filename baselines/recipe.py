@@ -163,6 +163,8 @@ class TrainingOptions(Settings):
                 "[train] or [train, extra]: never test or shift, which are scored, and "
                 "not valid, by which the weights are chosen"
             )
+        if len(set(windows)) < len(windows):
+            raise ValueError("each subset once, as in [train, extra]")
         return windows
 
     def total_steps(self, windows: int, *, processes: int = 1) -> int:

@@ -362,6 +362,7 @@ def test_more_epochs_than_any_machine_could_train_are_refused(
         ("training.windows=[test]", "never test"),
         ("training.windows=[train, valid]", "not valid"),
         ("training.windows=[train, shift]", "shift"),
+        ("training.windows=[train, train]", "each subset once"),
         ("training.learning_rate=.inf", "finite"),
         ("training.precision=off", "'bf16'"),
         ("training.opening_share=true", "opening_share"),
