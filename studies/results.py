@@ -168,14 +168,14 @@ entries, so these questions have no answer:"""
 TRAINING_NOTE = """\
 A training takes steps, and each step uses some windows. An epoch is one pass over all
 windows of train. VAR and the hybrids are fitted instead, without steps. The three
-columns *validation at* show the first seed. They have the lowest validation error in
-the first quarter, the first half and all of the steps. `validated` is the metric of
-this error. (`rmse` is the position error. Only our oldest trainings have it.) The last
-column shows how much the error decreased in the second half of the steps. If it
-decreased by more than 2 %, the training has not converged. Hours do not include hours
-on a GPU or validations. (Only those of the first seed of NeuralMPM on cavity mini
-include validations.) If a training started from the weights of earlier trainings, its
-steps, epochs and hours include the earlier trainings."""
+columns *validation at* belong to the first seed. They state the lowest validation error
+that it reached within the first quarter, the first half and all of the steps.
+`validated` is the metric of this error. (`rmse` is the position error. Only our oldest
+trainings have it.) The last column shows how much the error decreased in the second
+half of the steps. If it decreased by more than 2 %, the training has not converged.
+Hours do not include hours on a GPU or validations. (Only those of the first seed of
+NeuralMPM on cavity mini include validations.) If a training started from the weights of
+earlier trainings, its steps, epochs and hours include the earlier trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
