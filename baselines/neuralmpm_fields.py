@@ -127,12 +127,15 @@ class FieldEncoder(nn.Module):
         slot = self.slot[material]
         is_unknown = slot < 0
         if bool(is_unknown.any()):
+            present = sorted(set(material.tolist()))
+            all_materials = sorted({*self.options.materials, *present})
             raise DataError(
                 "a material that the model does not know",
                 where="model.materials",
                 expected=list(self.options.materials),
-                got=sorted(set(material.tolist())),
-                fix="predict with weights that were trained with these materials",
+                got=present,
+                fix=f"train with --set 'model.materials={all_materials}'; trained "
+                "weights know only the materials of their training",
             )
         return sample * self.material_count + slot
 

@@ -260,7 +260,8 @@ def _parse_axes(text: str) -> tuple[str, ...]:
 def _next_steps(local_split: LocalSplit) -> Iterator[str]:
     """Yield the commands that predict with a model of the user, and that train one.
 
-    The recipe has no options of a model, so every baseline can be trained by it.
+    The recipe has no options of a model, so every baseline can be trained by it. Only
+    NeuralMPM needs to know the materials, if there are others than liquid.
     """
     folder = shlex.quote(f"{local_split.folder}/")
     training = "training: {steps: 2000, learning_rate: 1.0e-3, schedule: cosine}"
@@ -271,7 +272,11 @@ def _next_steps(local_split: LocalSplit) -> Iterator[str]:
     yield "  train   lagbench has no recipe for your data; begin with this one:"
     yield f"          echo {shlex.quote(recipe)} > {file}"
     options = f"--split {folder} --recipe {file}"
-    yield f"          lagbench train --baseline neuralmpm {options}"
+    materials = ""
+    if local_split.materials != (0,):
+        numbers = ",".join(map(str, local_split.materials))
+        materials = f" --set 'model.materials=[{numbers}]'"
+    yield f"          lagbench train --baseline neuralmpm {options}{materials}"
     yield "          or a small graph network:"
     yield (
         f"          lagbench train --baseline gns {options} --set model.latent=32 "

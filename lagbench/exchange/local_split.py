@@ -98,6 +98,7 @@ class LocalSplit:
     scenarios: dict[str, int]  # number of scenarios by subset
     frames: int  # frames of all scenarios
     particles: tuple[int, int]  # the fewest and the most particles of a scenario
+    materials: tuple[int, ...]  # numbers of the materials of all scenarios
     input_frames: int  # frames given to a model
     horizon: int  # frames to predict
     # the walls, or one period [length]: lowest and highest position along each axis
@@ -246,7 +247,10 @@ def make_local_split(
         built = root / description.name
         size = load(built / DESCRIPTION).size(description.name, SIZE)
         _move_to_place(built, folder)
-    local_split = _summarise(folder, size, manifest, spacing=builder.spacing)
+    materials = tuple(sorted(builder.materials))
+    local_split = _summarise(
+        folder, size, manifest, spacing=builder.spacing, materials=materials
+    )
     notes = builder.periods.describe_extent(spacing=builder.spacing)
     return replace(local_split, notes=(*local_split.notes, *notes))
 
@@ -301,7 +305,12 @@ def _period_error(box: Box) -> UsageError:
 
 
 def _summarise(
-    folder: Path, size: Size, manifest: Manifest, *, spacing: float
+    folder: Path,
+    size: Size,
+    manifest: Manifest,
+    *,
+    spacing: float,
+    materials: tuple[int, ...],
 ) -> LocalSplit:
     """Return what is told of a local split that was made."""
     particle_counts = []
@@ -318,6 +327,7 @@ def _summarise(
         scenarios={name: len(ids) for name, ids in size.subsets.items()},
         frames=frame_count,
         particles=(min(particle_counts), max(particle_counts)),
+        materials=materials,
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
         bounds=size.bounds,
@@ -493,6 +503,7 @@ class SplitBuilder:
     spacing: float = 0.0
     # of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
+    materials: set[int] = field(default_factory=set)  # numbers of all their materials
     # extent of the positions of all particles [length]
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(1, np.inf))
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(1, -np.inf))
@@ -557,6 +568,7 @@ class SplitBuilder:
             for position, velocity in self._read_frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
+        self.materials.update(np.unique(trajectory.material).tolist())
 
     def _check_dimension(self, trajectory: Trajectory) -> None:
         """Refuse positions with other components than the bounds or those before."""

@@ -31,6 +31,7 @@ KINDS = {
     "a cube": "",
     "a periodic cube": "--periodic x,y,z --bounds 0,1,0,1,0,1",
     "unequal counts": "",
+    "several materials": "",
 }
 """Options of `adopt` by the kind of data."""
 
@@ -44,8 +45,12 @@ def write_runs(folder: Path, kind: str) -> list[Path]:
             positions = np.concatenate([run, run[..., :1]], axis=-1)
         if kind == "unequal counts":
             positions = run[:, : 180 + number]
-        path = folder / f"run{number:02d}.npy"
-        np.save(path, positions)
+        path = folder / f"run{number:02d}.npz"
+        material = np.zeros(positions.shape[1], np.int8)
+        if kind == "several materials":
+            # jelly in even runs, snow in odd ones, and liquid in all
+            material[::2] = 1 + number % 2
+        np.savez(path, position=positions, material=material)
         paths.append(path)
     return paths
 
@@ -55,7 +60,9 @@ def write_runs(folder: Path, kind: str) -> list[Path]:
 def test_the_printed_commands_train(
     kind: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """NeuralMPM and a graph network learn from walls, periods, cubes and any counts."""
+    """NeuralMPM and a graph network learn from walls, periods, cubes, any counts, and
+    any materials.
+    """
     monkeypatch.chdir(tmp_path)
     paths = write_runs(tmp_path, kind)
     options = ("--radius", "0.1", "--frame-interval", "0.1", *KINDS[kind].split())
@@ -82,8 +89,8 @@ def test_every_baseline_takes_the_printed_recipe(
 ) -> None:
     """The recipe fitted graph networks only.
 
-    The one baseline that needs a viscosity refuses these data, which have none. So does
-    the one that solves our free surfaces.
+    The baselines that contain a solver refuse these data: one knows full boxes, the
+    other the free surfaces of lagbench.
     """
     monkeypatch.chdir(tmp_path)
     paths = write_runs(tmp_path, "walls")
@@ -103,8 +110,8 @@ def test_every_baseline_takes_the_printed_recipe(
     few_steps = () if is_fitted else FEW_STEPS
     trained = run(*words, *few_steps)
     if baseline == "hybrid-projection":
-        assert trained.exit_code == 4
-        assert "the viscosity is not known" in trained.stderr
+        assert trained.exit_code == 2
+        assert "full boxes only" in trained.stderr
     elif baseline == "hybrid-coarse":
         assert trained.exit_code == 2
         assert "free surfaces of lagbench only" in trained.stderr
