@@ -275,3 +275,45 @@ def test_a_missing_or_changed_card_is_written_again(
     path.unlink()
     generate(SPLIT, SIZE, root=root, registry=unmeasured)
     assert path.read_bytes() == before
+
+
+EDITED = """
+from dataclasses import replace
+from lagbench.generators import curl_noise
+from lagbench.generators.curl_noise import solver_parameters
+
+def initial_state(size, scenario, rng):
+    state = curl_noise.initial_state(size, scenario, rng)
+    parameters = dict(state.parameters)
+    parameters["frequency"] += 1
+    return replace(state, parameters=parameters)
+"""
+
+
+@pytest.mark.parametrize("is_recorded", [True, False])
+def test_an_edited_module_costs_no_file_with_the_recorded_hash(
+    copied: Copy,
+    unmeasured: Registry,
+    right: Measured,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    is_recorded: bool,
+) -> None:
+    """Only files without a recorded hash are simulated again: they may be any draw."""
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    (modules / "edited_noise.py").write_text(EDITED)
+    monkeypatch.syspath_prepend(modules)
+    split = unmeasured.split(SPLIT).model_copy(update={"generator": "edited_noise"})
+    registry = Registry({SPLIT: split}, {})
+    if is_recorded:
+        registry = with_measured(registry, right)
+    root = copied()
+    plan = generate(SPLIT, SIZE, root=root, registry=registry, dry_run=True)
+    if not is_recorded:
+        assert plan.simulated == (0, 1, 2, 3, 4)
+        return
+    assert plan.simulated == ()
+    generate(SPLIT, SIZE, root=root, registry=registry)
+    assert manifest_of(root).dataset_sha256 == right.dataset_sha256
+    verify(SPLIT, SIZE, root=root, registry=registry).check()
