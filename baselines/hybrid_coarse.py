@@ -28,6 +28,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +96,8 @@ class HybridCoarseOptions(Options):
     in_training = frozenset({"scenarios", "frame_step", "evaluations"})
     of_weights = frozenset({"times"})
 
-    times: int = Field(default=2, ge=2, le=4)  # cells of the data's grid over its own
+    # cells of the data's grid over its own, along each axis; 1.5 keeps two of three
+    times: int | float = Field(default=2, ge=1.5, le=4, allow_inf_nan=False)
     scenarios: int = Field(default=24, ge=1)  # of train, to fit on, at most
     frame_step: int = Field(default=10, ge=1)  # frames between those compared
     evaluations: int = Field(default=96, ge=1)  # points at which the error is measured
@@ -114,14 +116,14 @@ class HybridCoarse(Hybrid):
         super().__init__(options, info)
         _check_split(info.split, info.size)
         self.size = load_registry().size(info.split, info.size)
-        coarse = coarser(self.size, options.times)
+        coarse = coarser(self.size, Fraction(options.times))
         if coarse is None:
             raise UsageError(
                 f"{self.method} has no such grid for {info.split} {info.size}",
                 where="model.times",
                 expected="walls on nodes of the coarser grid, and enough cells",
                 got=options.times,
-                fix="train at a larger size, or neuralmpm",
+                fix="another model.times, as 1.5; or a larger size, or neuralmpm",
             )
         self.coarse = coarse
         self.register_buffer("coefficients", torch.zeros(len(COEFFICIENTS)))

@@ -64,6 +64,7 @@ class SubmitResult:
     mean: float | None  # of it over scenarios and seeds; None where undefined
     std: float | None  # over seeds; None for one seed
     flags: tuple[str, ...]  # names of flags that were raised
+    has_cost: bool  # whether the entry states the time of a frame
     board: Path
     # files that were written; verified.yaml, where the entry before had a line there
     files: tuple[Path, ...]
@@ -423,6 +424,7 @@ def _result_of(
         mean=summary.mean,
         std=summary.std,
         flags=tuple(flags),
+        has_cost=entry.cost is not None,
         board=board,
         files=written,
         kept=kept,

@@ -113,6 +113,11 @@ def _describe(result: SubmitResult) -> Iterator[str]:
             "tiny has too few scenarios to rank anything; "
             "use it for trials: --board trial --new-board"
         )
+    if not result.has_cost:
+        yield (
+            "no cost: for it, all predictions must state seconds_per_frame and the "
+            "same device, or meta.yaml must state cost"
+        )
     yield f"written: {', '.join(map(str, result.files))}"
     if result.kept:
         paths = ", ".join(map(str, result.kept))

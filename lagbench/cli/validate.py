@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lagbench.data.local import locate_split
-from lagbench.submission.validation import require_split, validate
+from lagbench.submission.validation import validate
 
 from .options import JsonFlag, QuietFlag, RootOption, option
 from .output import print_result
@@ -32,10 +31,6 @@ def validate_command(
     quiet: QuietFlag = False,
 ) -> None:
     """Check a predictions.nc; print every error and how to fix it."""
-    expected_split = None
-    if split is not None:
-        expected_split, root, _ = locate_split(split, root=root)
-    result = validate(predictions, root=root)
-    require_split(result, expected_split)
+    result = validate(predictions, split=split, root=root)
     print_result(result, [str(result)], as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)

@@ -22,7 +22,12 @@ import h5py
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.local import load_rooted_registry, resolve_root, suggest_split_of
+from lagbench.data.local import (
+    load_rooted_registry,
+    locate_split,
+    resolve_root,
+    suggest_split_of,
+)
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import (
     DataError,
@@ -119,6 +124,7 @@ def seconds_for(path: Path) -> float:
 def validate(
     path: str | Path,
     *,
+    split: str | Path | None = None,
     root: str | Path | None = None,
     require_truth: bool = False,
     isolated: bool = True,
@@ -128,6 +134,8 @@ def validate(
 
     Args:
         path: the file.
+        split: the split to which the predictions must belong, or the path of a local
+            split's folder, which then stands for ``root``.
         root: folder of all data sets, else LAGBENCH_ROOT, else the user data folder;
             the checks ``start``, ``discontinuous_start`` and ``max_displacement`` need
             the test subset there.
@@ -140,7 +148,33 @@ def validate(
     Returns:
         All issues; ``result.check()`` raises unless the file is valid.
         ``lagbench.score`` takes it, so that nothing is read twice.
+
+    Raises:
+        UsageError: there is no such split, or the predictions are for another one.
     """
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root, registry=registry)
+    result = _validate_file(
+        path,
+        root=root,
+        require_truth=require_truth,
+        isolated=isolated,
+        registry=registry,
+    )
+    require_split(result, expected_split)
+    return result
+
+
+def _validate_file(
+    path: str | Path,
+    *,
+    root: str | Path | None,
+    require_truth: bool,
+    isolated: bool,
+    registry: Registry | None,
+) -> ValidationResult:
+    """Check a predictions.nc for whatever split; :func:`validate` has the arguments."""
     folder = resolve_root(root)
     file = Path(path).absolute()
     splits = load_rooted_registry(folder, registry)
@@ -257,8 +291,8 @@ def _find_size(
     except (UsageError, UnreadableFileError) as error:
         parts = _parts_of(error, where="attributes 'split' and 'size'")
         parts["fix"] += (
-            "; predictions for a split of your own are scored with"
-            " lagbench score FILE --split own/, and cannot be submitted"
+            "; predictions for a split of your own are validated and scored with"
+            " --split own/, and cannot be submitted"
         )
         return None, parts
     try:

@@ -587,7 +587,8 @@ def test_what_is_not_given(own: BoardBench) -> None:
         device="two",
         seconds_per_frame=0.25,
     )
-    own.submit(first, second, date=None)
+    result = own.submit(first, second, date=None)
+    assert not result.has_cost
     entry = read_entry(own.entry("mixed"))
     assert entry.cost is None
     today = datetime.datetime.now(datetime.UTC).date()

@@ -199,12 +199,17 @@ def test_a_local_split_is_named_by_its_description_too(
     assert locate_split("split.yaml").root == own.folder.parent
 
 
-def test_predictions_for_a_local_split_are_compared(
+def test_predictions_for_a_local_split_are_validated_and_compared(
     own: LocalSplit, tmp_path: Path
 ) -> None:
     """The split is named as in score: by its folder, without a root."""
     target = tmp_path / "predictions.nc"
     lagbench.template(str(own.folder), output=target)
+    validation = lagbench.validate(target, split=f"{own.folder}/")
+    validation.check()
+    assert validation.split == "mine"
+    with pytest.raises(UsageError, match="another split"):
+        lagbench.validate(target, split="cavity")
     result = lagbench.compare(target, "persistence", split=f"{own.folder}/")
     assert result.split == "mine"
     assert result.second == "persistence"
