@@ -96,5 +96,10 @@ def _describe(result: ExportResult) -> list[str]:
             f"  {left_out} left out: "
             "readers of this format need trajectories of equal lengths"
         )
+    if result.loses_wall_motion:
+        lines.append(
+            "  the walls move, and the files do not tell how: the format has no wall "
+            "velocities (docs/exchange.md: wall particles)"
+        )
     lines.append(f"  {format_bytes(result.bytes)}")
     return lines

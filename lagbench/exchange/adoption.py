@@ -333,6 +333,14 @@ def import_split(
             fix="leave it out; adopt takes it",
         )
     folder = Path(source)
+    if not folder.is_dir():
+        raise UnreadableFileError(
+            "there is no such folder",
+            where=str(folder),
+            expected="a folder of train, valid, test and metadata.json",
+            got="a file" if folder.exists() else "nothing",
+            fix="name the folder of the data",
+        )
     if format is None:
         form = _recognise_format(folder)
     else:

@@ -129,8 +129,12 @@ def list_trajectories(path: Path) -> list[Row]:
     if path.suffix != ".npy":
         return [(path, None)]
 
-    shape = _read_npy(path).shape
+    array = _read_npy(path)
+    shape = array.shape
     if len(shape) != 4:
+        if len(shape) != 3:
+            # before trajectories are counted: a user would look for more of them
+            check_array(str(path), shape, array.dtype)
         return [(path, None)]
     if shape[0] > MAX_ID + 1:
         raise DataError(

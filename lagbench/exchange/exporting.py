@@ -70,6 +70,8 @@ class ExportResult:
     frames: dict[str, int]  # frames by subset, over all trajectories
     # frames that are not in the files, because that format needs equal lengths
     left_out: int
+    # whether walls move and the files do not tell how
+    loses_wall_motion: bool
     bytes: int  # length of the files together [bytes]
 
 
@@ -180,7 +182,15 @@ def export(
     metadata = describe_export(tier, file_format, shapes, info)
     metadata_path = write_metadata(target, metadata)
     written = (*paths, metadata_path)
-    return _summarise(tier, file_format, target, written, frames_by_subset, shapes)
+    return _summarise(
+        tier,
+        file_format,
+        target,
+        written,
+        frames_by_subset,
+        shapes,
+        loses_wall_motion=has_moving_walls and not wall_particles,
+    )
 
 
 def _check_from_walls(file_format: Format, *, from_walls: bool | None) -> None:
@@ -202,6 +212,8 @@ def _summarise(
     files: tuple[Path, ...],
     frames_of: Mapping[str, Mapping[Path, int]],
     shapes: Mapping[str, Sequence[tuple[int, int]]],
+    *,
+    loses_wall_motion: bool,
 ) -> ExportResult:
     """Return what was written.
 
@@ -212,6 +224,7 @@ def _summarise(
         files: the files, metadata.json too.
         frames_of: frames of each scenario file by subset.
         shapes: frames and particles of each trajectory that was written, by subset.
+        loses_wall_motion: whether walls move and the files do not tell how.
     """
     trajectory_counts = {}
     frame_counts = {}
@@ -231,6 +244,7 @@ def _summarise(
         trajectories=trajectory_counts,
         frames=frame_counts,
         left_out=left_out,
+        loses_wall_motion=loses_wall_motion,
         bytes=sum(path.stat().st_size for path in files),
     )
 

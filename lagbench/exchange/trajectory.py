@@ -626,12 +626,18 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
         DataError: not two or three components, too few or too many frames or particles.
     """
     if len(shape) != 3 or dtype.kind != "f":
+        fix = "save positions as float32, with the axes in this order"
+        if len(shape) == 4 and dtype.kind == "f":
+            fix = (
+                "save each trajectory in a file of its own, or all of them in one .npy "
+                "file of shape (trajectory, frame, particle, 2 or 3)"
+            )
         raise UnreadableFileError(
             "these are no positions",
             where=name,
             expected="floats of shape (frame, particle, 2 or 3)",
             got=f"{dtype} of shape {shape}",
-            fix="save positions as float32, with the axes in this order",
+            fix=fix,
         )
     frame_count, particle_count, component_count = shape
     if component_count not in DIMENSIONS:

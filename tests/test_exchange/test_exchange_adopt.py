@@ -1745,3 +1745,25 @@ def test_the_error_of_exchanged_bounds_names_the_axis(
     assert "y" in got
     assert "0.75" in got
     assert "(" not in got
+
+
+def test_a_wrong_shape_is_named_before_trajectories_are_counted(
+    tmp_path: Path,
+) -> None:
+    """A user would look for more files. Several in an .npz get a fix that works."""
+    flat = tmp_path / "flat.npy"
+    np.save(flat, np.zeros((25, 80), np.float32))
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(flat, output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    assert "(25, 80)" in str(caught.value.got)
+
+    several = np.stack([*straight_runs(6)])
+    archive = tmp_path / "several.npz"
+    np.savez(archive, position=several)
+    archives = [archive, *save_runs(tmp_path, straight_runs(3))]
+    with pytest.raises(UnreadableFileError, match=r"one \.npy") as caught:
+        adopt(archives, output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    array = tmp_path / "several.npy"
+    np.save(array, several)
+    own = adopt(array, output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+    assert sum(own.scenarios.values()) == 6

@@ -476,12 +476,13 @@ def test_readers_see_the_lid_move(
     """Differences of lid particles are the wall's velocity, but for the one that comes
     in again.
     """
-    export(
+    written = export(
         str(lid.folder),
         format=form,
         output=tmp_path / "out",
         wall_particles=True,
     )
+    assert not written.loses_wall_motion
     metadata = read_metadata(tmp_path / "out")
     truth = stored("lid", lid.folder.parent, "full")
     raw, kinds = files_of(tmp_path / "out")["test"][0]
@@ -515,6 +516,18 @@ def test_readers_see_the_lid_move(
     assert back.particles == (40, 40)
     came = stored("back", tmp_path, "full")
     assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
+
+
+def test_an_export_says_that_it_loses_the_motion_of_walls(
+    lid: LocalSplit, tmp_path: Path
+) -> None:
+    array = tmp_path / "runs.npy"
+    np.save(array, np.stack(straight_runs(4)))
+    still = adopt(array, output=tmp_path / "still", radius=0.1, frame_interval=0.1)
+    for local_split, moves in ((lid, True), (still, False)):
+        folder = tmp_path / f"export-{local_split.name}"
+        written = export(str(local_split.folder), format="gns-npz", output=folder)
+        assert written.loses_wall_motion is moves
 
 
 def test_walls_at_rest_are_solid(flow: Callable[..., object], tmp_path: Path) -> None:
