@@ -94,14 +94,15 @@ HOW_TO_READ = """\
   the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
   several seeds, the number after ± is the standard deviation over the seeds. For such a
   model the leaderboard resamples the seeds too, so its intervals are wider.
-  "1440 undefined" means that the metric is undefined in 1440 frames. The column
+  "1440 undefined" means that the metric is undefined in 1440 frames. The tables of
+  `fluid` and `multimaterial` leave out the metrics of the vorticity. The column
   `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
   seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
-  sign-flip test over scenarios. Otherwise it is a t-test, and the two-way bootstrap
-  over scenarios and seeds gives its standard error. Two models may use the same
-  weights, for example with and without mirror averaging. Then they are compared seed by
-  seed. The p-values are corrected for
+  sign-flip test over scenarios. Otherwise it is a t-test, whose variance has two
+  parts, scenarios and seeds ([scoring](scoring.md#comparing-two-methods)). Two models
+  may use the same weights, for example with and without mirror averaging. Then they are
+  compared seed by seed. The p-values are corrected for
   the number of models in the comparison (Holm). With fewer than six scenarios there is
   no test.
 - **The thesis** trained on its own data, at the size called `full` here, for hours on
@@ -153,8 +154,8 @@ which operator is the most accurate, and whether NeuralMPM is better than every 
 network. The question about the best naive baseline counts both."""
 
 MISSING_NOTE = """\
-These models are missing on this page. Semicolons separate their names. If a line has a
-command, this command trains those of the models that have a recipe. Then
+These models are missing on this page. Semicolons separate their names. Some lines have a
+command. It trains the models of its line, except those without a recipe. Then
 `lagbench submit` makes the entries."""
 
 UNANSWERED_NOTE = """\
@@ -173,9 +174,10 @@ that it reached within the first quarter, the first half and all of the steps.
 `validated` is the metric of this error. (`rmse` is the position error. Only our oldest
 trainings have it.) The last column shows how much the error decreased in the second
 half of the steps. If it decreased by more than 2 %, the training has not converged.
-Hours do not include hours on a GPU or validations. (Only those of the first seed of
-NeuralMPM on cavity mini include validations.) If a training started from the weights of
-earlier trainings, its steps, epochs and hours include the earlier trainings."""
+Hours do not include hours on a GPU or validations. There is one exception: the hours of
+the first seed of NeuralMPM on cavity mini include validations. If a training started
+from the weights of earlier trainings, its steps, epochs and hours include the earlier
+trainings."""
 
 COST_NOTE = """\
 **Cost.** `changed` lists the options of the training or of the prediction that differ
@@ -186,10 +188,10 @@ come from the entry. The speed-up is the time of our solver for a frame, on one 
 divided by the time of the model on the same machine. The times are those of the entry,
 mostly means over whole rollouts. The first table of this page has means over the first
 ten frames, which were measured in another run. So the two can differ. `trained on` is
-the machine on which the training ended. `s/frame` is the time on one core of a CPU.
-A dash means that there is no record of the value. Hours do not include hours on a
-GPU or validations. (Only those of the first seed of NeuralMPM on cavity mini include
-validations.)"""
+the machine on which the training ended. `s/frame` is the time on one core of a CPU. A
+dash means that there is no record of the value. Hours do not include hours on a GPU or
+validations. There is one exception: the hours of the first seed of NeuralMPM on cavity
+mini include validations."""
 
 COMMANDS = """\
 ## How to make these results again
