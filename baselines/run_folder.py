@@ -66,7 +66,7 @@ class RunFolder:
                 raise self._without_checkpoint(recipe)
             return None  # that training failed before its first checkpoint
 
-        checkpoint = load(self.checkpoint)
+        checkpoint = self._load_checkpoint()
         checks = [
             *self._recipe_checks(checkpoint, recipe),
             (resume, self._occupied()),
@@ -76,6 +76,19 @@ class RunFolder:
             if not fits:
                 raise error
         return checkpoint
+
+    def _load_checkpoint(self) -> Checkpoint:
+        """Return the last state; the error of a damaged file says how to go on."""
+        try:
+            return load(self.checkpoint)
+        except UnreadableFileError as error:
+            raise UnreadableFileError(
+                f"cannot go on from a damaged checkpoint: {error.what}",
+                where=error.where,
+                expected=error.expected,
+                got=error.got,
+                fix="train anew with --fresh, or name another folder with --output",
+            ) from error
 
     def _recipe_checks(
         self, checkpoint: Checkpoint, recipe: Recipe

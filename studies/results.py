@@ -154,8 +154,8 @@ which operator is the most accurate, and whether NeuralMPM is better than every 
 network. The question about the best naive baseline counts both."""
 
 MISSING_NOTE = """\
-These models are missing on this page. Semicolons separate their names. Some lines have a
-command. It trains the models of its line, except those without a recipe. Then
+These models are missing on this page. Semicolons separate their names. Some lines have
+a command. It trains the models of its line, except those without a recipe. Then
 `lagbench submit` makes the entries."""
 
 UNANSWERED_NOTE = """\

@@ -27,9 +27,10 @@ from lagbench.errors import (
     suggest_file,
     suggest_name,
 )
+from lagbench.scoring.boards import board_option
 from lagbench.submission.issues import quote
 
-from .entry import Entry, Meta, Status
+from .entry import Entry, Meta, Status, Weights
 from .folder import Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
@@ -321,6 +322,25 @@ def is_unchanged(folder: Folder, path: Path, sha256: str) -> bool:
     if file.stat().st_size > MOST_FILE_BYTES:
         return False
     return file_sha256(file) == sha256
+
+
+def require_unchanged_model(folder: Folder, weights: Weights) -> Path:
+    """Return the path of a model beside its entry.
+
+    Raises:
+        ChecksFailedError: the file is not the one that the entry names.
+    """
+    path = folder.path / weights.path
+    if not is_unchanged(folder, Path(weights.path), weights.sha256):
+        raise ChecksFailedError(
+            "the model is not the one that the entry names",
+            where=str(path),
+            expected=f"SHA-256 {weights.sha256[:16]}",
+            got="another file, or none",
+            fix="restore the file; what is wrong with the board says: lagbench "
+            f"leaderboard check{board_option(folder.path)}",
+        )
+    return path
 
 
 def read_rivals(folder: Folder, place: Place) -> dict[Path, Entry]:

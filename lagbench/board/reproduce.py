@@ -45,7 +45,7 @@ from .entry import (
     Reproduction,
     Verification,
 )
-from .entry_file import is_unchanged
+from .entry_file import require_unchanged_model
 from .folder import Folder
 from .measured_cost import Runner, TimedEntry, TimeSolver, measure_costs
 from .scores_compared import compare, sample_scenarios
@@ -225,16 +225,7 @@ def open_model(
             fix="its submitter may add one: "
             f"{name_submit_command(entry.yaml_path, folder.path)}",
         )
-    path = folder.path / prediction.weights.path
-    place = Path(prediction.weights.path)
-    if not is_unchanged(folder, place, prediction.weights.sha256):
-        raise ChecksFailedError(
-            "the model is not the one that the entry names",
-            where=str(path),
-            expected=f"SHA-256 {prediction.weights.sha256[:16]}",
-            got="another file, or none",
-            fix="lagbench leaderboard check",
-        )
+    path = require_unchanged_model(folder, prediction.weights)
     if path.suffix == ".onnx":
         return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
 

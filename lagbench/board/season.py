@@ -41,7 +41,13 @@ from lagbench.scoring.skill import best_reference
 from lagbench.submission.provenance import Overrides
 
 from .entry import Entry, Prediction, Strict
-from .entry_file import examine, format_issues, is_unchanged, load_plain, yaml_bytes
+from .entry_file import (
+    examine,
+    format_issues,
+    load_plain,
+    require_unchanged_model,
+    yaml_bytes,
+)
 from .fields import (
     MOST_SEEDS,
     Date,
@@ -560,14 +566,7 @@ def _frozen_models(folder: Folder, entry: Entry) -> tuple[FrozenModel, ...]:
         weights = prediction.weights
         if weights is None:
             continue
-        if not is_unchanged(folder, Path(weights.path), weights.sha256):
-            raise ChecksFailedError(
-                "the model is not the one that the entry names",
-                where=str(folder.path / weights.path),
-                expected=f"SHA-256 {weights.sha256[:16]}",
-                got="another file, or none",
-                fix="lagbench leaderboard check",
-            )
+        require_unchanged_model(folder, weights)
         model = FrozenModel(
             seed=prediction.seed,
             sha256=weights.sha256,

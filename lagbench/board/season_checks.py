@@ -12,6 +12,7 @@ from lagbench.errors import LagbenchError
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import shipped
+from lagbench.scoring.boards import board_option
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.issues import ValidationIssue
 
@@ -80,7 +81,8 @@ def check_seasons(
             ):
                 difference = values.find_difference()
                 if difference is not None:
-                    issues.append(_issue_of_difference(name, values, *difference))
+                    issue = _issue_of_difference(folder, name, values, *difference)
+                    issues.append(issue)
         except LagbenchError as error:
             issues.append(issue_from_error("season", error, error.where or SEASONS))
     return issues
@@ -150,7 +152,7 @@ def _read_reference(
 
 
 def _issue_of_difference(
-    season: str, values: PublicValues, stated: str, measured: str
+    folder: Folder, season: str, values: PublicValues, stated: str, measured: str
 ) -> ValidationIssue:
     path = season_path(season, SEASON_SCORES)
     return make_issue(
@@ -159,7 +161,7 @@ def _issue_of_difference(
         stated,
         what="the public scores of a season are not those of the score files",
         expected=f"{measured}, as in {values.source}",
-        fix=f"lagbench season run {season}",
+        fix=f"lagbench season run {season}{board_option(folder.path)}",
     )
 
 

@@ -38,7 +38,7 @@ from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.progress import Meter, Progress
 
 from .entry import Entry
-from .entry_file import read_entry, yaml_bytes
+from .entry_file import read_entry, require_unchanged_model, yaml_bytes
 from .fields import RankingValue
 from .folder import SEASON_SCORES, Folder, entry_path
 from .lock import board_lock
@@ -145,7 +145,7 @@ def run_season(
             where=str(folder.path / season_path(name, SEASON_SCORES)),
             expected="the scores of an earlier run",
             got="no such file",
-            fix=f"lagbench season run {name}",
+            fix=f"lagbench season run {name}{board_option(folder.path)}",
         )
     data_root = resolve_root(root)
     run = _SeasonRun(
@@ -382,6 +382,9 @@ class _SeasonRun:
         wanted = dict(list(hashes.items())[: frozen.scenarios])
         # entries may share a model and still predict otherwise
         key = f"{data_set.draw_seed} {frozen.method} {model.seed} {model.sha256}"
+        weights = entry.predictions[index].weights
+        if weights is not None:
+            require_unchanged_model(self.folder, weights)
         if self._is_saved(key, wanted):
             blind = self._saved_values(key, wanted)
         else:

@@ -11,6 +11,7 @@ from pydantic import Field
 from lagbench.data.checksums import round_digits
 from lagbench.errors import ChecksFailedError
 from lagbench.metrics.aggregate import Score
+from lagbench.scoring.boards import board_option
 
 from .entry import Entry, Strict
 from .entry_file import examine, format_issues, load_plain
@@ -85,7 +86,10 @@ def read_scores(folder: Folder, season: Season) -> SeasonScores | None:
     file = folder.path / path
     if folder.link_in(path) is not None or not file.is_file():
         return None
-    fix = f"restore it, or remove it and run: lagbench season run {season.season}"
+    fix = (
+        "restore it, or remove it and run: lagbench season run "
+        f"{season.season}{board_option(folder.path)}"
+    )
     content = load_plain(file, longest=MOST_SCORE_BYTES, fix=fix)
     scores, issues = examine(SeasonScores, content)
     if scores is None:

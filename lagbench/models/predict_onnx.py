@@ -75,7 +75,8 @@ def predict_onnx(
 
     Raises:
         UsageError: no such split, size or subset, neither ``split`` nor the file names
-            a split, there is such an output, or onnx is not installed.
+            a split, the file states another split than ``split``, there is such an
+            output, or onnx is not installed.
         UnreadableFileError: the model is refused, or cannot be run.
         DataError: the subset is missing.
         WorkFailedError: the model needs more time or memory than allowed, or another
@@ -99,6 +100,14 @@ def predict_onnx(
             got=error.got,
             fix="name the split, or the folder of a local one: --split",
         ) from error
+    if declared.split not in (None, any_tier.split):
+        raise UsageError(
+            "the model was trained on another split",
+            where=f"{model_path}, --split",
+            expected=declared.split,
+            got=any_tier.split,
+            fix="leave --split out, or give the model of this split",
+        )
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(model_path, size=tier, root=folder, declared=declared)

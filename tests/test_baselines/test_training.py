@@ -659,6 +659,17 @@ def test_weights_beside_a_damaged_log_are_not_replaced(
     assert run("drift", "steps=2", fresh=True).step == 2
 
 
+def test_a_damaged_checkpoint_is_no_dead_end(run: Run) -> None:
+    """The message names what helps, and it does."""
+    first = run("drift", "steps=1")
+    whole = first.checkpoint.read_bytes()
+    first.checkpoint.write_bytes(whole[:1000])
+    with pytest.raises(UnreadableFileError, match="damaged checkpoint") as caught:
+        run("drift", "steps=2")
+    assert "--fresh" in str(caught.value.fix)
+    assert run("drift", "steps=2", fresh=True).step == 2
+
+
 def test_a_training_that_failed_before_it_stored_weights_starts_again(
     run: Run,
 ) -> None:

@@ -539,11 +539,14 @@ def test_a_removed_entry_leaves_its_season_alone(own: ModelBoard) -> None:
 def test_other_models_and_other_scenarios_are_refused(
     own: ModelBoard, twins: ModelBoard, tmp_path: Path
 ) -> None:
-    """A model that was exchanged, and blind scenarios of another seed."""
+    """A model that was exchanged, also where its scores are saved, and blind scenarios
+    of another seed.
+    """
     weights = own.weights.read_bytes()
     own.weights.write_bytes(weights + b"1")
-    with pytest.raises(ChecksFailedError):
-        run_again(own, again=True)
+    for again in (False, True):
+        with pytest.raises(ChecksFailedError, match="not the one that the entry"):
+            run_again(own, again=again)
     own.weights.write_bytes(weights)
 
     root = tmp_path / "data"

@@ -372,6 +372,19 @@ def test_a_stated_split_that_is_not_there_needs_the_option(tmp_path: Path) -> No
     assert "--split" in str(caught.value.fix)
 
 
+def test_an_onnx_model_of_another_split_is_refused_before_data_are_asked_for(
+    tmp_path: Path,
+) -> None:
+    path = straight_on(tmp_path / "lines.onnx")
+    model = onnx.load(path)
+    onnx.helper.set_model_props(model, {"lagbench_split": "cavity"})
+    onnx.save(model, path)
+    output = tmp_path / "predictions.nc"
+    with pytest.raises(UsageError, match="another split") as caught:
+        predict_onnx(path, output, split="curl-noise", size="tiny", root=tmp_path)
+    assert caught.value.expected == "cavity"
+
+
 def test_an_onnx_model_without_a_stated_split_needs_the_option(tmp_path: Path) -> None:
     path = straight_on(tmp_path / "lines.onnx")
     with pytest.raises(UsageError) as caught:
