@@ -40,6 +40,7 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
+from lagbench.scoring.boards import board_option
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
     read_score_file,
@@ -426,10 +427,19 @@ def _read_method(
             score_file = read_score_file(board.path / score_path, size)
             _require_possible(board, score_path, score_file)
             stored.append(score_file)
-    except UnreadableFileError:
-        if current:
+    except UnreadableFileError as error:
+        if not current:
+            return None
+        if Path(str(error.where)).exists():
             raise
-        return None
+        raise UnreadableFileError(
+            "a score file of an entry is missing",
+            where=str(error.where),
+            expected=f"the file that {path} names",
+            got="no such file",
+            fix="restore it, or submit the predictions again; all that is wrong says: "
+            f"lagbench leaderboard check{board_option(board.path)}",
+        ) from error
 
     ranking = stored[0].scores.ranking
     scores = _form_scores(board, entry, stored, scope)

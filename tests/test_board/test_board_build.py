@@ -230,6 +230,16 @@ def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> No
     assert not row_of(board, "flipping").current
 
 
+def test_a_missing_score_file_is_named_with_its_entry(own: BoardBench) -> None:
+    """The user gave no path that could be wrong."""
+    path = next(own.folder.glob("scores/**/noisy*.nc"))
+    path.unlink()
+    with pytest.raises(UnreadableFileError, match="score file of an entry") as caught:
+        collect(own.folder, registry=own.registry)
+    assert caught.value.where == str(path)
+    assert "leaderboard check --board" in str(caught.value.fix)
+
+
 def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
     """Maps of truth and prediction share one packing: the tab's truth is the finest."""
     folder = bench.folder / "scores/cavity/tiny"
