@@ -230,8 +230,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
         f"contains 1/{FIXED} of the time of a copy. For a frame of {2 * FIXED} "
-        f"substeps, the product of {2 * FIXED} and our t/substep contains two copies, "
-        f"but our t/frame contains only one. {consequence}",
+        f"substeps, {2 * FIXED} times our t/substep contains {2 * FIXED}/{FIXED} = 2 "
+        f"copies, but our t/frame contains only one. {consequence}",
         "",
     ]
 
