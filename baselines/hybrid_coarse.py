@@ -1,6 +1,6 @@
 """Hybrid: the solver on a coarser grid, with constants that are learned.
 
-On a grid with half as many cells the material-point solver damps the flow more: each
+On a grid with fewer cells the material-point solver damps the flow more: each
 transfer between particles and nodes averages over a larger cell. Softer matter carries
 sound more slowly. It allows longer time steps, so there are fewer transfers, and each
 frame loses less. The hybrid changes the constants of the solver accordingly:
@@ -12,8 +12,9 @@ frame loses less. The hybrid changes the constants of the solver accordingly:
     moduli        exp(e) E                  (all solids)
 
 The time steps of a frame follow from the fastest sound: the number of sound's cells in
-a time step stays what it is in the classical ``coarse-solver``. With all five 0 the
-model is that solver, to the bit.
+a time step stays what it is in the classical solver on the same grid. This is
+``coarse-solver``, or with ``times=1.5`` ``coarse-solver-two-thirds``. With all five 0
+the model is that solver, to the bit.
 
 The coefficients are fitted to rollouts on ``train``. The error to minimise is the
 metric of free surfaces, ``cloud_distance``. Splashes are chaotic: the error jumps by
@@ -118,12 +119,17 @@ class HybridCoarse(Hybrid):
         self.size = load_registry().size(info.split, info.size)
         coarse = coarser(self.size, Fraction(options.times))
         if coarse is None:
+            fitting_times = _list_fitting_times(self.size)
+            fix = "a larger size, or neuralmpm"
+            if fitting_times:
+                choices = " or ".join(f"{times:g}" for times in fitting_times)
+                fix = f"--set model.times={choices}; or neuralmpm"
             raise UsageError(
                 f"{self.method} has no such grid for {info.split} {info.size}",
                 where="model.times",
                 expected="walls on nodes of the coarser grid, and enough cells",
                 got=options.times,
-                fix="another model.times, as 1.5; or a larger size, or neuralmpm",
+                fix=fix,
             )
         self.coarse = coarse
         self.register_buffer("coefficients", torch.zeros(len(COEFFICIENTS)))
@@ -286,6 +292,15 @@ def _next_position(rollout: CoarseRollout) -> Floats:
         return rollout.advance()
     except WorkFailedError:
         return np.full_like(rollout.position, np.nan)
+
+
+def _list_fitting_times(size: Size) -> list[float]:
+    """Return the values of the option ``times`` that a data set allows."""
+    fitting_times = []
+    for times in (1.5, 2.0, 3.0, 4.0):
+        if coarser(size, Fraction(times)) is not None:
+            fitting_times.append(times)
+    return fitting_times
 
 
 def _check_split(split: str, size: str) -> None:

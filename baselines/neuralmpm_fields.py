@@ -127,15 +127,16 @@ class FieldEncoder(nn.Module):
         slot = self.slot[material]
         is_unknown = slot < 0
         if bool(is_unknown.any()):
-            present = sorted(set(material.tolist()))
-            all_materials = sorted({*self.options.materials, *present})
+            present_materials = sorted(set(material.tolist()))
+            all_materials = sorted({*self.options.materials, *present_materials})
             raise DataError(
                 "a material that the model does not know",
                 where="model.materials",
                 expected=list(self.options.materials),
-                got=present,
-                fix=f"train with --set 'model.materials={all_materials}'; trained "
-                "weights know only the materials of their training",
+                got=present_materials,
+                fix=f"train with --set 'model.materials={all_materials}', or with the "
+                "numbers of all materials of the data; trained weights know only the "
+                "materials of their training",
             )
         return sample * self.material_count + slot
 

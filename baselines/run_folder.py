@@ -78,12 +78,12 @@ class RunFolder:
         return checkpoint
 
     def _load_checkpoint(self) -> Checkpoint:
-        """Return the last state; the error of a damaged file says how to go on."""
+        """Return the last state; the error of an unreadable file says how to go on."""
         try:
             return load(self.checkpoint)
         except UnreadableFileError as error:
             raise UnreadableFileError(
-                f"cannot go on from a damaged checkpoint: {error.what}",
+                f"cannot go on from this checkpoint: {error.what}",
                 where=error.where,
                 expected=error.expected,
                 got=error.got,

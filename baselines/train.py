@@ -59,7 +59,8 @@ MEMORY_HINT = (
     ".lags"
 )
 FIT_STEPS = 1  # a closed form counts as one step
-FITTING = "fitting"  # the stage in which a fit evaluates
+READING = "reading"  # the stage in which a fit reads scenarios
+FITTING = "fitting"  # the stage in which it evaluates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -582,8 +583,10 @@ def _read_scenarios(job: TrainingJob, *, most: int | None = None) -> Iterator[Ba
         check_contents(size, job.root, files)
         paths += files.values()
     paths = paths[:most]
-    job.meter.begin("reading", total=len(paths), scenarios=len(paths), unit="scenarios")
+    job.meter.begin(READING, total=len(paths), scenarios=len(paths), unit="scenarios")
     for path in paths:
         scenario = scenario_batch(path, viscosity=viscosity)
-        job.meter.count(1, scenarios=1)
+        # A fit may evaluate what it has read before it reads on.
+        if job.meter.stage == READING:
+            job.meter.count(1, scenarios=1)
         yield scenario

@@ -7,6 +7,7 @@ not used; ``lagbench leaderboard check`` compares them.
 from __future__ import annotations
 
 import math
+import os
 import shlex
 import warnings
 from collections.abc import Collection, Mapping, Sequence
@@ -411,6 +412,25 @@ def _read_in_place(board: Folder, path: Path) -> Entry:
     return entry
 
 
+def _require_present(board: Folder, score_path: Path, *, entry: Path) -> None:
+    """Refuse an entry whose score file is missing.
+
+    Raises:
+        UnreadableFileError: there is no such file.
+    """
+    file = board.path / score_path
+    if os.path.lexists(file):
+        return
+    raise UnreadableFileError(
+        "a score file of an entry is missing",
+        where=str(file),
+        expected=f"the file that {entry} names",
+        got="no such file",
+        fix="restore it, or submit the predictions again; lagbench leaderboard "
+        f"check{board_option(board.path)} lists all that is wrong",
+    )
+
+
 def _read_method(
     board: Folder, path: Path, registry: Registry, scope: Scope
 ) -> tuple[ScoredMethod, PicturedTruth] | None:
@@ -424,22 +444,15 @@ def _read_method(
     try:
         stored = []
         for score_path in entry.score_paths:
+            if current:
+                _require_present(board, score_path, entry=path)
             score_file = read_score_file(board.path / score_path, size)
             _require_possible(board, score_path, score_file)
             stored.append(score_file)
-    except UnreadableFileError as error:
-        if not current:
-            return None
-        if Path(str(error.where)).exists():
+    except UnreadableFileError:
+        if current:
             raise
-        raise UnreadableFileError(
-            "a score file of an entry is missing",
-            where=str(error.where),
-            expected=f"the file that {path} names",
-            got="no such file",
-            fix="restore it, or submit the predictions again; all that is wrong says: "
-            f"lagbench leaderboard check{board_option(board.path)}",
-        ) from error
+        return None
 
     ranking = stored[0].scores.ranking
     scores = _form_scores(board, entry, stored, scope)

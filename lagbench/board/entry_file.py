@@ -325,7 +325,11 @@ def is_unchanged(folder: Folder, path: Path, sha256: str) -> bool:
 
 
 def require_unchanged_model(folder: Folder, weights: Weights) -> Path:
-    """Return the path of a model beside its entry.
+    """Refuse a model that is not the one that its entry names; return its path.
+
+    Args:
+        folder: the leaderboard's folder.
+        weights: path and hash that the entry states.
 
     Raises:
         ChecksFailedError: the file is not the one that the entry names.
@@ -337,8 +341,8 @@ def require_unchanged_model(folder: Folder, weights: Weights) -> Path:
             where=str(path),
             expected=f"SHA-256 {weights.sha256[:16]}",
             got="another file, or none",
-            fix="restore the file; what is wrong with the board says: lagbench "
-            f"leaderboard check{board_option(folder.path)}",
+            fix="restore the file; lagbench leaderboard "
+            f"check{board_option(folder.path)} lists all that is wrong",
         )
     return path
 

@@ -142,6 +142,7 @@ def _legend_of_times(tab: Tab) -> Iterator[str]:
     """Yield what the column of times means, and which times compare."""
     if tab.run is not None:
         yield "s/frame: time of a frame on one core, measured in one run"
+        yield "(naive baselines that read train: converted from another run)"
         return
     yield "s/frame: time of a frame of one scenario"
     if tab.references:

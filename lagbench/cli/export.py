@@ -98,8 +98,9 @@ def _describe(result: ExportResult) -> list[str]:
         )
     if result.loses_wall_motion:
         lines.append(
-            "  the walls move, and the files do not tell how: the format has no wall "
-            "velocities (docs/exchange.md: wall particles)"
+            "  the scenarios have wall velocities, and the files do not: the format "
+            "has none. In two dimensions, with four walls, --wall-particles adds "
+            "particles that move with them (docs/exchange.md, Moving walls)"
         )
     lines.append(f"  {format_bytes(result.bytes)}")
     return lines

@@ -382,19 +382,27 @@ def _missing_files(folder: Path, names: Sequence[str]) -> list[str]:
 
 
 def _recognise_format(folder: Path) -> Format:
-    """Return the format whose three files a folder holds; refuse none, and several."""
-    present = []
+    """Return the format whose files a folder holds; refuse none, and several.
+
+    A format with all three files wins over one of which files are missing.
+    """
+    whole_formats = []
+    begun_formats = []
     layouts = []
     for form in Format:
         names = _file_names(form)
         layouts.append(f"{', '.join(names)} ({form.value})")
-        if not _missing_files(folder, names):
-            present.append(form.value)
-    if len(present) == 1:
-        return Format(present[0])
-    if present:
+        missing_count = len(_missing_files(folder, names))
+        if missing_count == 0:
+            whole_formats.append(form)
+        elif missing_count < len(names):
+            begun_formats.append(form)
+    formats = whole_formats or begun_formats
+    if len(formats) == 1:
+        return formats[0]
+    if formats:
         got = "files of both formats"
-        fix = f"name one: --format {present[0]}"
+        fix = f"name one: --format {formats[0].value}"
     else:
         got = "no such files"
         fix = "name their folder; `lagbench adopt` takes other files"

@@ -70,7 +70,7 @@ class ExportResult:
     frames: dict[str, int]  # frames by subset, over all trajectories
     # frames that are not in the files, because that format needs equal lengths
     left_out: int
-    # whether walls move and the files do not tell how
+    # whether walls may move and the files do not tell how
     loses_wall_motion: bool
     bytes: int  # length of the files together [bytes]
 
@@ -224,7 +224,7 @@ def _summarise(
         files: the files, metadata.json too.
         frames_of: frames of each scenario file by subset.
         shapes: frames and particles of each trajectory that was written, by subset.
-        loses_wall_motion: whether walls move and the files do not tell how.
+        loses_wall_motion: whether walls may move and the files do not tell how.
     """
     trajectory_counts = {}
     frame_counts = {}

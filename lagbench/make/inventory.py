@@ -249,17 +249,17 @@ def _inspect_file(
 
     with read_scenario(path) as file:
         _check_key(path, file.header, size, scenario)
-        different = _different_parameters(file.header, size, scenario)
-        if noted_content and not different:
+        different_parameters = _list_different_parameters(file.header, size, scenario)
+        if noted_content and not different_parameters:
             file.check_attributes()
-    if different:
+    if different_parameters:
         # The content hash covers the parameters. So a file with the recorded hash is
         # right, whatever the module of the split draws today.
-        noted_content = _recorded_content(path, size, scenario)
+        noted_content = _find_recorded_content(path, size, scenario)
         if noted_content is None:
             raise DataError(
                 "a file was simulated with other parameters",
-                where=f"{path}, attributes {', '.join(different)}",
+                where=f"{path}, attributes {', '.join(different_parameters)}",
                 expected=f"those of {size.record_name}, and of {size.generator}",
             )
     content = noted_content or check_scenario(path)
@@ -386,7 +386,7 @@ def _check_key(path: Path, header: ScenarioHeader, size: Size, scenario: int) ->
         )
 
 
-def _recorded_content(path: Path, size: Size, scenario: int) -> str | None:
+def _find_recorded_content(path: Path, size: Size, scenario: int) -> str | None:
     """Return the content hash of a whole file if it is the recorded one, else None."""
     recorded = recorded_hash(size, scenario)
     if recorded is None:
@@ -398,7 +398,7 @@ def _recorded_content(path: Path, size: Size, scenario: int) -> str | None:
     return content if content.startswith(recorded) else None
 
 
-def _different_parameters(
+def _list_different_parameters(
     header: ScenarioHeader, size: Size, scenario: int
 ) -> list[str]:
     """Return the names of parameters that are not those of the draw.
@@ -422,11 +422,11 @@ def _different_parameters(
     if "periodic" in stated:  # in any order
         stated["periodic"] = " ".join(sorted(str(stated["periodic"]).split()))
 
-    different = []
+    different_parameters = []
     for name in sorted(expected.keys() | stated.keys()):
         if expected.get(name) != stated.get(name):
-            different.append(name)
-    return different
+            different_parameters.append(name)
+    return different_parameters
 
 
 def compare_hashes(

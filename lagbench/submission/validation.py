@@ -130,7 +130,7 @@ def validate(
     isolated: bool = True,
     registry: Registry | None = None,
 ) -> ValidationResult:
-    """Check a predictions.nc; nothing is raised for what is wrong with it.
+    """Check a predictions.nc; what is wrong with it is returned, not raised.
 
     Args:
         path: the file.
@@ -151,6 +151,7 @@ def validate(
 
     Raises:
         UsageError: there is no such split, or the predictions are for another one.
+        UnreadableFileError: the description of the local split is not right.
     """
     expected_split = None
     if split is not None:

@@ -23,7 +23,7 @@ class Progress:
     scenarios_done: int  # scenarios that are finished
     scenarios: int  # scenarios to finish; 0 where nobody knows
     seconds: float  # time since the start [s]
-    # scenarios that an earlier run had finished; they took none of that time
+    # scenarios that were finished when the stage began; they took none of that time
     before: int = 0
     # what is counted as scenarios, in the plural; empty for the command's own word
     unit: str = ""

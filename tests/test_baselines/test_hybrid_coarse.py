@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -334,3 +336,32 @@ def test_data_without_a_coarser_grid_are_refused(
     other = replace(figures, **changes)
     with pytest.raises(UsageError):
         HybridCoarse.build({}, other)
+
+
+def info_of(figures: DatasetInfo, split: str, size: str) -> DatasetInfo:
+    """Return public figures with the names and the box of another data set."""
+    described = load().size(split, size)
+    return replace(figures, split=split, size=size, bounds=described.bounds)
+
+
+def test_two_thirds_of_the_cells_are_those_of_the_classical_solver(
+    figures: DatasetInfo,
+) -> None:
+    """Without changes the constants are those of coarse-solver-two-thirds."""
+    info = info_of(figures, "multimaterial-3d", "full")
+    model = HybridCoarse.build({"times": 1.5}, info)
+    size = load().size("multimaterial-3d", "full")
+    assert model.coarse == coarse_solver.coarser(size, Fraction(3, 2))
+    assert model.coarse.grid == 32
+    assert change_constants(model.coarse, model.checked_coefficients()) == model.coarse
+
+
+def test_a_refused_factor_names_one_that_works(figures: DatasetInfo) -> None:
+    info = info_of(figures, "multimaterial-3d", "full")
+    with pytest.raises(UsageError) as caught:
+        HybridCoarse.build({}, info)
+    (proposal, *_) = re.findall(r"model\.times=([0-9.]+)", str(caught.value.fix))
+    HybridCoarse.build({"times": float(proposal)}, info)
+    with pytest.raises(UsageError) as caught:
+        HybridCoarse.build({}, info_of(figures, "fluid", "tiny"))
+    assert "model.times" not in str(caught.value.fix)

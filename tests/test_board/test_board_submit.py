@@ -587,7 +587,8 @@ def test_what_is_not_given(own: BoardBench) -> None:
         device="two",
         seconds_per_frame=0.25,
     )
-    result = own.submit(first, second, date=None)
+    assert own.submit(first, date=None).has_cost
+    result = own.submit(first, second, date=None, replace=True)
     assert not result.has_cost
     entry = read_entry(own.entry("mixed"))
     assert entry.cost is None

@@ -261,8 +261,8 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
 def test_the_files_tell_their_format(tmp_path: Path, form: str) -> None:
     """Without a format the split is the same."""
-    gns = form == "gns-npz"
-    source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
+    write = write_gns if form == "gns-npz" else write_h5
+    source = write(tmp_path / "in", straight_runs(3))
     named = import_split(source, format=form, output=tmp_path / "named" / "own")
     unnamed = import_split(source, output=tmp_path / "unnamed" / "own")
     for subset in SUBSETS:
@@ -272,6 +272,14 @@ def test_the_files_tell_their_format(tmp_path: Path, form: str) -> None:
     assert (unnamed.folder / "split.yaml").read_text() == (
         named.folder / "split.yaml"
     ).read_text()
+
+
+def test_a_folder_without_one_of_the_files_names_it(tmp_path: Path) -> None:
+    source = write_gns(tmp_path / "in", straight_runs(3))
+    (source / "valid.npz").unlink()
+    with pytest.raises(UnreadableFileError) as caught:
+        import_split(source, output=tmp_path / "own")
+    assert caught.value.got == "no valid.npz"
 
 
 def test_files_of_no_format_and_of_both_do_not_tell_it(tmp_path: Path) -> None:
