@@ -60,6 +60,7 @@ def run(
         wrong=Wrong,
         unstorable=Unstorable,
         fitted=FittedDrift,
+        eager=EagerDrift,
     )
 
 
@@ -859,6 +860,29 @@ class FittedDrift(Drift):
             count(1)
         self.a.data.fill_(products / squares)
         return {"best": products / squares}
+
+
+class EagerDrift(FittedDrift):
+    """A fit that evaluates each scenario before it reads the next one."""
+
+    evaluations = 2  # scenarios of train
+
+    def fit(
+        self, scenarios: Iterable[Batch], *, count: Callable[[int], None]
+    ) -> dict[str, float]:
+        """Count once for each scenario."""
+        for _ in scenarios:
+            count(1)
+        return {}
+
+
+def test_a_fit_that_evaluates_while_it_reads_is_counted_once(run: Run) -> None:
+    """No more is done than there is to do."""
+    reports: list[Progress] = []
+    run("eager", progress=reports.append)
+    fitting = [report for report in reports if report.stage == "fitting"]
+    assert [report.done for report in fitting] == [1, 2]
+    assert all(report.done <= report.total for report in reports)
 
 
 def test_a_users_fit_gets_whole_scenarios_as_batches(
