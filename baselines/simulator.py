@@ -9,12 +9,11 @@ untrained model with target acceleration adds the mean acceleration of train to 
 velocity.
 
 The loss has terms of motion (acceleration, velocity and position), and in boxes of two
-dimensions with walls also of density and flow (divergence and vorticity), after Eqs.
-5.29-5.35 of the thesis. The terms are normalised: accelerations, velocities and
-positions by their deviations in train, widened by the noise; the velocities on the grid
-too, so that vorticity and divergence have the unit 1/length; density by that around a
-particle. The training applies the weights.
-"""
+dimensions without a periodic axis also of density and flow (divergence and vorticity),
+after Eqs. 5.29-5.35 of the thesis. The terms are normalised: accelerations, velocities
+and positions by their deviations in train, widened by the noise; the velocities on the
+grid too, so that vorticity and divergence have the unit 1/length; density by that
+around a particle. The training applies the weights."""
 
 from __future__ import annotations
 

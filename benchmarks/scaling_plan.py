@@ -318,7 +318,7 @@ def expected(row: ThesisRow, p: Parts, frames: int) -> float:
     return row.particles * (3 * simulation + 2 * writing)
 
 
-def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
+def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> list[str]:
     """Return bytes, core hours and memory of the planned data set."""
     n = row.particles
     frames = PLANNED
@@ -353,7 +353,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"The following plan is for {SCENARIOS:,} scenarios. Each has {n:,} "
+        f"The following plan uses the times of q = {measured_q}. It is for "
+        f"{SCENARIOS:,} scenarios. Each has {n:,} "
         f"particles, {frames} frames of {row.substeps} substeps, and a grid of "
         f"{row.grid} x {row.grid} cells:",
         "",
@@ -404,7 +405,7 @@ def main() -> int:
         measured.append((row, parts, runs))
 
     million = row_of("8")
-    _, largest_parts, _ = measured[-1]
+    largest_row, largest_parts, _ = measured[-1]
     memory = extrapolate_memory(measured, million.particles)
     lines = [
         "# Costs of large scenarios",
@@ -424,14 +425,14 @@ def main() -> int:
         "the [perturbed run](../glossary.md) of the test scenario. In this measurement "
         "all three runs have the same number of frames. The column *sum of the parts* "
         "follows from three columns of the first table: drawing and substeps for three "
-        "runs of the solver, and writing for two scenarios. A whole generation takes "
-        "longer: it also imports and compiles, and it writes the manifest and draws "
-        "the pictures. The *client* is the process that you start; it starts the "
+        "runs of the solver, and writing for two scenarios, because the perturbed run "
+        "is not written. A whole generation takes longer: it also imports and "
+        "compiles, and it writes the manifest and draws the pictures. The *client* is the process that you start; it starts the "
         "workers.",
         "",
         *whole_table(measured),
         "",
-        *plan_table(million, largest_parts, memory),
+        *plan_table(million, largest_parts, memory, measured_q=largest_row.q),
     ]
     text = "\n".join(lines) + "\n"
     options.output.mkdir(parents=True, exist_ok=True)

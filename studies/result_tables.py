@@ -206,9 +206,10 @@ def _place_of(results: SplitResults, model: str) -> list[str]:
             ahead.append(label(name))
         else:
             equal.append(label(name))
-    sentences = place_among_solvers(
-        label(model), behind=behind, equal=equal, ahead=ahead
-    )
+    name = label(model)
+    if name[0].islower():
+        name = f"the {name}"  # a description, and no proper name
+    sentences = place_among_solvers(name, behind=behind, equal=equal, ahead=ahead)
     if sentences:
         first = sentences[0]
         sentences[0] = f"On {results.where} {first[0].lower()}{first[1:]}"
