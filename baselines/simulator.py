@@ -13,7 +13,8 @@ dimensions without a periodic axis also of density and flow (divergence and vort
 after Eqs. 5.29-5.35 of the thesis. The terms are normalised: accelerations, velocities
 and positions by their deviations in train, widened by the noise; the velocities on the
 grid too, so that vorticity and divergence have the unit 1/length; density by that
-around a particle. The training applies the weights."""
+around a particle. The training applies the weights.
+"""
 
 from __future__ import annotations
 

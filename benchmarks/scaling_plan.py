@@ -427,8 +427,8 @@ def main() -> int:
         "follows from three columns of the first table: drawing and substeps for three "
         "runs of the solver, and writing for two scenarios, because the perturbed run "
         "is not written. A whole generation takes longer: it also imports and "
-        "compiles, and it writes the manifest and draws the pictures. The *client* is the process that you start; it starts the "
-        "workers.",
+        "compiles, and it writes the manifest and draws the pictures. The *client* is "
+        "the process that you start; it starts the workers.",
         "",
         *whole_table(measured),
         "",
