@@ -93,6 +93,7 @@ class TrainingResult:
     track: Track | None  # equal compute, converged or none
     cpu_seconds: float  # processor time in all runs [s]
     validation_cpu_seconds: float  # of it that of validations [s]
+    is_fitted: bool  # whether the model was fitted as a whole, without steps
     gpu_seconds: float  # time times the GPUs in use [s]
     wall_seconds: float  # time of all runs [s]
 
@@ -337,6 +338,7 @@ def _result(
         threads=budget.threads or 0,
         track=track_of(job.info.size, budget),
         start=describe_start(job.recipe.start),
+        is_fitted=model.closed_form,
         first_step=first_step,
         **log_values,
     )

@@ -54,9 +54,18 @@ def measure(
     read_frame: ReadFrame | None,
     cells: tuple[int, int],
 ) -> dict[int, Tensor]:
-    """Return (deviation, density) of each material, shape [scenario and frame, 2].
+    """Return deviation and density of each material, shape [scenario and frame, 2].
 
-    None reads the truth. The cells are those of the clusters and of the densities.
+    The deviation is the mean distance of particles from the places where their bodies
+    in the first frame would put them [length]. The density is the 95th percentile over
+    particles, relative to the densest place of the first frame [1]. A scenario has rows
+    for the materials that it has.
+
+    Args:
+        size: the data set.
+        root: folder of all data sets.
+        read_frame: reads predicted positions; None measures the truth.
+        cells: cells across the box, of the grid of bodies and of that of densities.
     """
     cluster_cells, density_cells = cells
     cluster_grid = ParticleGrid(size.bounds, cluster_cells)

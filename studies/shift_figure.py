@@ -43,7 +43,7 @@ class ShiftedRow:
     kind: str
     test: float  # ranking metric, mean over scenarios
     shift: float
-    skill: float | None  # on test; None for a reference predictor
+    skill: float | None  # on test; None without a naive baseline
     skill_on_shift: float | None
 
 

@@ -63,7 +63,7 @@ def draft_entry(
         if add:
             extended = require_extendable(folder, place, headers, meta)
         elif not replace:
-            _require_free(folder, place)
+            _require_no_entry(folder, place)
         _require_distinct_name(_name_of(headers[0], meta, extended), rivals)
         read_verified(folder)  # publishing may have to write it
     with errors:
@@ -129,7 +129,8 @@ def _place_of(header: Header, meta: Meta) -> Place:
     return header.split, header.size, method
 
 
-def _require_free(folder: Folder, place: Place) -> None:
+def _require_no_entry(folder: Folder, place: Place) -> None:
+    """Refuse a method that has an entry already."""
     path = folder.path / entry_path(place)
     if path.exists():
         raise UsageError(
@@ -137,8 +138,8 @@ def _require_free(folder: Folder, place: Place) -> None:
             where=str(path),
             expected="a method without an entry on this data set",
             got=place[2],
-            fix="a further seed: --add; instead of it: --replace; else another "
-            "--method, and name: in meta.yaml",
+            fix="to add a seed, --add; to replace the entry, --replace; for another "
+            "method, another --method, and another name in meta.yaml",
         )
 
 

@@ -258,9 +258,7 @@ def _describe_time(result: TrainingResult) -> str:
 
 def _describe_learning(result: TrainingResult) -> str:
     """Return the terms of the loss, their sum last; of a fit the learned numbers."""
-    from lagbench.baselines.catalogue import find
-
-    if find(result.baseline).model.closed_form:
+    if result.is_fitted:
         numbers = [f"{name} {value:.4g}" for name, value in result.loss.items()]
         return f"  fit        {', '.join(numbers)}"
 

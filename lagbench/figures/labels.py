@@ -302,14 +302,19 @@ def _points_of_line(start: Point, end: Point) -> list[Point]:
 def _is_free_line(
     start: Point, end: Point, other_dots: Sequence[Point], boxes: Sequence[LabelBox]
 ) -> bool:
-    """Return whether a line crosses no label, no other line and no other dot.
+    """Return whether a line keeps clear of other dots and of the given boxes.
 
-    It may leave a dot that overlaps its own one, but not enter it.
+    It is tested from the rim of its own dot on.
+
+    Args:
+        start: the line's own dot.
+        end: where it meets its label.
+        other_dots: all other dots.
+        boxes: labels, and lines of labels, that were placed before.
     """
+    clearance = DOT_RADIUS + 1.0
     for point in _points_of_line(start, end):
-        own_distance = math.dist(point, start)
-        reach = min(own_distance, DOT_RADIUS + 1.0)
-        if any(math.dist(point, other) < reach for other in other_dots):
+        if any(math.dist(point, other) < clearance for other in other_dots):
             return False
         if any(box.distance(point) < 1.0 for box in boxes):
             return False

@@ -335,8 +335,9 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
         Var = sum_i w_i^2 / (N (N - 1)) + sum_s u_s^2 / (S (S - 1))
 
     The rest enters both sums once, which errs on the side of too wide. With one seed
-    only the scenarios are drawn: the mean is then that of these weights, not of the
-    method. The draws are seeded: two calls with as many scenarios draw the same ones.
+    only the scenarios are drawn: the mean is then that of this one training, not of
+    the method. The draws are seeded: two calls with as many scenarios draw the same
+    ones.
 
     Args:
         values: values of a method, NaN where undefined, shape [scenario] or [seed,
@@ -453,9 +454,10 @@ class Score:
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the mean of these weights, by bootstrap over scenarios.
+        """95 % interval of the mean, by bootstrap over scenarios.
 
-        It does not leave the range of the metric.
+        It says nothing about other trainings (seeds) of the method. It is cut off at
+        the range of the metric, and NaN with fewer than four scenarios.
         """
         return interval_in_range(self.values, self.value_range)
 

@@ -89,7 +89,7 @@ def _signed_sums(d: Floats) -> Floats:
 def differ(first: ArrayLike, second: ArrayLike) -> float:
     """Return the two-sided p-value of no difference between two methods.
 
-    With one seed each it is the exact sign-flip test over scenarios, of these weights.
+    With one seed each it is the exact sign-flip test over scenarios, of two trainings.
     Otherwise ``t = mean difference / two-way bootstrap error`` against Student's t with
     Satterthwaite's degrees of freedom; no p-value is below the sign-flip test's least,
     ``2^(1-n)``.

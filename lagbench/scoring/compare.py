@@ -701,7 +701,7 @@ def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant
         _check_split(path, scores.identity, scoring.split)
         if SUBMISSION not in scores.scores:
             rows = _list_names(map(repr, scores.scores), empty="no row")
-            raise _incomplete(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
+            raise _incomplete_error(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
         seeds.append(scores)
 
     first = seeds[0]
@@ -967,9 +967,9 @@ def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
 
     expected = f"values of a ranking metric that judges, {one.ranking!r}"
     if one.ranking not in judging:
-        raise _incomplete(one.name, expected, _list_names(judging))
+        raise _incomplete_error(one.name, expected, _list_names(judging))
     if one.ranking not in two.scores:
-        raise _incomplete(two.name, expected, _list_names(two.scores))
+        raise _incomplete_error(two.name, expected, _list_names(two.scores))
     common = []
     for name in judging:
         if name in two.scores:
@@ -987,9 +987,9 @@ def _list_names(names: Iterable[str], *, empty: str = "no such metric") -> str:
     return line
 
 
-def _incomplete(where: str, expected: str, got: str) -> UnreadableFileError:
+def _incomplete_error(where: str, expected: str, got: str) -> UnreadableFileError:
     return UnreadableFileError(
-        "scores without the row or the ranking metric",
+        "the scores lack a row, or a ranking metric that judges",
         where=where,
         expected=expected,
         got=got,

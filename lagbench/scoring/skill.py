@@ -230,7 +230,7 @@ def compare_with_solvers(
             costs[name] = reference.seconds_per_frame
     seconds_here = solver_seconds(size)
     if not solvers or seconds_here is None:
-        return None, "no classical solver was timed on this data set"
+        return None, "no classical solver was scored and timed on this data set"
 
     seconds = seconds_where_measured(
         seconds_per_frame=header.seconds_per_frame,
@@ -244,15 +244,15 @@ def compare_with_solvers(
                 missing.append(label)
         return None, (
             f"the predictions do not state {' and '.join(missing)}; `lagbench "
-            "predict` without --no-bench states both, and `lagbench bench solver` "
-            "measures our solver on the machine of any other model"
+            "predict` without --no-bench states both; for another model `lagbench "
+            "bench solver` times our solver on its machine"
         )
     ratio = compute_against_classical(
         [submission], solvers, seconds=costs, seconds_per_frame=seconds
     )
     if ratio is not None:
         return ratio, None
-    return None, "the classical solvers have no score in these scenarios"
+    return None, "no classical solver has a score above 0 in these scenarios"
 
 
 @dataclass(frozen=True, kw_only=True)
