@@ -414,10 +414,11 @@ def main() -> int:
         "number of particles, the grid and the substeps. The first table shows "
         "processor times for one particle: for drawing the initial state, for one "
         "substep, and for three kinds of work on a frame. *Writing a frame* includes "
-        "hashing and "
-        "compressing it. *Hashing a written frame* is the work of `lagbench verify`: "
-        "it reads the frame from the file and hashes it again. The last column of the "
-        "table is the number of bytes of one particle in one frame of the file.",
+        "hashing and compressing it. *Hashing a written frame* is the work of "
+        "`lagbench verify`: it reads the frame from the file and hashes it again. "
+        "*Statistics of a frame* is the work for the means and standard deviations "
+        "over train. The last column of the table is the number of bytes of one "
+        "particle in one frame of the file.",
         "",
         *parts_table(measured),
         "",

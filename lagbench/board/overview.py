@@ -593,9 +593,9 @@ def state_verdicts(conclusions: Sequence[Conclusion]) -> list[str]:
     sentences = []
     if winners:
         sentences.append(
-            f"Learning pays on {_share(len(winners), total)}: there no classical "
-            "solver of lagbench is as cheap per frame and as accurate as the most "
-            "accurate model."
+            f"Learning pays on {_share(len(winners), total)}: there no single "
+            "classical solver of lagbench is both as cheap per frame and as accurate "
+            "as the most accurate model."
         )
         sentences += _describe_winners(winners)
     for verdict, statement in OTHER_VERDICTS.items():
