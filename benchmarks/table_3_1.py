@@ -214,7 +214,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     if device == Device.CUDA:
         consequence = (
             "On a GPU the copy takes long. So with 120 substeps or more in a frame, "
-            "t/frame can be half of the number of substeps times t/substep."
+            "t/frame can be only half as long as t/substep times the number of "
+            "substeps."
         )
     return [
         "## Table 3.1: time of the solver for more and more particles",

@@ -42,7 +42,8 @@ def export_command(
             "--from-walls/--unit-box",
             "For lagrangebench-h5: the origin of the positions is the corner of the "
             "lower walls, or that of the unit box, as in lagbench. Default: the walls "
-            "in full boxes, the unit box on free surfaces.",
+            "in full boxes, with moving walls and with periodic axes, else the unit "
+            "box.",
         ),
     ] = None,
     wall_particles: Annotated[

@@ -62,9 +62,7 @@ PeriodicOption = Annotated[
 ]
 RescaleFlag = Annotated[
     bool,
-    option(
-        "--rescale", "Scale positions by a power of two so that they fit the unit box."
-    ),
+    option("--rescale", "Scale positions so that they fit the unit box."),
 ]
 InputFramesOption = Annotated[
     int | None,

@@ -104,7 +104,8 @@ def export(
         from_walls: lagrangebench-h5 only: measure positions from the lower walls, so
             that the bounds that its models see are the walls; no bit is lost. Else
             positions are ours, and the bounds those of the unit box, which that
-            program's neighbour search needs. None: from the walls in full boxes.
+            program's neighbour search needs. None: from the walls in full boxes, and
+            where walls may move or an axis is periodic.
         wall_particles: full boxes of two dimensions with four walls only: add
             particles beside the walls that move along with them, since neither
             format has wall velocities.
