@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.layout import expand_home
-from lagbench.data.local import locate
+from lagbench.data.local import SizeLocation, locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
@@ -86,28 +86,9 @@ def predict_onnx(
     output_path = expand_home(output)
     check_predictions_output(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)
-    named_split = split
-    split, size = _choose_data_set(split, size, declared, model_path)
-    try:
-        any_tier, folder, known = locate(split, size, root=root, registry=registry)
-    except UsageError as error:
-        if named_split is not None:
-            raise
-        raise UsageError(
-            error.what,
-            where=f"{model_path}, the data set that it states",
-            expected=error.expected,
-            got=error.got,
-            fix="name the split, or the folder of a local one: --split",
-        ) from error
-    if declared.split not in (None, any_tier.split):
-        raise UsageError(
-            "the model was trained on another split",
-            where=f"{model_path}, --split",
-            expected=declared.split,
-            got=any_tier.split,
-            fix="leave --split out, or give the model of this split",
-        )
+    any_tier, folder, known = _locate_data_set(
+        split, size, declared, model_path, root=root, registry=registry
+    )
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(model_path, size=tier, root=folder, declared=declared)
@@ -154,6 +135,54 @@ def predict_onnx(
         parameters=runner.parameters,
         solver_seconds_per_frame=solver_seconds,
     )
+
+
+def _locate_data_set(
+    split: str | None,
+    size: str | None,
+    declared: DeclaredModel,
+    model: Path,
+    *,
+    root: str | Path | None,
+    registry: Registry | None,
+) -> SizeLocation:
+    """Return the data set to predict, and where it lies.
+
+    Args:
+        split: the named split; that of the file when None.
+        size: the named size.
+        declared: what the file states.
+        model: the file, for messages.
+        root: folder of all data sets.
+        registry: where splits are described.
+
+    Raises:
+        UsageError: no split is named or stated, there is no such data set, or the file
+            states another split than the named one.
+    """
+    chosen_split, chosen_size = _choose_data_set(split, size, declared, model)
+    try:
+        location = locate(chosen_split, chosen_size, root=root, registry=registry)
+    except UsageError as error:
+        if split is not None:
+            raise
+        raise UsageError(
+            error.what,
+            where=f"{model}, the data set that it states",
+            expected=error.expected,
+            got=error.got,
+            fix="name the split, or the folder of a local one: --split",
+        ) from error
+    located_split = location.size.split
+    if declared.split not in (None, located_split):
+        raise UsageError(
+            "the model was trained on another split",
+            where=f"{model}, --split",
+            expected=declared.split,
+            got=located_split,
+            fix="leave --split out, or give the model of this split",
+        )
+    return location
 
 
 def _choose_data_set(
