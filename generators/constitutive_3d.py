@@ -206,6 +206,34 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
 
 
 @ti.func
+def deformed(rows: Template, slopes: Template, dt: f32) -> Value:
+    """Return (I + dt C) F: how F of a solid follows the flow for a substep.
+
+    Args:
+        rows: F [1].
+        slopes: the velocity gradient C [1/s].
+        dt: duration of the substep [s].
+    """
+    columns = transposed(rows)
+    x_rate = dot_with_each(slopes[0], columns)
+    y_rate = dot_with_each(slopes[1], columns)
+    z_rate = dot_with_each(slopes[2], columns)
+    x_row = advanced(rows[0], x_rate, dt)
+    y_row = advanced(rows[1], y_rate, dt)
+    z_row = advanced(rows[2], z_rate, dt)
+    return [x_row, y_row, z_row]
+
+
+@ti.func
+def advanced(row: Template, rate: Template, dt: f32) -> Value:
+    """Return a row after a substep in which it changes at this rate [1/s]."""
+    x = row[0] + dt * rate[0]
+    y = row[1] + dt * rate[1]
+    z = row[2] + dt * rate[2]
+    return [x, y, z]
+
+
+@ti.func
 def rotation_tangent(difference: Value, double_entry: Value) -> Value:
     """Return the tangent of the angle by which Jacobi's method rotates two axes.
 

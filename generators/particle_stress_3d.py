@@ -23,6 +23,7 @@ from . import backend
 from .constitutive import hardening, larger, liquid_stress
 from .constitutive_3d import (
     corotated_stress,
+    deformed,
     determinant,
     plastic_return,
     rows_of,
@@ -46,22 +47,11 @@ _ENTRIES = 6  # of a symmetric matrix, in Voigt's order
 
 # The serial driver computes solids in blocks of this many particles, one in each lane
 # of a vector register. LLVM makes vector instructions only if a loop reads its lanes
-# from memory and writes them to memory. Therefore one loop copies the particles to
-# lists, a second one computes block by block, and a third one copies the results back.
+# from memory and writes them to memory. Therefore the solids have lists, in which
+# equal numbers of neighbours stand side by side. One loop copies to a list what the
+# other phases computed, a second one computes block by block, and a third one copies
+# the results back. F stays in its list during an advance.
 _LANES = 8
-
-
-def _fill_list(field: ti.ScalarField, is_member: NDArray[np.bool_]) -> int:
-    """Write the numbers of the member particles to a field, then zeros to its end.
-
-    Returns:
-        How many members there are.
-    """
-    numbers = np.flatnonzero(is_member)
-    filled = np.zeros(field.shape, np.int32)
-    filled[: len(numbers)] = numbers
-    field.from_numpy(filled)
-    return len(numbers)
 
 
 @ti.data_oriented
@@ -100,17 +90,17 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.elastic_diagonal = vec4.field()
         self.elastic_off_diagonal = vec4.field()
 
-        # two lists of particles of scenario 0: those that are solids, and those that
-        # are snow
+        # the solids of scenario 0, snow first
         self.solids = ti.field(i32)
-        self.snow_particles = ti.field(i32)
-        # at the place of a particle in its list: entries of F [1], Lame's constants mu
-        # and lambda [mass/(length s^2)], entries of the Kirchhoff stress without
-        # damping [mass/(length s^2)], and the factor on Jp [1]
+        # at the place of a solid in this list: entries of F [1] and of C [1/s], Lame's
+        # constants mu and lambda [mass/(length s^2)], entries of the Kirchhoff stress
+        # without damping [mass/(length s^2)], the factor on Jp [1], and det F [1]
         self.listed_gradient = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
+        self.listed_slopes = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
         self.listed_moduli = [ti.field(f32), ti.field(f32)]
         self.listed_stress = [ti.field(f32) for _ in range(_ENTRIES)]
         self.listed_growth = ti.field(f32)
+        self.listed_jacobian = ti.field(f32)
 
         # of each node: n v and n J
         self.sums = ti.Vector.field(4, i64)
@@ -144,13 +134,16 @@ class ParticleStress3D(FreeSurfaceKernels):
         whole_blocks = _LANES * blocks
         listed = (
             self.solids,
-            self.snow_particles,
             *self.listed_gradient[0],
             *self.listed_gradient[1],
             *self.listed_gradient[2],
+            *self.listed_slopes[0],
+            *self.listed_slopes[1],
+            *self.listed_slopes[2],
             *self.listed_moduli,
             *self.listed_stress,
             self.listed_growth,
+            self.listed_jacobian,
         )
         backend.place(((whole_blocks,), listed))
 
@@ -162,8 +155,16 @@ class ParticleStress3D(FreeSurfaceKernels):
         """
         super().sort_by_material(material)
         first_material = material[0]
-        self.solid_count = _fill_list(self.solids, first_material != LIQUID)
-        self.snow_count = _fill_list(self.snow_particles, first_material == SNOW)
+        is_snow = first_material == SNOW
+        is_other_solid = (first_material != LIQUID) & ~is_snow
+        snow = np.flatnonzero(is_snow)
+        other_solids = np.flatnonzero(is_other_solid)
+        numbers = np.zeros(self.solids.shape, np.int32)
+        solids = np.concatenate([snow, other_solids])
+        numbers[: len(solids)] = solids
+        self.solids.from_numpy(numbers)
+        self.snow_count = len(snow)
+        self.solid_count = len(solids)
 
     # The phases: each function is one phase at one particle or node.
 
@@ -257,12 +258,30 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.store_elastic_stress(s, p, stress)
 
     @ti.func
-    def copy_gradient_to_list(self, members: Template, number: i32) -> None:
-        """Copy F of a particle to its place in a list."""
-        p = members[number]
+    def copy_gradient_to_list(self, number: i32) -> None:
+        """Copy F of a solid to its place in the list of solids."""
+        p = self.solids[number]
         f = self.deformation(0, p)
         for row, column in ti.static(ti.ndrange(3, 3)):
             self.listed_gradient[row][column][number] = f[row, column]
+
+    @ti.func
+    def copy_gradient_from_list(self, number: i32) -> None:
+        """Copy F of a solid from its place in the list of solids to the particle."""
+        p = self.solids[number]
+        for axis in ti.static(_AXES):
+            x = self.listed_gradient[0][axis][number]
+            y = self.listed_gradient[1][axis][number]
+            z = self.listed_gradient[2][axis][number]
+            self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
+
+    @ti.func
+    def copy_slopes_to_list(self, number: i32) -> None:
+        """Copy C of a solid to its place in the list of solids."""
+        p = self.solids[number]
+        c = self.velocity_gradient(0, p)
+        for row, column in ti.static(ti.ndrange(3, 3)):
+            self.listed_slopes[row][column][number] = c[row, column]
 
     @ti.func
     def copy_moduli_to_list(self, number: i32) -> None:
@@ -273,28 +292,11 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.listed_moduli[1][number] = la
 
     @ti.func
-    def listed_rows(self, block: i32) -> Value:
-        """Return the rows of F of a block of particles."""
-        x_row = self.listed_row(0, block)
-        y_row = self.listed_row(1, block)
-        z_row = self.listed_row(2, block)
-        return [x_row, y_row, z_row]
-
-    @ti.func
-    def listed_row(self, row: Template, block: i32) -> Value:
-        """Return a row of F of a block of particles."""
-        fields = ti.static(self.listed_gradient[row])
-        x = load_lanes(fields[0], block)
-        y = load_lanes(fields[1], block)
-        z = load_lanes(fields[2], block)
-        return [x, y, z]
-
-    @ti.func
     def compute_listed_stress(self, block: i32) -> None:
         """Compute the Kirchhoff stress of a block of solids without damping."""
         mu = load_lanes(self.listed_moduli[0], block)
         la = load_lanes(self.listed_moduli[1], block)
-        rows = self.listed_rows(block)
+        rows = load_rows(self.listed_gradient, block)
         stress = corotated_stress(rows, mu, la)
         for entry in ti.static(range(_ENTRIES)):
             store_lanes(self.listed_stress[entry], block, stress[entry])
@@ -334,9 +336,12 @@ class ParticleStress3D(FreeSurfaceKernels):
         off_diagonal = vec4(0.0)  # entries yz, xz and xy
         if ti.static(solid):
             viscosity = self.viscosity(s, p)
-            if self.matter[s, p][0] != LIQUID:
-                diagonal = self.elastic_diagonal[s, p]
-                off_diagonal = self.elastic_off_diagonal[s, p]
+            # Selections instead of branches: LLVM makes vector instructions.
+            is_liquid = self.matter[s, p][0] == LIQUID
+            elastic_diagonal = self.elastic_diagonal[s, p]
+            elastic_off_diagonal = self.elastic_off_diagonal[s, p]
+            diagonal = ti.select(is_liquid, diagonal, elastic_diagonal)
+            off_diagonal = ti.select(is_liquid, off_diagonal, elastic_off_diagonal)
 
         # A node lies within 1.5 cells of the particle along each axis. This bounds the
         # speed that A adds at the node, along each axis.
@@ -548,10 +553,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.slopes[1][s, p] = slope_y
         divergence = slope_x[0] + slope_y[1] + slope_z[2]
         j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
+        is_liquid = kind == LIQUID
         ratio = j
         spread_jacobian = j
         if ti.static(solid):
-            is_liquid = kind == LIQUID
             ratio = ti.select(is_liquid, j, old_ratio)
             spread_jacobian = ti.select(is_liquid, j, 1.0)
         self.particle_state[s, p] = vec4(velocity, spread_jacobian)
@@ -561,8 +566,11 @@ class ParticleStress3D(FreeSurfaceKernels):
         speed = largest_component(velocity)
         extremes[0] = larger(speed, extremes[0])
         self.extremes[s, p] = extremes
-        if ti.static(not solid):
-            self.update_jacobian_extremes(s, p)
+        kept_jacobian = j
+        if ti.static(solid):
+            # det F of a solid is not known yet. The old extreme changes nothing.
+            kept_jacobian = ti.select(is_liquid, j, extremes[1])
+        self.keep_jacobian(s, p, kept_jacobian)
 
     @ti.func
     def store_ratio(self, s: i32, p: i32, ratio: f32) -> None:
@@ -586,9 +594,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         return ti.select(is_liquid, ratio, solid_jacobian)
 
     @ti.func
-    def update_jacobian_extremes(self, s: i32, p: i32) -> None:
-        """Update the extremes of J of a liquid or det F of a solid in this advance."""
-        jacobian = self.jacobian(s, p)
+    def keep_jacobian(self, s: i32, p: i32, jacobian: f32) -> None:
+        """Keep the smallest and largest J or det F of a particle in this advance."""
         extremes = self.extremes[s, p]
         old_min = extremes[1]
         extremes[1] = ti.select(jacobian < old_min, jacobian, old_min)
@@ -597,33 +604,27 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.func
     def deform(self, s: i32, p: i32) -> None:
-        """Update F of a solid with the velocity gradient: F <- (I + dt C) F."""
-        is_liquid = self.matter[s, p][0] == LIQUID
-        c = self.velocity_gradient(s, p)
-        old_f = self.deformation(s, p)
-        rate = c @ old_f
-        solid_f = old_f + self.dt * rate
-        f = ti.select(is_liquid, old_f, solid_f)
-        self.store_deformation(s, p, f)
+        """Update F of a solid with the velocity gradient, and Jp of snow.
 
-    @ti.func
-    def apply_snow_plasticity(self, s: i32, p: i32) -> None:
-        """Bring F of a snow particle back to its yield limits.
-
-        F from :meth:`deform` is the trial gradient. The change of volume that it loses
-        goes into Jp. Particles of other materials stay as they are.
+        (I + dt C) F is the trial gradient. That of snow returns to its yield limits,
+        and the change of volume that it loses goes into Jp.
         """
         kind = self.matter[s, p][0]
-        if kind == SNOW:
+        if kind != LIQUID:
             f = self.deformation(s, p)
-            trial = rows_of(f)
-            rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
-            for axis in ti.static(_AXES):
-                x = rows[0][axis]
-                y = rows[1][axis]
-                z = rows[2][axis]
-                self.deformation_columns[axis][s, p] = vec4(x, y, z, 0.0)
-            self.update_plastic_ratio(s, p, growth)
+            c = self.velocity_gradient(s, p)
+            old_rows = rows_of(f)
+            slopes = rows_of(c)
+            rows = deformed(old_rows, slopes, self.dt)
+            self.store_deformation(s, p, rows)
+            if kind == SNOW:
+                low = self.yield_low
+                high = self.yield_high
+                elastic_rows, growth = plastic_return(rows, low, high)
+                self.store_deformation(s, p, elastic_rows)
+                self.update_plastic_ratio(s, p, growth)
+            jacobian = self.jacobian(s, p)
+            self.keep_jacobian(s, p, jacobian)
 
     @ti.func
     def update_plastic_ratio(self, s: i32, p: i32, growth: f32) -> None:
@@ -635,33 +636,60 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.store_ratio(s, p, jp)
 
     @ti.func
-    def compute_listed_plasticity(self, block: i32) -> None:
-        """Compute the elastic F and the growth of Jp of a block of snow particles."""
-        trial = self.listed_rows(block)
+    def compute_listed_deformation(self, block: i32) -> None:
+        """Update F of a block of solids with the velocity gradient."""
+        old_rows = load_rows(self.listed_gradient, block)
+        slopes = load_rows(self.listed_slopes, block)
+        rows = deformed(old_rows, slopes, self.dt)
+        store_rows(self.listed_gradient, block, rows)
+
+    @ti.func
+    def compute_listed_plasticity(self, block: i32, snow_count: i32) -> None:
+        """Compute the elastic F and the growth of Jp of a block of snow particles.
+
+        The last block may have other solids behind the snow. Their F stays as it is.
+        """
+        trial = load_rows(self.listed_gradient, block)
         rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
-        for row, column in ti.static(ti.ndrange(3, 3)):
-            field = ti.static(self.listed_gradient[row][column])
-            store_lanes(field, block, rows[row][column])
+        snow_lanes = snow_count - block * _LANES
+        for lane in ti.static(range(_LANES)):
+            is_snow = lane < snow_lanes
+            for row, column in ti.static(ti.ndrange(3, 3)):
+                elastic = rows[row][column][lane]
+                old = trial[row][column][lane]
+                rows[row][column][lane] = ti.select(is_snow, elastic, old)
+        store_rows(self.listed_gradient, block, rows)
         store_lanes(self.listed_growth, block, growth)
 
     @ti.func
-    def copy_plasticity_from_list(self, number: i32) -> None:
-        """Update F and Jp of a snow particle from its place in the list of snow."""
-        p = self.snow_particles[number]
-        for axis in ti.static(_AXES):
-            x = self.listed_gradient[0][axis][number]
-            y = self.listed_gradient[1][axis][number]
-            z = self.listed_gradient[2][axis][number]
-            self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
+    def copy_growth_from_list(self, number: i32) -> None:
+        """Update Jp of a snow particle from its place in the list of solids."""
+        p = self.solids[number]
         growth = self.listed_growth[number]
         self.update_plastic_ratio(0, p, growth)
 
     @ti.func
-    def store_deformation(self, s: i32, p: i32, f: mat3) -> None:
-        """Store F, column by column."""
+    def compute_listed_jacobian(self, block: i32) -> None:
+        """Compute det F of a block of solids."""
+        rows = load_rows(self.listed_gradient, block)
+        jacobian = determinant(rows)
+        store_lanes(self.listed_jacobian, block, jacobian)
+
+    @ti.func
+    def copy_jacobian_from_list(self, number: i32) -> None:
+        """Keep the extremes of det F of a solid, from its place in the list."""
+        p = self.solids[number]
+        jacobian = self.listed_jacobian[number]
+        self.keep_jacobian(0, p, jacobian)
+
+    @ti.func
+    def store_deformation(self, s: i32, p: i32, rows: Template) -> None:
+        """Store F of a particle, column by column."""
         for axis in ti.static(_AXES):
-            column = f[:, axis]
-            self.deformation_columns[axis][s, p] = vec4(column, 0.0)
+            x = rows[0][axis]
+            y = rows[1][axis]
+            z = rows[2][axis]
+            self.deformation_columns[axis][s, p] = vec4(x, y, z, 0.0)
 
     # The drivers run the same phases in the same order.
 
@@ -669,6 +697,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Advance scenario 0 by many substeps in one thread, on the nodes that
         particles touch.
         """
+        self._fill_lists(self.solid_count)
         self._serial_substeps(
             substeps,
             self.particles,
@@ -676,10 +705,24 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.snow_count,
             self.solid,
         )
+        self._empty_lists(self.solid_count)
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
         self._parallel_substep(self.particles, self.width, self.solid)
+
+    @ti.kernel
+    def _fill_lists(self, solid_count: i32) -> Nothing:
+        ti.loop_config(serialize=True)
+        for number in range(solid_count):
+            self.copy_gradient_to_list(number)
+            self.copy_moduli_to_list(number)
+
+    @ti.kernel
+    def _empty_lists(self, solid_count: i32) -> Nothing:
+        ti.loop_config(serialize=True)
+        for number in range(solid_count):
+            self.copy_gradient_from_list(number)
 
     @ti.kernel
     def _serial_substeps(
@@ -710,8 +753,8 @@ class ParticleStress3D(FreeSurfaceKernels):
             for p in range(particles):
                 self.locate(0, p)
             if ti.static(solid):
-                for number in range(solid_count):
-                    self.copy_gradient_to_list(self.solids, number)
+                # Jp changes the moduli of snow only.
+                for number in range(snow_count):
                     self.copy_moduli_to_list(number)
                 for block in range(solid_blocks):
                     self.compute_listed_stress(block)
@@ -730,16 +773,18 @@ class ParticleStress3D(FreeSurfaceKernels):
             for p in range(particles):
                 self.flow(0, p, solid)
             if ti.static(solid):
-                for p in range(particles):
-                    self.deform(0, p)
-                for number in range(snow_count):
-                    self.copy_gradient_to_list(self.snow_particles, number)
+                for number in range(solid_count):
+                    self.copy_slopes_to_list(number)
+                for block in range(solid_blocks):
+                    self.compute_listed_deformation(block)
                 for block in range(snow_blocks):
-                    self.compute_listed_plasticity(block)
+                    self.compute_listed_plasticity(block, snow_count)
                 for number in range(snow_count):
-                    self.copy_plasticity_from_list(number)
-                for p in range(particles):
-                    self.update_jacobian_extremes(0, p)
+                    self.copy_growth_from_list(number)
+                for block in range(solid_blocks):
+                    self.compute_listed_jacobian(block)
+                for number in range(solid_count):
+                    self.copy_jacobian_from_list(number)
 
     @ti.kernel
     def _parallel_substep(self, particles: i32, width: i32, solid: Template) -> Nothing:
@@ -765,8 +810,6 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.flow(s, p, solid)
             if ti.static(solid):
                 self.deform(s, p)
-                self.apply_snow_plasticity(s, p)
-                self.update_jacobian_extremes(s, p)
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
@@ -790,6 +833,32 @@ def load_lanes(field: Template, block: i32) -> Value:
     for lane in ti.static(range(_LANES)):
         values[lane] = field[first + lane]
     return values
+
+
+@ti.func
+def load_rows(fields: Template, block: i32) -> Value:
+    """Read the matrices of a block of particles as a list of rows."""
+    x_row = load_row(fields[0], block)
+    y_row = load_row(fields[1], block)
+    z_row = load_row(fields[2], block)
+    return [x_row, y_row, z_row]
+
+
+@ti.func
+def load_row(fields: Template, block: i32) -> Value:
+    """Read a row of the matrices of a block of particles."""
+    x = load_lanes(fields[0], block)
+    y = load_lanes(fields[1], block)
+    z = load_lanes(fields[2], block)
+    return [x, y, z]
+
+
+@ti.func
+def store_rows(fields: Template, block: i32, rows: Value) -> None:
+    """Write the matrices of a block of particles."""
+    for row, column in ti.static(ti.ndrange(3, 3)):
+        field = ti.static(fields[row][column])
+        store_lanes(field, block, rows[row][column])
 
 
 @ti.func
