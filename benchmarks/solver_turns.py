@@ -2,11 +2,13 @@
 
     python benchmarks/solver_turns.py --against main~20 --cases cavity curl-noise-3d
 
-Per case two processes, one of each commit, keep their solvers and advance the first
-test scenario from its start, in turns, on the same core. So both meet the same load of
-the machine. Prints the medians of the particle-substeps per second of processor time,
-and of the ratios of the turns, with quartiles. No positions are read:
-``solver_against.py`` compares whole frames.
+Per case two processes, one of each commit, keep their solvers and advance one scenario
+from its start, in turns, on the same core. So both meet the same load of the machine.
+The scenario is the first one of test, or the one that ``--scenario`` names.
+
+Prints the medians of the particle-substeps per second of processor time, and of the
+ratios of the turns, with quartiles. No positions are read: ``solver_against.py``
+compares whole frames.
 """
 
 from __future__ import annotations
@@ -32,12 +34,13 @@ CASES = ("cavity", "curl-noise", "fluid", "multimaterial")
 PARTICLE_SUBSTEPS = 2_000_000  # of a turn
 
 
-def serve(split: str, size: str) -> None:
+def serve(split: str, size: str, scenario: int | None) -> None:
     """Advance the solver once per line of stdin; print the rate of each turn."""
     tier = load().size(split, size)
     parameters = solver_constants(tier)
-    first_test = tier.subsets["test"][0]
-    state = draw_initial_state(tier, first_test)
+    if scenario is None:
+        scenario = tier.subsets["test"][0]
+    state = draw_initial_state(tier, scenario)
     solver = build(parameters)
     substeps = max(1, PARTICLE_SUBSTEPS // parameters.particles)
     for _ in sys.stdin:
@@ -53,9 +56,13 @@ def serve(split: str, size: str) -> None:
 class Side:
     """The process of one commit."""
 
-    def __init__(self, tree: Path, split: str, size: str) -> None:
+    def __init__(
+        self, tree: Path, split: str, size: str, scenario: int | None = None
+    ) -> None:
         core = min(os.sched_getaffinity(0))
         command = [sys.executable, __file__, "--serve", split, "--size", size]
+        if scenario is not None:
+            command += ["--scenario", str(scenario)]
         # Both sides run the benchmark scripts of HERE; lagbench comes from the tree.
         self._process = subprocess.Popen(
             command,
@@ -81,9 +88,11 @@ class Side:
         self._process.communicate()
 
 
-def compare(other: Path, split: str, size: str, turns: int) -> NDArray[np.float64]:
+def compare(
+    other: Path, split: str, size: str, scenario: int | None, turns: int
+) -> NDArray[np.float64]:
     """Return the rates of both trees, shape [turn, tree]."""
-    sides = [Side(tree, split, size) for tree in (other, HERE)]
+    sides = [Side(tree, split, size, scenario) for tree in (other, HERE)]
     rates = np.empty((turns, 2))
     for turn in range(turns):
         for index, side in enumerate(sides):
@@ -101,11 +110,12 @@ def main() -> int:
     parser.add_argument("--against", metavar="REV")
     parser.add_argument("--cases", nargs="+", default=CASES, metavar="SPLIT")
     parser.add_argument("--size", default="mini")
+    parser.add_argument("--scenario", type=int, metavar="ID")
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument("--serve", metavar="SPLIT", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve:
-        serve(options.serve, options.size)
+        serve(options.serve, options.size, options.scenario)
         return 0
     if options.against is None:
         parser.error("--against is required")
@@ -118,7 +128,7 @@ def main() -> int:
     print("|---|---:|---:|---:|---|")
     with checked_out(options.against) as other:
         for case in options.cases:
-            rates = compare(other, case, options.size, options.turns)
+            rates = compare(other, case, options.size, options.scenario, options.turns)
             theirs, ours = np.median(rates, axis=0) / 1e6
             their_rates, our_rates = rates.T
             ratios = our_rates / their_rates

@@ -47,10 +47,10 @@ _ENTRIES = 6  # of a symmetric matrix, in Voigt's order
 
 # The serial driver computes solids in blocks of this many particles, one in each lane
 # of a vector register. LLVM makes vector instructions only if a loop reads its lanes
-# from memory and writes them to memory. Therefore the solids have lists, in which
-# equal numbers of neighbours stand side by side. One loop copies to a list what the
+# from memory and writes them to memory. Therefore each number of the solids, such as an
+# entry of F, has a list with one place for each solid. One loop copies to a list what
 # other phases computed, a second one computes block by block, and a third one copies
-# the results back. F stays in its list during an advance.
+# the results back. F stays in its lists during an advance.
 _LANES = 8
 
 

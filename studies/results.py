@@ -156,8 +156,8 @@ network. The question about the best naive baseline counts both."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. Some lines have
-a command. It trains the models of its line, except those without a recipe. Then
-`lagbench submit` makes the entries."""
+a command. It trains the models of its line, except those for which lagbench has no
+recipe on this data set. Then `lagbench submit` makes the entries."""
 
 UNANSWERED_NOTE = """\
 ### Questions without an answer
