@@ -39,6 +39,8 @@ class RunFolder:
         self.weights = path / "weights.pt"
         self.log = path / "training.json"  # the log of the training
         self.tensorboard = path / "tensorboard"  # folder of TensorBoard's files
+        # files of an earlier training that the first file of the new one replaces
+        self._replaced: list[Path] = []
 
     def find_checkpoint(
         self,
@@ -218,12 +220,27 @@ class RunFolder:
                 return True
         return False
 
-    def clear(self) -> None:
-        """Remove the files of an earlier training; files of others stay."""
+    def start_anew(self) -> None:
+        """Note the files of an earlier training, if there are any.
+
+        They stay until the new training has something to store. If it fails before, the
+        earlier training is not lost.
+        """
         logs = self.tensorboard.glob("events.out.tfevents.*")
         parameters = self.tensorboard / "hparams.yaml"
-        for file in (self.checkpoint, self.weights, self.log, *logs, parameters):
+        files = (self.checkpoint, self.weights, self.log, *logs, parameters)
+        self._replaced = [file for file in files if file.exists()]
+
+    @property
+    def holds_earlier(self) -> bool:
+        """Whether the files of an earlier training are still there."""
+        return bool(self._replaced)
+
+    def remove_earlier(self) -> None:
+        """Remove the files that :meth:`start_anew` noted; files of others stay."""
+        for file in self._replaced:
             file.unlink(missing_ok=True)
+        self._replaced = []
         with suppress(OSError):  # a folder that holds other files is not removed
             self.tensorboard.rmdir()
 

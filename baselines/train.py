@@ -145,8 +145,8 @@ def train(
         output: folder of the run; by default
             ``runs/<split>/<size>[-<variant>]/<baseline>[-further]-<seed>``.
         resume: go on with what an earlier run left there.
-        fresh: train anew, and remove an earlier training there; it wins over
-            ``resume``.
+        fresh: train anew; it wins over ``resume``. An earlier training in the folder is
+            replaced when the new one stores its first file.
         device: ``cpu``, ``cuda`` or ``auto``.
         processes: processes, one device each (torchrun's own number where that started
             us).
@@ -233,9 +233,9 @@ def train(
 
 
 def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
-    """Fit a model or descend on its loss, in a folder without an earlier training."""
+    """Fit a model or descend on its loss."""
     if job.earlier is None and not is_helper():
-        job.folder.clear()
+        job.folder.start_anew()
     if model.closed_form:
         try:
             log, steps = fit(job, model)
@@ -529,6 +529,7 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         exact_weights[name] = weight.detach()
     rounded = job.checkpoint(log, round_weights(model))
     exact = job.checkpoint(log, exact_weights)
+    job.folder.remove_earlier()
     save(job.folder.weights, rounded)
     save(job.folder.checkpoint, exact)
     job.folder.write_log(job.log_as_json(model, log, steps=FIT_STEPS))

@@ -151,7 +151,7 @@ class TrainingLoop:
                     self._train(loader)
             except Exception:
                 # The checkpoint stays as it is.
-                if self.fabric.is_global_zero:
+                if self.fabric.is_global_zero and not self.job.folder.holds_earlier:
                     self.log.state = "failed"
                     # A disk that takes no log does not hide the first error.
                     with suppress(WorkFailedError):
@@ -289,6 +289,7 @@ class TrainingLoop:
         with self.optimisation.use_mean():
             weights = round_weights(self.optimisation.model)
             checkpoint = self.job.checkpoint(self.log, weights)
+            self.job.folder.remove_earlier()
             save(self.job.folder.weights, checkpoint)
 
     def _store(self) -> None:
@@ -306,8 +307,9 @@ class TrainingLoop:
         for value in weights.values():
             if not torch.isfinite(value).all():
                 raise self.optimisation.not_finite()
-        self._write_log()
         folder = self.job.folder
+        folder.remove_earlier()
+        self._write_log()
         optimizer_state = self.optimisation.optimizer.state_dict()
         checkpoint = self.job.checkpoint(self.log, weights, optimizer_state)
         save(folder.checkpoint, checkpoint)

@@ -376,6 +376,17 @@ def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) 
     assert read_training_log(tmp_path / "run")["state"] == "failed"
 
 
+def test_a_fresh_training_that_fails_at_once_leaves_the_earlier_one(run: Run) -> None:
+    """No file of it changes, and it goes on as if nothing had happened."""
+    earlier = run("drift", "steps=2")
+    files = (earlier.checkpoint, earlier.weights, earlier.folder / "training.json")
+    before = [file.read_bytes() for file in files]
+    with pytest.raises(WorkFailedError):
+        run("drift", "model.fail_at=1", "steps=2", fresh=True)
+    assert [file.read_bytes() for file in files] == before
+    assert run("drift", "steps=2").first_step == 2
+
+
 def test_a_training_that_stopped_early_is_over(run: Run) -> None:
     """Validations without a new best end it; the same command again changes no byte."""
     # The best coefficient is near 1; with this rate the second step overshoots it for
@@ -823,7 +834,9 @@ def write_tensorboard_logs(folder: Path) -> Path:
 
 def test_logs_of_a_run_are_cleared(tmp_path: Path) -> None:
     write_tensorboard_logs(tmp_path)
-    RunFolder(tmp_path).clear()
+    folder = RunFolder(tmp_path)
+    folder.start_anew()
+    folder.remove_earlier()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -832,7 +845,9 @@ def test_other_files_among_the_logs_are_not_cleared(tmp_path: Path) -> None:
     notes = logs / "my-runs" / "notes.txt"
     notes.parent.mkdir()
     notes.write_text("precious")
-    RunFolder(tmp_path).clear()
+    folder = RunFolder(tmp_path)
+    folder.start_anew()
+    folder.remove_earlier()
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert files == [notes]
 
