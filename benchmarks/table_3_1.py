@@ -266,8 +266,7 @@ def markdown(
         "For example, the row `t/frame against q^2` has the exponent p in "
         "t/frame ~ (q^2)^p. It is the slope of a least-squares line through the "
         'logarithms of both. The column "thesis, same rows" uses only the rows of the '
-        "thesis that are in the table above. If the table above has all rows of the "
-        "thesis, the last two columns are equal.",
+        "thesis that are in the table above.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
