@@ -213,9 +213,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     consequence = "On a CPU the difference is small, often smaller than the noise."
     if device == Device.CUDA:
         consequence = (
-            "On a GPU the copy takes long. So with 120 substeps or more in a frame, "
-            "t/frame can be only half as long as t/substep times the number of "
-            "substeps."
+            "On a GPU a copy takes long. So in the rows with 120 or more substeps "
+            "t/frame is only about half of this product."
         )
     return [
         "## Table 3.1: time of the solver for more and more particles",
@@ -230,9 +229,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "number of frames per second. t/frame is the time of a run with all substeps "
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
-        f"contains 1/{FIXED} of the time of a copy. For a frame of {2 * FIXED} "
-        f"substeps, {2 * FIXED} times our t/substep contains {2 * FIXED}/{FIXED} = 2 "
-        f"copies, but our t/frame contains only one. {consequence}",
+        f"contains 1/{FIXED} of the time of a copy. The product of t/substep and the "
+        f"number of substeps therefore contains several copies (2 for {2 * FIXED} "
+        f"substeps, 6 for {6 * FIXED}), but t/frame contains only one. {consequence}",
         "",
     ]
 

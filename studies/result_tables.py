@@ -184,8 +184,8 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
             " whose time was measured "
         )
     sentence = (
-        f"{place}this model takes more time per frame than the simulator that made the"
-        f" data ({times}, in the first ten frames)."
+        f"{place}the best model takes more time per frame than the simulator that made"
+        f" the data ({times}, in the first ten frames)."
     )
     return [sentence[0].upper() + sentence[1:]]
 

@@ -79,9 +79,10 @@ score is better.
 - `against_classical` is (score of the model) / (score of the best classical solver that
   costs no more per frame than the model). If every classical solver costs more, the
   ratio uses the cheapest one, and the cell says so. The brackets contain the 95 %
-  interval. The name of the solver follows. If the whole interval is below 1,
-  [learning pays](glossary.md). A dash means that the cost of the model was not measured
-  beside the solvers."""
+  interval. The name of the solver follows. A dash means that the cost of the model was
+  not measured beside the solvers.
+- [Learning pays](glossary.md) on a data set if the whole interval of its best model,
+  learned or hybrid, is below 1."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -152,7 +153,8 @@ Graph networks differ in their *operator*, and are named after it
 ([glossary](glossary.md)). A graph network may have a second entry, with ", pushforward"
 at the end of its name. In two questions the second entry takes the place of the first:
 which operator is the most accurate, and whether NeuralMPM is better than every graph
-network. The question about the best naive baseline counts both."""
+network. The question about the best naive baseline counts the two entries as two
+models."""
 
 MISSING_NOTE = """\
 These models are missing on this page. Semicolons separate their names. Some lines have

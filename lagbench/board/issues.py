@@ -166,10 +166,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
-        "a line of verified.yaml for an entry that does not exist or has other score "
-        "files than the line; a level that the records do not prove; a date in the "
-        "future; a cost for a reference predictor that the data set lacks; a blind "
-        "score of a season that the leaderboard lacks",
+        "a line of verified.yaml that does not fit its entry, its records, the data "
+        "set or the leaderboard",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
