@@ -230,8 +230,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
         f"contains 1/{FIXED} of the time of a copy. The product of t/substep and the "
-        f"number of substeps therefore contains several copies (2 for {2 * FIXED} "
-        f"substeps, 6 for {6 * FIXED}), but t/frame contains only one. {consequence}",
+        f"number of substeps therefore contains one copy for every {FIXED} substeps, "
+        f"but t/frame contains only one. {consequence}",
         "",
     ]
 

@@ -105,9 +105,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     sentences = []
     if pays:
         sentences.append(
-            f"Learning pays on {_join(pays)}. There no single classical solver of"
-            " lagbench is both as cheap per frame and as accurate as the best learned"
-            " or hybrid model."
+            f"Learning pays on {_join(pays)}. On these data sets no single classical"
+            " solver of lagbench is both as cheap per frame and as accurate as the"
+            " best learned or hybrid model."
         )
         sentences += slower_than_simulator(time_ratios)
     if open_sets:

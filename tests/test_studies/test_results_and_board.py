@@ -117,8 +117,8 @@ TWO_OF_THREE = (
         ([2.44, None], r"On 1 of the 1 of these 2 data sets whose time was measured "),
         (
             [2.0, 0.5],
-            r"On 1 of these 2 data sets the best model .* \(2 times as much, in the first"
-            r" ten frames\)",
+            r"On 1 of these 2 data sets the best model .* \(2 times as much, in the"
+            r" first ten frames\)",
         ),
         (
             [2.44],
