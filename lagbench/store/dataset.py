@@ -225,8 +225,10 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
     with ExitStack() as stack:
         try:
+            # h5netcdf reads under the lock of h5py. With netCDF4 Python crashes when a
+            # thread of Dask frees a file while another file is being opened.
             file = stack.enter_context(
-                xr.open_dataset(path, engine="netcdf4", cache=False)
+                xr.open_dataset(path, engine="h5netcdf", cache=False)
             )
             value_bytes = file["position"].dtype.itemsize
             frame_bytes = value_bytes * file.sizes["particle"] * file.sizes["space"]

@@ -65,8 +65,6 @@ def assert_refused(
 @pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
 def test_xarray_opens_it_unaided(written: Written, engine: str) -> None:
     """Plain open_dataset gives the documented dims, types and coordinates."""
-    if engine == "h5netcdf":
-        pytest.importorskip("h5netcdf")
     path, _ = written
     with xr.open_dataset(path, engine=engine) as scenario:
         dims = {}

@@ -404,6 +404,30 @@ def test_public_names_load_on_first_use() -> None:
     assert caught.value.obj is lagbench
 
 
+OPEN_AGAIN = """
+import sys
+from lagbench import open_split
+
+def measure(place):
+    again = open_split("cavity", size="tiny", root=sys.argv[1])
+    return float(again["position"].isel(scenario=place).diff("frame").mean())
+
+kept = open_split("cavity", size="tiny", root=sys.argv[1])
+for turn in range(20):
+    measure(turn % 2)
+print("done")
+"""
+
+
+def test_a_subset_that_is_kept_open_is_opened_again(ragged: Path) -> None:
+    """Threads of Dask free the files of each turn while the next turn opens its own."""
+    run = subprocess.run(
+        [sys.executable, "-c", OPEN_AGAIN, str(ragged)], capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert run.stdout.strip() == "done"
+
+
 def test_public_modules_need_no_import_of_their_own() -> None:
     """The docs write ``lagbench.exchange.export`` and ``lagbench.metrics.differ``."""
     program = (
