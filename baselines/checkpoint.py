@@ -21,7 +21,7 @@ import re
 import threading
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -111,8 +111,13 @@ class _LoggedTraining(_LogPart):
     recipe: _LoggedRecipe = _LoggedRecipe()
 
 
-def save(path: Path, checkpoint: Checkpoint) -> None:
+def save(path: Path, checkpoint: Checkpoint, *, replaced: Iterable[Path] = ()) -> None:
     """Write a checkpoint; it appears whole or not at all.
+
+    Args:
+        path: the file; weights alone may have the ending of safetensors.
+        checkpoint: what to write.
+        replaced: other files that it replaces; they are removed once it is written.
 
     Raises:
         UsageError: a weight is no tensor of plain numbers, or a file of safetensors
@@ -155,7 +160,7 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     }
     if checkpoint.optimizer is not None:
         content["optimizer"] = dict(checkpoint.optimizer)
-    with atomic_path(path, option="--output") as temporary:
+    with atomic_path(path, option="--output", replaced=replaced) as temporary:
         try:
             torch.save(content, temporary)
         except RuntimeError as error:  # torch raises it for any error of the system

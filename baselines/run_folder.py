@@ -21,7 +21,7 @@ from lagbench.errors import (
 )
 
 from .baseline import DatasetInfo
-from .checkpoint import Checkpoint, load
+from .checkpoint import Checkpoint, load, save
 from .recipe import Recipe
 from .recipe_changes import describe_start, first_difference
 from .training_log import OVER
@@ -39,8 +39,8 @@ class RunFolder:
         self.weights = path / "weights.pt"
         self.log = path / "training.json"  # the log of the training
         self.tensorboard = path / "tensorboard"  # folder of TensorBoard's files
-        # files of an earlier training that the first file of the new one replaces
-        self._replaced: list[Path] = []
+        # files of an earlier training that are still there
+        self._earlier_files: list[Path] = []
 
     def find_checkpoint(
         self,
@@ -220,27 +220,56 @@ class RunFolder:
                 return True
         return False
 
-    def start_anew(self) -> None:
-        """Note the files of an earlier training, if there are any.
+    def note_earlier_files(self) -> None:
+        """Note the files of an earlier training, before a new one begins.
 
-        They stay until the new training has something to store. If it fails before, the
-        earlier training is not lost.
+        They stay until the first :meth:`save`: if the new training fails before, the
+        earlier one is not lost. Logs without a model are removed at once.
         """
-        logs = self.tensorboard.glob("events.out.tfevents.*")
-        parameters = self.tensorboard / "hparams.yaml"
-        files = (self.checkpoint, self.weights, self.log, *logs, parameters)
-        self._replaced = [file for file in files if file.exists()]
+        files = (self.checkpoint, self.weights, self.log, *self._list_logs())
+        self._earlier_files = [file for file in files if file.exists()]
+        if not self.checkpoint.exists() and not self.weights.exists():
+            for file in self._earlier_files:
+                file.unlink()
+            self._forget_earlier_files()
 
     @property
-    def holds_earlier(self) -> bool:
+    def has_earlier_files(self) -> bool:
         """Whether the files of an earlier training are still there."""
-        return bool(self._replaced)
+        return bool(self._earlier_files)
 
-    def remove_earlier(self) -> None:
-        """Remove the files that :meth:`start_anew` noted; files of others stay."""
-        for file in self._replaced:
-            file.unlink(missing_ok=True)
-        self._replaced = []
+    def save(self, path: Path, checkpoint: Checkpoint) -> None:
+        """Save a checkpoint; the first one replaces the earlier training.
+
+        Args:
+            path: :attr:`checkpoint` or :attr:`weights`.
+            checkpoint: what to save.
+
+        Raises:
+            WorkFailedError: the disk is full, or nobody may write there. All files stay
+                as they are.
+        """
+        replaced = [file for file in self._earlier_files if file != path]
+        save(path, checkpoint, replaced=replaced)
+        self._forget_earlier_files()
+
+    def remove_new_logs(self) -> None:
+        """Remove the logs of a training that has stored nothing."""
+        for file in self._list_logs():
+            if file not in self._earlier_files:
+                file.unlink()
+
+    def _list_logs(self) -> list[Path]:
+        """Return the files of TensorBoard."""
+        events = self.tensorboard.glob("events.out.tfevents.*")
+        parameters = self.tensorboard / "hparams.yaml"
+        logs = [*events]
+        if parameters.exists():
+            logs.append(parameters)
+        return logs
+
+    def _forget_earlier_files(self) -> None:
+        self._earlier_files = []
         with suppress(OSError):  # a folder that holds other files is not removed
             self.tensorboard.rmdir()
 

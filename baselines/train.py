@@ -33,7 +33,7 @@ from lagbench.work.progress import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters
 from .catalogue import check_data_set, find
-from .checkpoint import check_weights, load_weights, round_weights, save
+from .checkpoint import check_weights, load_weights, round_weights
 from .dataset_info import find_forcing, read_dataset_info
 from .job import TrainingJob
 from .machine import (
@@ -235,7 +235,7 @@ def train(
 def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
     """Fit a model or descend on its loss."""
     if job.earlier is None and not is_helper():
-        job.folder.start_anew()
+        job.folder.note_earlier_files()
     if model.closed_form:
         try:
             log, steps = fit(job, model)
@@ -342,6 +342,10 @@ def _result(
         first_step=first_step,
         **log_values,
     )
+
+
+NOTHING_STORED = "the earlier training in the folder is still there"
+"""What an interrupted training says that has stored nothing yet."""
 
 
 class StepBatches(Sampler[list[int]]):
@@ -460,6 +464,8 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
 
         loop.run(load_batches)
     if log.state == "interrupted":
+        if job.folder.has_earlier_files:
+            raise KeyboardInterrupt(NOTHING_STORED)
         raise KeyboardInterrupt
     return log, steps
 
@@ -529,9 +535,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
         exact_weights[name] = weight.detach()
     rounded = job.checkpoint(log, round_weights(model))
     exact = job.checkpoint(log, exact_weights)
-    job.folder.remove_earlier()
-    save(job.folder.weights, rounded)
-    save(job.folder.checkpoint, exact)
+    job.folder.save(job.folder.weights, rounded)
+    job.folder.save(job.folder.checkpoint, exact)
     job.folder.write_log(job.log_as_json(model, log, steps=FIT_STEPS))
     return log, FIT_STEPS
 

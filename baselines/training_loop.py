@@ -27,7 +27,7 @@ from torch.utils.tensorboard import SummaryWriter
 from lagbench.errors import WorkFailedError
 from lagbench.tensors import Batch, TensorWindow
 
-from .checkpoint import load, round_weights, save
+from .checkpoint import load, round_weights
 from .job import TrainingJob
 from .machine import multiplies_bfloat16, return_memory
 from .optimisation import TOTAL, Optimisation
@@ -151,12 +151,16 @@ class TrainingLoop:
                     self._train(loader)
             except Exception:
                 # The checkpoint stays as it is.
-                if self.fabric.is_global_zero and not self.job.folder.holds_earlier:
+                if self.fabric.is_global_zero:
                     self.log.state = "failed"
                     # A disk that takes no log does not hide the first error.
                     with suppress(WorkFailedError):
+                        self._read_clocks()
                         self._write_log()
                 raise
+            finally:
+                if self.job.folder.has_earlier_files:
+                    self.job.folder.remove_new_logs()
 
     def _train(self, loader: Loader) -> None:
         fabric = self.fabric
@@ -176,10 +180,15 @@ class TrainingLoop:
             if self.validation is not None and self._is_validation_due(self.validation):
                 self._validate(self.validation)
             self._check_end()
-            if self._is_over or self._is_checkpoint_due():
+            is_in_vain = self.log.state == "interrupted" and self._keeps_earlier_files()
+            if not is_in_vain and (self._is_over or self._is_checkpoint_due()):
                 self._store()
             if self._is_over:
                 return
+
+    def _keeps_earlier_files(self) -> bool:
+        """Return whether nothing is stored yet that replaces an earlier training."""
+        return self.job.folder.has_earlier_files
 
     def _starts_from_weights(self) -> bool:
         """Return whether the training is at its start, and starts from weights."""
@@ -289,8 +298,7 @@ class TrainingLoop:
         with self.optimisation.use_mean():
             weights = round_weights(self.optimisation.model)
             checkpoint = self.job.checkpoint(self.log, weights)
-            self.job.folder.remove_earlier()
-            save(self.job.folder.weights, checkpoint)
+            self.job.folder.save(self.job.folder.weights, checkpoint)
 
     def _store(self) -> None:
         """Write checkpoint and log.
@@ -308,11 +316,11 @@ class TrainingLoop:
             if not torch.isfinite(value).all():
                 raise self.optimisation.not_finite()
         folder = self.job.folder
-        folder.remove_earlier()
-        self._write_log()
+        self._read_clocks()
         optimizer_state = self.optimisation.optimizer.state_dict()
         checkpoint = self.job.checkpoint(self.log, weights, optimizer_state)
-        save(folder.checkpoint, checkpoint)
+        folder.save(folder.checkpoint, checkpoint)
+        self._write_log()
 
         if self.log.best_step is None or not folder.weights.exists():
             self._publish()
@@ -323,10 +331,14 @@ class TrainingLoop:
         training = dict(best.training)
         training["budget"] = budget.model_dump(mode="json")
         best = replace(best, training=training)
-        save(folder.weights, best)
+        folder.save(folder.weights, best)
+
+    def _read_clocks(self) -> None:
+        self.log.read_clocks(self.fabric.world_size, device=self.job.device)
 
     def _write_log(self) -> None:
-        self.log.read_clocks(self.fabric.world_size, device=self.job.device)
+        if self.job.folder.has_earlier_files:
+            return  # the log in the folder is that of the earlier training
         log = self.job.log_as_json(
             self.optimisation.model,
             self.log,

@@ -40,6 +40,7 @@ def serve(split: str, size: str, scenario: int | None) -> None:
     parameters = solver_constants(tier)
     if scenario is None:
         scenario = tier.subsets["test"][0]
+    tier.subset_of(scenario)  # raises if the size has no such scenario
     state = draw_initial_state(tier, scenario)
     solver = build(parameters)
     substeps = max(1, PARTICLE_SUBSTEPS // parameters.particles)
@@ -57,7 +58,7 @@ class Side:
     """The process of one commit."""
 
     def __init__(
-        self, tree: Path, split: str, size: str, scenario: int | None = None
+        self, tree: Path, split: str, size: str, *, scenario: int | None
     ) -> None:
         core = min(os.sched_getaffinity(0))
         command = [sys.executable, __file__, "--serve", split, "--size", size]
@@ -89,10 +90,10 @@ class Side:
 
 
 def compare(
-    other: Path, split: str, size: str, scenario: int | None, turns: int
+    other: Path, split: str, size: str, *, scenario: int | None, turns: int
 ) -> NDArray[np.float64]:
     """Return the rates of both trees, shape [turn, tree]."""
-    sides = [Side(tree, split, size, scenario) for tree in (other, HERE)]
+    sides = [Side(tree, split, size, scenario=scenario) for tree in (other, HERE)]
     rates = np.empty((turns, 2))
     for turn in range(turns):
         for index, side in enumerate(sides):
@@ -110,7 +111,12 @@ def main() -> int:
     parser.add_argument("--against", metavar="REV")
     parser.add_argument("--cases", nargs="+", default=CASES, metavar="SPLIT")
     parser.add_argument("--size", default="mini")
-    parser.add_argument("--scenario", type=int, metavar="ID")
+    parser.add_argument(
+        "--scenario",
+        type=int,
+        metavar="ID",
+        help="scenario of all cases; by default the first one of test",
+    )
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument("--serve", metavar="SPLIT", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -120,9 +126,12 @@ def main() -> int:
     if options.against is None:
         parser.error("--against is required")
 
+    scenario = "first scenario of test"
+    if options.scenario is not None:
+        scenario = f"scenario {options.scenario}"
     print(
-        f"{hardware()['processor']}, size {options.size}; M particle-substeps/s of "
-        f"processor time"
+        f"{hardware()['processor']}, size {options.size}, {scenario}; "
+        "M particle-substeps/s of processor time"
     )
     print(f"| case | {options.against} | this tree | ratio | quartiles |")
     print("|---|---:|---:|---:|---|")

@@ -213,8 +213,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     consequence = "On a CPU the difference is small, often smaller than the noise."
     if device == Device.CUDA:
         consequence = (
-            "On a GPU a copy takes long. So in the rows with 120 or more substeps "
-            "t/frame is only about half of this product."
+            "On a GPU a copy takes long. So where a frame has many substeps, t/frame "
+            "is much less than this product."
         )
     return [
         "## Table 3.1: time of the solver for more and more particles",

@@ -206,27 +206,27 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
 
 
 @ti.func
-def deformed(rows: Template, slopes: Template, dt: f32) -> Value:
-    """Return (I + dt C) F: how F of a solid follows the flow for a substep.
+def follow_flow(rows: Template, gradient: Template, dt: f32) -> Value:
+    """Return F of a solid after a substep, (I + dt C) F.
 
     Args:
         rows: F [1].
-        slopes: the velocity gradient C [1/s].
+        gradient: the velocity gradient C [1/s].
         dt: duration of the substep [s].
     """
     columns = transposed(rows)
-    x_rate = dot_with_each(slopes[0], columns)
-    y_rate = dot_with_each(slopes[1], columns)
-    z_rate = dot_with_each(slopes[2], columns)
-    x_row = advanced(rows[0], x_rate, dt)
-    y_row = advanced(rows[1], y_rate, dt)
-    z_row = advanced(rows[2], z_rate, dt)
+    x_rate = dot_with_each(gradient[0], columns)
+    y_rate = dot_with_each(gradient[1], columns)
+    z_rate = dot_with_each(gradient[2], columns)
+    x_row = add_rate(rows[0], x_rate, dt)
+    y_row = add_rate(rows[1], y_rate, dt)
+    z_row = add_rate(rows[2], z_rate, dt)
     return [x_row, y_row, z_row]
 
 
 @ti.func
-def advanced(row: Template, rate: Template, dt: f32) -> Value:
-    """Return a row after a substep in which it changes at this rate [1/s]."""
+def add_rate(row: Template, rate: Template, dt: f32) -> Value:
+    """Return row + dt rate; the rate is in [1/s]."""
     x = row[0] + dt * rate[0]
     y = row[1] + dt * rate[1]
     z = row[2] + dt * rate[2]

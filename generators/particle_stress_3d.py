@@ -23,8 +23,8 @@ from . import backend
 from .constitutive import hardening, larger, liquid_stress
 from .constitutive_3d import (
     corotated_stress,
-    deformed,
     determinant,
+    follow_flow,
     plastic_return,
     rows_of,
 )
@@ -47,10 +47,10 @@ _ENTRIES = 6  # of a symmetric matrix, in Voigt's order
 
 # The serial driver computes solids in blocks of this many particles, one in each lane
 # of a vector register. LLVM makes vector instructions only if a loop reads its lanes
-# from memory and writes them to memory. Therefore each number of the solids, such as an
-# entry of F, has a list with one place for each solid. One loop copies to a list what
-# other phases computed, a second one computes block by block, and a third one copies
-# the results back. F stays in its lists during an advance.
+# from memory and writes them to memory. Therefore each quantity of the solids, such as
+# an entry of F, has a list with one place for each solid. One loop copies to a list
+# what other phases computed, a second one computes block by block, and a third one
+# copies the results back. F stays in its lists during an advance.
 _LANES = 8
 
 
@@ -568,7 +568,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.extremes[s, p] = extremes
         kept_jacobian = j
         if ti.static(solid):
-            # det F of a solid is not known yet. The old extreme changes nothing.
+            # det F of a solid is computed later. Until then the old minimum stands for
+            # it, which changes neither extreme.
             kept_jacobian = ti.select(is_liquid, j, extremes[1])
         self.keep_jacobian(s, p, kept_jacobian)
 
@@ -614,8 +615,8 @@ class ParticleStress3D(FreeSurfaceKernels):
             f = self.deformation(s, p)
             c = self.velocity_gradient(s, p)
             old_rows = rows_of(f)
-            slopes = rows_of(c)
-            rows = deformed(old_rows, slopes, self.dt)
+            gradient = rows_of(c)
+            rows = follow_flow(old_rows, gradient, self.dt)
             self.store_deformation(s, p, rows)
             if kind == SNOW:
                 low = self.yield_low
@@ -639,8 +640,8 @@ class ParticleStress3D(FreeSurfaceKernels):
     def compute_listed_deformation(self, block: i32) -> None:
         """Update F of a block of solids with the velocity gradient."""
         old_rows = load_rows(self.listed_gradient, block)
-        slopes = load_rows(self.listed_slopes, block)
-        rows = deformed(old_rows, slopes, self.dt)
+        gradient = load_rows(self.listed_slopes, block)
+        rows = follow_flow(old_rows, gradient, self.dt)
         store_rows(self.listed_gradient, block, rows)
 
     @ti.func
@@ -696,8 +697,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that
         particles touch.
+
+        The lists have F of the solids during the substeps, and the particles have it
+        before and after.
         """
-        self._fill_lists(self.solid_count)
         self._serial_substeps(
             substeps,
             self.particles,
@@ -705,24 +708,10 @@ class ParticleStress3D(FreeSurfaceKernels):
             self.snow_count,
             self.solid,
         )
-        self._empty_lists(self.solid_count)
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
         self._parallel_substep(self.particles, self.width, self.solid)
-
-    @ti.kernel
-    def _fill_lists(self, solid_count: i32) -> Nothing:
-        ti.loop_config(serialize=True)
-        for number in range(solid_count):
-            self.copy_gradient_to_list(number)
-            self.copy_moduli_to_list(number)
-
-    @ti.kernel
-    def _empty_lists(self, solid_count: i32) -> Nothing:
-        ti.loop_config(serialize=True)
-        for number in range(solid_count):
-            self.copy_gradient_from_list(number)
 
     @ti.kernel
     def _serial_substeps(
@@ -733,10 +722,15 @@ class ParticleStress3D(FreeSurfaceKernels):
         snow_count: i32,
         solid: Template,
     ) -> Nothing:
-        solid_blocks = block_count(solid_count)
-        snow_blocks = block_count(snow_count)
+        if ti.static(solid):
+            ti.loop_config(serialize=True)
+            for number in range(solid_count):
+                self.copy_gradient_to_list(number)
+                self.copy_moduli_to_list(number)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
+            solid_blocks = block_count(solid_count)
+            snow_blocks = block_count(snow_count)
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
             first, end = self.touched_nodes(particles)
@@ -785,6 +779,10 @@ class ParticleStress3D(FreeSurfaceKernels):
                     self.compute_listed_jacobian(block)
                 for number in range(solid_count):
                     self.copy_jacobian_from_list(number)
+        if ti.static(solid):
+            ti.loop_config(serialize=True)
+            for number in range(solid_count):
+                self.copy_gradient_from_list(number)
 
     @ti.kernel
     def _parallel_substep(self, particles: i32, width: i32, solid: Template) -> Nothing:

@@ -36,12 +36,20 @@ ROOT_OPTION = "--root or LAGBENCH_ROOT"
 
 
 @contextmanager
-def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
+def atomic_path(
+    target: Path, *, option: str = ROOT_OPTION, replaced: Iterable[Path] = ()
+) -> Iterator[Path]:
     """Yield a temporary name beside the target; rename it there on a clean exit.
 
     The parent folder is created. Before the rename the file is flushed to disk, after
     it the folder is, so that a crash at any time leaves the old file or the new one.
     When the body raises, the temporary file is removed and the target stays as it was.
+
+    Args:
+        target: the file.
+        option: the option that names another folder, for messages.
+        replaced: other files that the target replaces; they are removed between the
+            flush and the rename.
 
     Raises:
         WorkFailedError: the operating system refused, or a device, socket or pipe has
@@ -53,6 +61,8 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         _flush(temporary)
+        for file in replaced:
+            file.unlink(missing_ok=True)
         temporary.replace(target)
         _flush_folder(target.parent)
     except LagbenchError:

@@ -37,13 +37,14 @@ from lagbench.arguments import check_arguments
 from lagbench.data.registry import Registry
 from lagbench.store.windows import CACHE_BYTES, WindowReader
 from lagbench.store.windows import Window as ArrayWindow
-from lagbench.tensors import Batch, TensorWindow, collate
+from lagbench.tensors import Batch, TensorBox, TensorWindow, collate
 
 __all__ = [
     "POOL_BYTES",
     "RUN",
     "Batch",
     "Step",
+    "TensorBox",
     "Window",
     "WindowDataset",
     "WindowSampler",

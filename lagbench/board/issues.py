@@ -167,7 +167,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     ),
     "verified": BoardCheck(
         "a line of verified.yaml that does not fit its entry, its records, the data "
-        "set or the leaderboard",
+        "set or the leaderboard, or with a date in the future",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",

@@ -376,15 +376,59 @@ def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) 
     assert read_training_log(tmp_path / "run")["state"] == "failed"
 
 
+def read_folder(folder: Path) -> dict[str, bytes]:
+    """Return the content of all files below a folder."""
+    contents = {}
+    for path in folder.rglob("*"):
+        if path.is_file():
+            contents[str(path.relative_to(folder))] = path.read_bytes()
+    return contents
+
+
 def test_a_fresh_training_that_fails_at_once_leaves_the_earlier_one(run: Run) -> None:
-    """No file of it changes, and it goes on as if nothing had happened."""
+    """No file of it changes, and none is added."""
     earlier = run("drift", "steps=2")
-    files = (earlier.checkpoint, earlier.weights, earlier.folder / "training.json")
-    before = [file.read_bytes() for file in files]
+    before = read_folder(earlier.folder)
     with pytest.raises(WorkFailedError):
         run("drift", "model.fail_at=1", "steps=2", fresh=True)
-    assert [file.read_bytes() for file in files] == before
-    assert run("drift", "steps=2").first_step == 2
+    assert read_folder(earlier.folder) == before
+
+
+def test_a_fresh_training_that_is_interrupted_at_once_leaves_the_earlier_one(
+    run: Run,
+) -> None:
+    """The message says so, and the earlier training goes on."""
+    with pytest.raises(KeyboardInterrupt):
+        run("drift", "steps=4", progress=interrupt_at(2))
+    folder = Path("run")
+    before = read_folder(folder)
+    with pytest.raises(KeyboardInterrupt, match="still there"):
+        run("drift", "steps=90", fresh=True, progress=interrupt_at(1))
+    assert read_folder(folder) == before
+    assert run("drift", "steps=4").first_step == 2
+
+
+@pytest.mark.parametrize("baseline", ["drift", "var"])
+def test_a_fresh_training_on_a_full_disk_leaves_the_earlier_one(
+    run: Run, baseline: str
+) -> None:
+    earlier = run(baseline)
+    before = read_folder(earlier.folder)
+    with largest_file(1000), pytest.raises(WorkFailedError):
+        run(baseline, fresh=True)
+    after = read_folder(earlier.folder)
+    for name in ("checkpoint.pt", "weights.pt", "training.json"):
+        assert after[name] == before[name]
+
+
+def test_the_log_of_a_failed_training_is_replaced_by_that_of_the_next(
+    run: Run, tmp_path: Path
+) -> None:
+    """A log without a model is nothing to keep."""
+    for steps in (2, 7):
+        with pytest.raises(WorkFailedError):
+            run("drift", "model.fail_at=1", f"steps={steps}")
+        assert read_training_log(tmp_path / "run")["steps"] == steps
 
 
 def test_a_training_that_stopped_early_is_over(run: Run) -> None:
@@ -834,9 +878,7 @@ def write_tensorboard_logs(folder: Path) -> Path:
 
 def test_logs_of_a_run_are_cleared(tmp_path: Path) -> None:
     write_tensorboard_logs(tmp_path)
-    folder = RunFolder(tmp_path)
-    folder.start_anew()
-    folder.remove_earlier()
+    RunFolder(tmp_path).note_earlier_files()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -845,9 +887,7 @@ def test_other_files_among_the_logs_are_not_cleared(tmp_path: Path) -> None:
     notes = logs / "my-runs" / "notes.txt"
     notes.parent.mkdir()
     notes.write_text("precious")
-    folder = RunFolder(tmp_path)
-    folder.start_anew()
-    folder.remove_earlier()
+    RunFolder(tmp_path).note_earlier_files()
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert files == [notes]
 
