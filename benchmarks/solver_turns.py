@@ -137,7 +137,13 @@ def main() -> int:
     print("|---|---:|---:|---:|---|")
     with checked_out(options.against) as other:
         for case in options.cases:
-            rates = compare(other, case, options.size, options.scenario, options.turns)
+            rates = compare(
+                other,
+                case,
+                options.size,
+                scenario=options.scenario,
+                turns=options.turns,
+            )
             theirs, ours = np.median(rates, axis=0) / 1e6
             their_rates, our_rates = rates.T
             ratios = our_rates / their_rates
