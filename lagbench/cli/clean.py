@@ -30,14 +30,22 @@ def clean_command(
         bool,
         option("--leftovers", "Remove only temporary files of interrupted commands."),
     ] = False,
+    force: Annotated[
+        bool,
+        option(
+            "--force", "Also remove a local split, which lagbench cannot make again."
+        ),
+    ] = False,
     dry_run: Annotated[
         bool, option("--dry-run", "Print the files without removing them.")
     ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Remove a generated data set, or only its temporary files."""
-    result = clean(split, size, root=root, leftovers=leftovers, dry_run=dry_run)
+    """Remove a data set, or only its temporary files."""
+    result = clean(
+        split, size, root=root, leftovers=leftovers, force=force, dry_run=dry_run
+    )
     action = "removed"
     if dry_run:
         action = "would be removed"

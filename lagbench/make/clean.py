@@ -1,4 +1,4 @@
-"""Remove what killed writers left, or a generated data set."""
+"""Remove what killed writers left, or a data set."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from lagbench.data.layout import (
     MANIFEST_NAME,
     NOTES_NAME,
     PICTURES,
+    quote_root,
 )
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import WorkFailedError
+from lagbench.errors import UsageError, WorkFailedError
 
 # what lagbench writes beside the subsets
 CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
@@ -39,23 +40,26 @@ def clean(
     *,
     root: str | Path | None = None,
     leftovers: bool = False,
+    force: bool = False,
     dry_run: bool = False,
     registry: Registry | None = None,
 ) -> CleanResult:
-    """Remove a generated data set; files that lagbench did not write stay.
+    """Remove a data set; files that lagbench did not write stay.
 
     Args:
-        split: name of the split.
+        split: name of the split, or path of a local split's folder.
         size: name of the size; the only one that is there when None. Where several are
             there it must be named.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         leftovers: remove only temporary files of killed writers.
+        force: also remove a local split, whose data lagbench cannot make again.
         dry_run: only say what would go; writes nothing, a lock neither.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split or size, or no size is named and several are there.
+        UsageError: unknown split or size, no size is named and several are there, or
+            the split is a local one, without ``force`` or ``leftovers``.
         WorkFailedError: another process writes the data set, or a file cannot be
             removed.
     """
@@ -65,6 +69,8 @@ def clean(
     folder = tier.folder(home)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
+    if not (tier.simulated or leftovers or force):
+        raise _local_split_error(tier, home)
 
     lock: AbstractContextManager[object]
     if dry_run:
@@ -85,6 +91,17 @@ def clean(
     if not dry_run and not leftovers:
         _remove_empty_folders(folder, home)
     return CleanResult(removed=tuple(sorted(paths)), bytes=length, dry_run=dry_run)
+
+
+def _local_split_error(size: Size, home: Path) -> UsageError:
+    names = f"--split {size.split} --size {size.name} --root {quote_root(home)}"
+    return UsageError(
+        "lagbench cannot make these data again",
+        where=str(size.folder(home)),
+        expected="a data set that lagbench generates, or --force",
+        got="a local split, made by adopt or import",
+        fix=f"lagbench clean {names} --force",
+    )
 
 
 def _data_set_files(size: Size, folder: Path) -> set[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import tomllib
@@ -581,6 +582,32 @@ def test_clean_leaves_links(run: Run, copied: Copied, tmp_path: Path) -> None:
     assert list(elsewhere.iterdir()) == []
     names = [path.name for path in folder.iterdir()]
     assert names == ["train"]
+
+
+def test_clean_removes_a_local_split_only_by_force(
+    run: Run, original: LocalSplit, tmp_path: Path
+) -> None:
+    """lagbench cannot make its data again; its temporary files are nobody's data."""
+    own = tmp_path / "own data" / "own"
+    shutil.copytree(original.folder, own)
+    leftover = own / "full" / "v1" / ".0000.nc.1.partial"
+    leftover.write_text("")
+    words = ["clean", f"{own}/"]
+    assert run(*words, "--leftovers").exit_code == 0
+    assert not leftover.exists()
+
+    names = files_below(own)
+    for flags in ([], ["--dry-run"]):
+        refused = run(*words, *flags)
+        assert refused.exit_code == 2
+        assert files_below(own) == names
+    assert run(*words, "--force", "--dry-run").exit_code == 0
+    assert files_below(own) == names
+
+    fix = run(*words).stderr.partition("fix: lagbench ")[2].partition("\n")[0]
+    assert run(*shlex.split(fix)).exit_code == 0
+    assert not own.exists()
+    assert run("clean", SPLIT, "--size", SIZE, "--root", tmp_path).exit_code == 0
 
 
 def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:
