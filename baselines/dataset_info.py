@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lagbench.data.box import parse_obstacle
-from lagbench.data.layout import dataset_folder
+from lagbench.data.layout import dataset_folder, has_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
@@ -105,7 +105,7 @@ def find_forcing(size: Size, root: Path) -> frozenset[str]:
     """
     for scenario in size.scenarios:
         path = size.path(root, scenario)
-        if path.is_file():
+        if has_file(path):
             break
     else:
         return frozenset()

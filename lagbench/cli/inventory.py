@@ -10,7 +10,13 @@ from typing import Annotated, Any
 import typer
 
 from lagbench.data.box import describe_bounds
-from lagbench.data.layout import format_ids, url_of
+from lagbench.data.layout import (
+    STORE_FILE,
+    ClosedFolderError,
+    format_ids,
+    refuse_closed_folder,
+    url_of,
+)
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError, escape_line, hide_user
@@ -92,7 +98,7 @@ def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
     name, folder, registry = locate_split(split, root=root)
     entry = registry.split(name)
     sizes = [registry.size(name, size) for size in entry.sizes]
-    overviews = [overview(size, folder) for size in sizes]
+    overviews = _overviews_of_split(registry, name, folder)
     references = {size.name: measured_references(size) for size in sizes}
     if as_json:
         print_json({"root": folder, "sizes": overviews, "references": references})
@@ -120,7 +126,11 @@ def _list_overviews(folder: Path) -> list[Overview]:
     """Return the overview of every size, those of local splits last.
 
     A local split whose description cannot be read is left out with a warning.
+
+    Raises:
+        ClosedFolderError: the root folder may not be read.
     """
+    refuse_closed_folder(folder / STORE_FILE)
     registry = load_rooted_registry(folder, load())
     overviews: list[Overview] = []
     for name in registry.splits:
@@ -134,8 +144,14 @@ def _list_overviews(folder: Path) -> list[Overview]:
 
 
 def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Overview]:
-    sizes = registry.split(split).sizes
-    return [overview(registry.size(split, size), folder) for size in sizes]
+    """Return the overviews of a split; a size that may not be read gives a warning."""
+    overviews = []
+    for size_name in registry.split(split).sizes:
+        try:
+            overviews.append(overview(registry.size(split, size_name), folder))
+        except ClosedFolderError as error:
+            print_warning(f"{split} {size_name} is left out: {error}")
+    return overviews
 
 
 def _describe_times(overviews: Sequence[Overview]) -> list[str]:

@@ -19,12 +19,13 @@ import os
 import re
 import shlex
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import platformdirs
 
-from lagbench.errors import UsageError, hide_user
+from lagbench.errors import DataError, UsageError, hide_user
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable for the folder of working copies and of measured speeds."""
@@ -309,6 +310,53 @@ def scenario_path(root: Path, key: ScenarioKey) -> Path:
     """Return the path of a scenario file."""
     folder = dataset_folder(root, key.split, key.size, key.major)
     return folder / key.subset / f"{key.scenario:04d}.nc"
+
+
+class ClosedFolderError(DataError):
+    """A folder of a data set may not be read."""
+
+
+def has_file(path: Path) -> bool:
+    """Return whether a file of a data set is there.
+
+    Raises:
+        ClosedFolderError: a folder above it may not be read.
+    """
+    refuse_closed_folder(path)
+    return path.is_file()
+
+
+def refuse_closed_folder(path: Path) -> None:
+    """Refuse a path below a folder that may not be read.
+
+    Raises:
+        ClosedFolderError: nobody can tell whether the path exists.
+    """
+    folder = find_closed_folder(path)
+    if folder is not None:
+        name = shlex.quote(str(folder))
+        raise ClosedFolderError(
+            "a folder of data may not be read",
+            where=str(folder),
+            expected="permission to read it",
+            got="permission denied",
+            fix=f"see who owns it: ls -ld {name}; chmod +rx {name} lets others read it",
+        )
+
+
+def find_closed_folder(path: Path) -> Path | None:
+    """Return the folder that hides whether a path exists; None where none does."""
+    try:
+        path.stat()
+    except PermissionError:
+        for folder in path.parents:
+            # Folders below the closed one are hidden as the path is.
+            with suppress(PermissionError):
+                folder.stat()
+                return folder
+    except (OSError, ValueError):
+        return None
+    return None
 
 
 def generation_command(path: Path) -> str | None:

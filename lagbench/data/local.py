@@ -34,10 +34,13 @@ from lagbench.errors import (
 
 from .layout import (
     CACHE_VARIABLE,
+    MANIFEST_NAME,
     STORE_FILE,
     as_url,
     dataset_folder,
     expand_path,
+    find_closed_folder,
+    has_file,
     no_home_error,
     quote_root,
     url_of,
@@ -315,7 +318,7 @@ def locate_split(
     text = os.fspath(split)
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
-    if path.name == DESCRIPTION and path.is_file():
+    if path.name == DESCRIPTION and has_file(path):
         return _locate_folder(path.parent, root, registry)
     if has_separator or not isinstance(split, str):
         return _locate_folder(path, root, registry)
@@ -324,7 +327,7 @@ def locate_split(
     try:
         rooted_registry.split(text)
     except UsageError:
-        if root is None and (path / DESCRIPTION).is_file():
+        if root is None and has_file(path / DESCRIPTION):
             return _locate_folder(path, root, registry)
         raise
     return SplitLocation(text, folder, rooted_registry)
@@ -344,7 +347,7 @@ def _locate_folder(
             got=root,
             fix="give the path alone, or the root and the split's name",
         )
-    if not (folder / DESCRIPTION).is_file() or not is_split_name(name):
+    if not has_file(folder / DESCRIPTION) or not is_split_name(name):
         raise UsageError(
             "no local split there",
             where=SPLIT_NAMED,
@@ -435,7 +438,9 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
     sizes_with_data = []
     for size in sizes:
         folder = dataset_folder(root, split, size.name, size.major)
-        if any(folder.glob("*/*.nc")):
+        # A folder that may not be read is there too: whoever reads it will say so.
+        is_closed = find_closed_folder(folder / MANIFEST_NAME) is not None
+        if is_closed or any(folder.glob("*/*.nc")):
             sizes_with_data.append(size)
     if len(sizes_with_data) == 1:
         return sizes_with_data[0].name

@@ -34,7 +34,7 @@ from .hdf5 import (
     read_attribute,
     read_attributes,
 )
-from .layout import ScenarioKey, generation_command
+from .layout import ScenarioKey, generation_command, has_file
 from .variables import (
     ATTRIBUTES,
     MAX_VALUES_PER_FRAME,
@@ -326,9 +326,9 @@ def read_scenario(path: Path) -> ScenarioFile:
     """Open a scenario file.
 
     Raises:
-        DataError: the file is missing, damaged, or no scenario.
+        DataError: the file is missing, damaged, or no scenario, or it may not be read.
     """
-    if not path.is_file():
+    if not has_file(path):
         raise _missing_error(path, _repair_hint(path))
     with _damage_errors(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)

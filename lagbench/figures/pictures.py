@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import check_output_file
-from lagbench.data.layout import expand_home
+from lagbench.data.layout import expand_home, has_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.store.copy import update_working_copy
@@ -201,7 +201,7 @@ def find_scenario(
     tier.subset_of(scenario_id)  # refuses an id that the size does not have
     update_working_copy(tier, folder, [scenario_id])
     path = tier.path(folder, scenario_id)
-    if not path.is_file():
+    if not has_file(path):
         raise DataError(
             f"scenario {scenario_id} is not there",
             where=str(path),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import WALL_NAMES
+from lagbench.data.layout import has_file
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, suggest_name
@@ -361,7 +362,7 @@ def _list_existing_files(size: Size, root: Path) -> list[Path]:
     for ids in size.subsets.values():
         for scenario in sorted(ids):
             path = size.path(root, scenario)
-            if path.is_file():
+            if has_file(path):
                 files.append(path)
     return files
 

@@ -19,7 +19,9 @@ from lagbench.data.checksums import file_sha256, load_recorded_hashes
 from lagbench.data.layout import (
     PICTURES,
     format_ids,
+    has_file,
     quote_root,
+    refuse_closed_folder,
     scenario_path,
     url_of,
 )
@@ -98,6 +100,9 @@ class Overview:
 def overview(size: Size, root: Path) -> Overview:
     """Return what a size is, costs, and has below a root folder or in its store, read
     from names alone.
+
+    Raises:
+        ClosedFolderError: the folder of the data set may not be read.
     """
     folder = size.folder(root)
     ids = size.scenarios
@@ -118,7 +123,7 @@ def overview(size: Size, root: Path) -> Overview:
 
     picture = None
     for name in PICTURES:
-        if picture is None and (folder / name).is_file():
+        if picture is None and has_file(folder / name):
             picture = folder / name
     dataset_sha256 = None
     if size.measured:
@@ -144,7 +149,7 @@ def _present_scenarios(size: Size, root: Path) -> set[int]:
     """Return the ids whose files a folder has, or that its store's manifest names."""
     url = url_of(root)
     if url is None:
-        return {i for i in size.scenarios if size.path(root, i).is_file()}
+        return {i for i in size.scenarios if has_file(size.path(root, i))}
 
     # what a store takes is not loaded for a folder
     from lagbench.store.copy import remote_manifest
@@ -196,8 +201,12 @@ def inspect_scenario(
             noted before instead of hashing the values again.
         trusting: take the manifest's content hash too, where the bytes are those of
             the manifest.
+
+    Raises:
+        ClosedFolderError: the folder of the file may not be read.
     """
     path = scenario_path(root, size.key(scenario))
+    refuse_closed_folder(path)
     if not path.exists():
         return ScenarioInspection(scenario=scenario, state=DataSetState.MISSING)
     try:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.contents import check_contents
+from lagbench.data.layout import has_file
 from lagbench.data.registry import Registry, Size, load
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
@@ -76,7 +77,7 @@ def _with_data(size: Size, root: Path) -> list[ReferencePredictor]:
 def _has_files(size: Size, root: Path, subset: str) -> bool:
     """Return whether all files of a subset, which is not empty, are there."""
     ids = size.subsets.get(subset, ())
-    return bool(ids) and all(size.path(root, i).is_file() for i in ids)
+    return bool(ids) and all(has_file(size.path(root, i)) for i in ids)
 
 
 def sizes_with_test_files(

@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
 from lagbench.data.field_errors import describe_expectation, describe_input
-from lagbench.data.layout import MANIFEST_NAME, format_ids, url_of
+from lagbench.data.layout import MANIFEST_NAME, format_ids, has_file, url_of
 from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
@@ -147,7 +147,7 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
 
     Raises:
         UsageError: unknown subset.
-        DataError: scenarios are missing.
+        DataError: scenarios are missing, or a folder may not be read.
     """
     paths = {}
     for subset in subsets:
@@ -165,7 +165,7 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
 
     missing = []
     for scenario, path in paths.items():
-        if not path.is_file():
+        if not has_file(path):
             missing.append(scenario)
     if missing:
         incomplete_subsets = []
@@ -401,7 +401,7 @@ def is_in_copy(
     The bytes are hashed, unless the trusted manifest has the same entry.
     """
     path = size.folder(root) / entry.path
-    if not path.is_file() or path.stat().st_size != entry.bytes:
+    if not has_file(path) or path.stat().st_size != entry.bytes:
         return False
     if trusted is not None:
         trusted_entry = trusted.entry(entry.scenario)
@@ -558,7 +558,7 @@ def list_scenarios_to_gather(size: Size, root: Path, source: Path) -> tuple[int,
     scenarios = []
     for entry in _list_known_entries(size, source_manifest):
         is_new = target_manifest.entry(entry.scenario) is None
-        has_source_file = (source_folder / entry.path).is_file()
+        has_source_file = has_file(source_folder / entry.path)
         has_target_file = (target_folder / entry.path).exists()
         if is_new and has_source_file and not has_target_file:
             scenarios.append(entry.scenario)

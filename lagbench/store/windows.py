@@ -21,7 +21,7 @@ from lagbench.arguments import check_arguments
 from lagbench.data.box import parse_obstacle
 from lagbench.data.contents import check_contents
 from lagbench.data.hdf5 import list_variables
-from lagbench.data.layout import major_of
+from lagbench.data.layout import has_file, major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import (
@@ -205,7 +205,7 @@ class FrameStore:
     def _open_checked(self, scenario: int) -> _OpenScenario:
         """Open a file; refuse one of another scenario, version or content."""
         path = self._paths[scenario]
-        if not path.is_file():
+        if not has_file(path):
             raise DataError(
                 "a scenario file is missing",
                 where=str(path),

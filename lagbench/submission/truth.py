@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.contents import check_contents
-from lagbench.data.layout import format_ids
+from lagbench.data.layout import format_ids, has_file
 from lagbench.data.local import suggest_repair
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
@@ -47,11 +47,12 @@ class Truth:
 
         Raises:
             DataError: scenarios are missing.
+            ClosedFolderError: their folder may not be read.
         """
         scenarios = self.size.subsets[self.subset]
         missing = []
         for scenario in scenarios:
-            if not self.path(scenario).is_file():
+            if not has_file(self.path(scenario)):
                 missing.append(scenario)
         if missing:
             raise DataError(

@@ -22,6 +22,7 @@ import h5py
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
+from lagbench.data.layout import ClosedFolderError
 from lagbench.data.local import (
     load_rooted_registry,
     locate_split,
@@ -413,6 +414,10 @@ def _check_values(
             return content_hash
         try:
             truth.require()
+        except ClosedFolderError as error:
+            issues.add_exception("dataset", error)
+            issues.skip(f"{error.what}: {error.where}", *TRUTH_CHECKS)
+            return content_hash
         except DataError as error:
             if require_truth:
                 issues.add_exception("dataset", error)

@@ -587,7 +587,7 @@ def test_clean_leaves_links(run: Run, copied: Copied, tmp_path: Path) -> None:
 def test_clean_removes_a_local_split_only_by_force(
     run: Run, original: LocalSplit, tmp_path: Path
 ) -> None:
-    """lagbench cannot make its data again; its temporary files are nobody's data."""
+    """Nothing makes its data again; its temporary files are nobody's data."""
     own = tmp_path / "own data" / "own"
     shutil.copytree(original.folder, own)
     leftover = own / "full" / "v1" / ".0000.nc.1.partial"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shlex
 import shutil
@@ -15,6 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
+from permissions import run_without_permissions
 from score_bench import ScoreBench, still
 from typer.testing import Result
 
@@ -483,17 +483,6 @@ def test_a_file_without_permission_is_unreadable(
     assert has_all_parts(result.output), result.output
 
 
-def lose_permissions() -> None:
-    """Let the program that this process becomes open no file that its mode forbids.
-
-    The superuser may open all files by two capabilities; others do not have them.
-    """
-    drop_capability = 24  # PR_CAPBSET_DROP of <linux/prctl.h>
-    libc = ctypes.CDLL(None)
-    for capability in (1, 2):  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
-        libc.prctl(drop_capability, capability, 0, 0, 0)
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
 def test_a_scenario_without_permission_is_named_in_the_message(
@@ -503,14 +492,9 @@ def test_a_scenario_without_permission_is_named_in_the_message(
     root = shutil.copytree(bench.root, tmp_path / "root")
     truth = bench.size.path(root, 3)
     truth.chmod(0)
-    words = ["score", str(files / "good.nc"), "--root", str(root), "--workers", "1"]
-    done = subprocess.run(
-        [sys.executable, "-m", "lagbench", *words, "-o", str(tmp_path / "scores")],
-        preexec_fn=lose_permissions,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ["score", files / "good.nc", "--root", root, "--workers", 1]
+    output = tmp_path / "scores"
+    done = run_without_permissions("-m", "lagbench", *words, "-o", output)
     assert done.returncode == 4, done.stderr
     assert has_all_parts(done.stderr), done.stderr
     assert truth.name in done.stderr
