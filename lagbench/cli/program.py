@@ -84,7 +84,7 @@ MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
 PROCESSOR_WORDS = "NumPy was built with baseline optimizations"
 """What NumPy says, as it is imported, on a processor that lacks instructions."""
 
-_UNREADABLE_PATH = re.compile(r"'(.+)' is not readable")
+_UNREADABLE_PATH = re.compile(r"""(['"])(.+)\1 is not readable""")
 """What click says of a file without permission."""
 
 _EXTRA_WORDS = re.compile(r"unexpected extra arguments?(?:\(s\))? \((.*)\)$")
@@ -433,11 +433,11 @@ def _bad_parameter_error(error: Any, command: str) -> LagbenchError:  # noqa: AN
     # The help of a group shall load no other module.
     from lagbench.data.field_errors import describe_expectation
 
-    unreadable_path = _UNREADABLE_PATH.search(str(error.format_message()))
+    unreadable_path = _UNREADABLE_PATH.search(str(error.message))
     if unreadable_path is not None:
         return UnreadableFileError(
             "cannot open the file",
-            where=unreadable_path[1],
+            where=unreadable_path[2],
             expected="a file that you may read",
             got="no permission to read it",
             fix="see who owns it, or name another",

@@ -871,8 +871,7 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
             examined=examine,
         )
     except (UnreadableFileError, ChecksFailedError) as error:
-        with real.open("rb") as stream:
-            head = stream.read(MAX_SCORE_BYTES)
+        head = _read_head(path)
         if isinstance(error, ChecksFailedError) and b"lagbench_scores" not in head:
             raise  # predictions that are not valid
         raise UnreadableFileError(
@@ -885,6 +884,25 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
         ) from error
     # through JSON, so that its digits are those of a scores.json
     return parse_scores(card.as_json())
+
+
+def _read_head(path: Path) -> bytes:
+    """Return as many first bytes of a file as scores take.
+
+    Raises:
+        UnreadableFileError: the file may not be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return stream.read(MAX_SCORE_BYTES)
+    except OSError as error:
+        raise UnreadableFileError(
+            "cannot open the file",
+            where=str(path),
+            expected="a file that you may read",
+            got=error.strerror,
+            fix="see who owns it, or name another",
+        ) from error
 
 
 def _load_entry(

@@ -485,6 +485,36 @@ def test_a_file_without_permission_is_unreadable(
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "validate {}.nc",
+        "score {}.nc",
+        "compare {}.nc constant-velocity",
+        "compare {}.json constant-velocity",
+        "compare good.nc {}.nc",
+    ],
+)
+@pytest.mark.parametrize("name", ["closed", "it's closed"])
+def test_the_message_names_a_file_without_permission(
+    name: str, words: str, files: Path, bench: ScoreBench, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(files, tmp_path / "files")
+    for ending in (".nc", ".json"):
+        path = Path(shutil.copy(folder / "good.nc", folder / f"{name}{ending}"))
+        path.chmod(0)
+    command = [word.format(name) for word in words.split(" ")]
+    closed_file = next(word for word in command if word.startswith(name))
+    done = run_without_permissions(
+        "-m", "lagbench", *command, "--root", bench.root, folder=folder
+    )
+    assert done.returncode == 3, done.stderr
+    assert has_all_parts(done.stderr), done.stderr
+    assert f"where: {closed_file}\n" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="capabilities are those of Linux")
 def test_a_scenario_without_permission_is_named_in_the_message(
     files: Path, bench: ScoreBench, tmp_path: Path
 ) -> None:
