@@ -146,7 +146,6 @@ def diagnose(root: str | Path | None = None) -> Diagnosis:
     Nothing is changed, but for the working copy of a root in a store: it is made where
     it is missing.
     """
-    folder = resolve_root(root)
     checks = [
         InstallationCheck(name="lagbench", state="ok", detail=version("lagbench")),
         InstallationCheck(
@@ -164,7 +163,7 @@ def diagnose(root: str | Path | None = None) -> Diagnosis:
         InstallationCheck(name=REPOSITORY_NAME, state="ok", detail=describe(REPOSITORY))
     )
     checks.append(_check_part("registry", _describe_registry))
-    checks.append(_check_part("data folder", lambda: _describe_folder(folder)))
+    checks.append(_check_part("data folder", lambda: _describe_folder(root)))
     return Diagnosis(checks=tuple(checks))
 
 
@@ -205,11 +204,13 @@ def _describe_registry() -> str:
     return f"{len(registry.splits)} splits, hashes of {hash_count} sizes"
 
 
-def _describe_folder(folder: Path) -> str:
+def _describe_folder(root: str | Path | None) -> str:
     """Return the folder of all data sets and its free space, if it can be written.
 
     Raises:
+        UsageError: the root cannot be a folder.
         WorkFailedError: nothing can be written there.
     """
+    folder = resolve_root(root)
     check_writable(folder)
     return f"{folder}, {free_bytes(folder)} bytes free"

@@ -84,8 +84,8 @@ def resolve_root(root: str | Path | None = None) -> Path:
             :mod:`.layout`.
 
     Raises:
-        UsageError: no file system can have a folder of that name, or none is named and
-            the user has no home folder.
+        UsageError: no file system can have a folder of that name, a file is in its
+            place, or none is named and the user has no home folder.
         WorkFailedError: the working copy of a URL cannot be made.
     """
     named_root = _named_root(root)
@@ -102,6 +102,7 @@ def resolve_root(root: str | Path | None = None) -> Path:
         return _make_working_copy(url)
     folder = expand_path(named_root, _ROOT_OPTION)
     _check_folder_name(folder)
+    _refuse_file(folder)
     return folder
 
 
@@ -128,6 +129,21 @@ def _check_folder_name(folder: Path) -> None:
             got=f"{name[:60]!a}..., {len(name)} characters",
             fix="name another folder",
         ) from error
+
+
+def _refuse_file(folder: Path) -> None:
+    """Refuse a root folder that is a file, or lies below one; it may be missing."""
+    for place in (folder, *folder.parents):
+        if os.path.isdir(place):
+            return
+        if os.path.exists(place):
+            raise UsageError(
+                "the root is no folder",
+                where=_ROOT_OPTION,
+                expected="a folder, or a place where one can be made",
+                got=f"{place}, which is a file",
+                fix="name a folder; without a root the folder for user data is taken",
+            )
 
 
 def root_url(root: str | Path | None) -> str | None:

@@ -76,6 +76,29 @@ def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None
     assert "--root" in str(caught.value.where)
 
 
+@pytest.mark.parametrize("inner", ["", "deeper"])
+@pytest.mark.parametrize("words", ["verify cavity --size tiny", "list", "clean cavity"])
+def test_a_file_is_no_root(
+    words: str, inner: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No data set can be there, and none can be made there."""
+    file = tmp_path / "fading.nc"
+    file.touch()
+    monkeypatch.setenv("LAGBENCH_ROOT", str(file / inner))
+    done = CliRunner().invoke(app, words.split())
+    assert done.exit_code == 2
+    assert str(file) in done.stderr
+    assert "generate" not in done.stderr
+
+
+def test_doctor_names_a_root_that_is_a_file_in_its_table(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    done = CliRunner().invoke(app, ["doctor", "--root", str(file)])
+    assert done.exit_code == 1
+    assert "data folder" in done.stdout
+
+
 def test_a_user_without_a_home_folder_names_the_folders(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
