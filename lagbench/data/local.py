@@ -327,11 +327,21 @@ def locate_split(
         registry: the other splits; ours when None.
 
     Raises:
-        UsageError: unknown split, no local split at the path, or a path and another
-            root.
+        UsageError: unknown split, an empty name, no local split at the path, or a path
+            and another root.
+        DataError: the folder of the local split may not be read.
         UnreadableFileError: the description of the local split is not right.
     """
     text = os.fspath(split)
+    if not text.strip():
+        # As a path it would mean the current folder.
+        raise UsageError(
+            "the name of the split is empty",
+            where=SPLIT_NAMED,
+            expected="the name of a split, or the folder of a local one",
+            got=ascii(text),
+            fix="name one, as in --split cavity; . is the split of the current folder",
+        )
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
     if path.name == DESCRIPTION and has_file(path):
@@ -465,11 +475,17 @@ def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> s
     has_mini = any(size.name == DEFAULT_NEW_SIZE for size in sizes_with_data)
     if has_mini and is_chosen_of_several:
         return DEFAULT_NEW_SIZE
-    raise _size_error(location, sizes, sizes_with_data)
+    raise _size_error(
+        location, sizes, sizes_with_data, is_to_remove=not is_chosen_of_several
+    )
 
 
 def _size_error(
-    location: SplitLocation, sizes: Sequence[Size], sizes_with_data: Sequence[Size]
+    location: SplitLocation,
+    sizes: Sequence[Size],
+    sizes_with_data: Sequence[Size],
+    *,
+    is_to_remove: bool,
 ) -> UsageError | DataError:
     url = url_of(location.root)
     size_names = ", ".join(size.name for size in sizes)
@@ -483,7 +499,11 @@ def _size_error(
             fix=f"--size {sizes_with_data[0].name}",
         )
 
-    if url is not None:
+    if is_to_remove:
+        what = "there is nothing to remove"
+        root_name = quote_root(location.root)
+        hint = f"lagbench list --root {root_name} shows what is there"
+    elif url is not None:
         # The store may hold it: only what was fetched is known.
         what = "no size is named, and none was fetched from the store"
         hint = "name it with --size"

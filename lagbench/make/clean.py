@@ -60,6 +60,7 @@ def clean(
     Raises:
         UsageError: unknown split or size, no size is named and several are there, or
             the split is a local one, without ``force`` or ``leftovers``.
+        DataError: no size is named, and none of several is there.
         WorkFailedError: another process writes the data set, or a file cannot be
             removed.
     """

@@ -610,6 +610,16 @@ def test_clean_removes_a_local_split_only_by_force(
     assert run("clean", SPLIT, "--size", SIZE, "--root", tmp_path).exit_code == 0
 
 
+def test_clean_of_nothing_advises_no_generation(run: Run, tmp_path: Path) -> None:
+    root = tmp_path / "my root"
+    result = run("clean", SPLIT, "--root", root)
+    assert result.exit_code == 4
+    fix = result.stderr.partition("fix: ")[2]
+    assert "generate" not in fix
+    command = fix.partition("lagbench ")[2].partition(" shows")[0]
+    assert run(*shlex.split(command)).exit_code == 0
+
+
 def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:
     """Each unreadable description gives a warning; all other splits are listed."""
     for name in ("mine", "pipe"):

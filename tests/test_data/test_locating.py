@@ -134,6 +134,21 @@ def test_an_empty_option_is_not_the_current_folder(
     assert CliRunner().invoke(app, ["list", "--root", "."]).exit_code == 0
 
 
+def test_an_empty_name_is_not_the_split_of_the_current_folder(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A variable of a shell that is not set gives such a name."""
+    monkeypatch.chdir(own)
+    assert locate_split(".").name == "own"
+    for name in ("", " "):
+        for root in (None, own.parent):
+            with pytest.raises(UsageError) as caught:
+                locate_split(name, root=root)
+            assert caught.value.where == "SPLIT or --split"
+    assert CliRunner().invoke(app, ["clean", "--split", "", "--force"]).exit_code == 2
+    assert own.exists()
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     """A local split named own."""
