@@ -36,6 +36,15 @@ CHECKS = (
 )
 """All checks, in the order in which they are reported."""
 
+ERROR_CLASSES: Mapping[str, type[LagbenchError]] = {
+    "readable": UnreadableFileError,
+    "dataset": DataError,
+}
+"""Classes of the errors of some checks, those first that decide before others.
+
+All other checks have ChecksFailedError.
+"""
+
 MAX_TEXT = 80
 """Longest piece of a stranger's file that a message repeats [characters]."""
 
@@ -181,6 +190,9 @@ class ValidationResult:
     def check(self) -> None:
         """Raise unless the file is valid.
 
+        The message describes the first error of the check that decides the class:
+        ``readable`` before ``dataset``, and both before all other checks.
+
         Raises:
             UnreadableFileError: the file cannot be read.
             DataError: it was made from another data set, or the data set needed is
@@ -189,26 +201,29 @@ class ValidationResult:
         """
         if self.valid:
             return
-        first = self.errors[0]
+        issue = self._deciding_error()
         path = escape_line(str(self.path))
-        what = f"{path} is {self.verdict}: [{first.check}] {first.what}"
+        what = f"{path} is {self.verdict}: [{issue.check}] {issue.what}"
         if len(self.errors) > 1:
             what += f" (and {len(self.errors) - 1} more)"
         raise self._error_class()(
             what,
-            where=first.where,
-            expected=first.expected,
-            got=first.got,
-            fix=first.fix,
+            where=issue.where,
+            expected=issue.expected,
+            got=issue.got,
+            fix=issue.fix,
         )
 
     def _error_class(self) -> type[LagbenchError]:
-        failed_checks = {issue.check for issue in self.errors}
-        if "readable" in failed_checks:
-            return UnreadableFileError
-        if "dataset" in failed_checks:
-            return DataError
-        return ChecksFailedError
+        return ERROR_CLASSES.get(self._deciding_error().check, ChecksFailedError)
+
+    def _deciding_error(self) -> ValidationIssue:
+        """Return the error that decides the class and the message of :meth:`check`."""
+        for check in ERROR_CLASSES:
+            for issue in self.errors:
+                if issue.check == check:
+                    return issue
+        return self.errors[0]
 
 
 class IssueCollector:

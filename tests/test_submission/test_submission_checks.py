@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,12 @@ from submission_data import (
 from lagbench.data import contents as module
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
+from lagbench.errors import (
+    ChecksFailedError,
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+)
 from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 from lagbench.scoring.score import score
@@ -237,6 +242,27 @@ def test_check_raises_the_error_of_the_exit_code(
     with pytest.raises(kind, match=FAULTS[name].check):
         bench.validate(FAULTS[name].make(bench)).check()
     bench.validate(bench.valid).check()
+
+
+@pytest.mark.parametrize(
+    ("checks", "deciding_check", "kind"),
+    [
+        (("format", "dataset"), "dataset", DataError),
+        (("format", "dataset", "readable"), "readable", UnreadableFileError),
+        (("finite", "format"), "format", ChecksFailedError),
+    ],
+)
+def test_the_raised_error_describes_the_check_that_decides_its_class(
+    checks: Sequence[str], deciding_check: str, kind: type[LagbenchError]
+) -> None:
+    issues = IssueCollector()
+    for check in checks:
+        issues.error(check, "wrong", where=check, expected="", got="", fix="mend it")
+    result = issues.result(Path("p.nc"))
+    with pytest.raises(kind) as caught:
+        result.check()
+    assert caught.value.where == deciding_check
+    assert result.exit_code == caught.value.exit_code
 
 
 def test_issues_read_as_what_where_expected_got_fix(bench: Bench) -> None:
