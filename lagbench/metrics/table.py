@@ -6,10 +6,14 @@ the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of the
 
 from __future__ import annotations
 
+import copyreg
+import importlib
+import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
+from typing import Any
 
 from lagbench.data.grid import Placement
 from lagbench.data.registry import (
@@ -299,3 +303,62 @@ def select(
         if name in needed:
             chosen_metrics.append(metric)
     return tuple(chosen_metrics)
+
+
+def _reduce_metric(metric: Metric) -> str | tuple[Any, ...]:
+    """Return how pickle stores a metric: by its name, or by its place in a module.
+
+    A decorated function cannot be pickled, as its name stands for the metric. A metric
+    that no name leads to is stored by its fields.
+    """
+    if METRICS.get(metric.name) is metric:
+        return _installed_metric, (metric.name,)
+    place = _find_in_module(metric)
+    if place is not None:
+        return _metric_at, place
+    if available().get(metric.name) is metric:
+        return _installed_metric, (metric.name,)
+    return metric.__reduce_ex__(4)
+
+
+def _find_in_module(metric: Metric) -> tuple[str, str] | None:
+    """Return the module of a metric's function, and the metric's name in it."""
+    function: object = metric.series
+    if metric.statistic is not None:
+        function = metric.statistic
+    module_name = str(getattr(function, "__module__", None))
+    module = sys.modules.get(module_name)
+    if module is None:
+        return None
+    for name, value in list(vars(module).items()):
+        if value is metric:
+            return module_name, name
+    return None
+
+
+def _metric_at(module_name: str, name: str) -> object:
+    """Return a metric that was pickled by its place in a module."""
+    return getattr(importlib.import_module(module_name), name)
+
+
+def _installed_metric(name: str) -> Metric:
+    """Return a metric that was pickled by its name.
+
+    Raises:
+        UsageError: no metric that is installed here has the name.
+    """
+    metric = METRICS.get(name)
+    if metric is None:
+        metric = available().get(name)
+    if metric is None:
+        raise UsageError(
+            f"no metric {name!r}",
+            where="an object that is unpickled",
+            expected="the name of a metric that is installed",
+            got=ascii(name),
+            fix="install the package that adds it",
+        )
+    return metric
+
+
+copyreg.pickle(Metric, _reduce_metric)

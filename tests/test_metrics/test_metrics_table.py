@@ -41,6 +41,7 @@ from lagbench.metrics import (
     available,
     bootstrap_interval,
     measure,
+    metric,
     score,
     select,
     snapshots,
@@ -410,6 +411,7 @@ OTHERS = Metric(
     summary="a metric of another package",
     statistic=lambda pair: 1.0,
 )
+LISTED = [replace(OTHERS, name="listed", of=())]  # its statistic has no name
 CLASHING = (replace(OTHERS, name="vorticity_mse", of=()),)
 NO_METRIC = ("vorticity",)
 NUMBER = 3
@@ -444,6 +446,42 @@ def test_our_metrics_are_registered_as_those_of_others_are(
     pieces = tally(pairs(), metrics, CONFIG.predicted_frames)
     scores = aggregate(metrics, {0: pieces})
     assert scores["enstrophy_error"].mean == 1.0
+
+
+@metric(unit="1", source="none")
+def decorated(pair: FramePair) -> float:
+    """One."""
+    return 1.0
+
+
+def of_function(pair: FramePair) -> float:
+    """Two."""
+    return 2.0
+
+
+OF_FUNCTION = replace(OTHERS, name="of_function", of=(), statistic=of_function)
+
+
+def test_a_metric_can_be_pickled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of lagbench or of an installed package comes back as the same object.
+
+    So does a decorated function of a script. One of a plain function comes back equal.
+    """
+    with_entry_point(monkeypatch, f"{__name__}:LISTED")
+    for named in (*METRICS.values(), *LISTED, decorated):
+        assert pickle.loads(pickle.dumps(named)) is named
+    assert pickle.loads(pickle.dumps(OF_FUNCTION)) == OF_FUNCTION
+
+
+def test_a_pickled_metric_whose_package_is_missing_is_a_usage_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with monkeypatch.context() as patch:
+        with_entry_point(patch, f"{__name__}:LISTED")
+        pickled = pickle.dumps(LISTED[0])
+    with pytest.raises(UsageError) as caught:
+        pickle.loads(pickled)
+    assert caught.value.got == "'listed'"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
@@ -127,6 +128,14 @@ def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     assert row["difference"] == pytest.approx(row["first"] - row["second"])
     assert row["low"] < row["difference"] < row["high"]
     assert row["significant"]
+
+
+def test_a_comparison_can_be_pickled(tmp_path: Path) -> None:
+    """Its metrics of lagbench come back as the same objects."""
+    a = publish(tmp_path, [1, 2, 3, 4, 5, 6], method="a")
+    b = publish(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
+    result = compare(a, b)
+    assert pickle.loads(pickle.dumps(result)) == result
 
 
 def test_five_wins_of_six_are_not_significant(tmp_path: Path) -> None:

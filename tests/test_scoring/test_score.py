@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import pickle
 import re
 import shutil
 import sys
@@ -101,6 +102,15 @@ def test_references_are_what_a_user_would_submit(
         expected = card.scores[row][name]
         assert_array_equal(score.per_frame, expected.per_frame, err_msg=name)
         assert_array_equal(score.values, expected.values, err_msg=name)
+
+
+def test_a_score_card_can_be_pickled(persistence_card: ScoreCard) -> None:
+    """It crosses process borders with all scores and metrics."""
+    again = pickle.loads(pickle.dumps(persistence_card))
+    assert again.as_json() == persistence_card.as_json()
+    for name, score in persistence_card.submission.items():
+        assert again.submission[name].metric is score.metric
+        assert_array_equal(again.submission[name].per_frame, score.per_frame)
 
 
 def test_position_rmse_is_that_of_xarray(
