@@ -284,6 +284,17 @@ class WrongCallError(UsageError, TypeError):
     """
 
 
+class UnknownKeyError(UsageError, KeyError):
+    """A mapping has no entry of that name.
+
+    It is a KeyError as well, as Python raises for such a name.
+    """
+
+    def __str__(self) -> str:
+        """Return the message; a KeyError would return its repr, in one line."""
+        return str(self.args[0])
+
+
 class NotInstalledError(UsageError, ModuleNotFoundError):
     """An optional package is not installed.
 

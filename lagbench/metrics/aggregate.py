@@ -19,7 +19,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.errors import UsageError
+from lagbench.data.layout import format_ids
+from lagbench.errors import UnknownKeyError, UsageError, suggest_name
 
 from .frame import Floats, FramePair
 from .metric import Metric, identity, mean, mean_of_rows, root_mean_square
@@ -471,12 +472,65 @@ class Score:
         return least, greatest
 
     def at(self, frame: int) -> Floats:
-        """Return the value at one absolute frame, shape [scenario]."""
-        return self.per_frame[:, self.frames.index(frame)]
+        """Return the value at one absolute frame, shape [scenario].
+
+        NaN where it is undefined, or not measured in this frame.
+
+        Raises:
+            UsageError: the metric has no value in single frames, as `stable_frames`, or
+                the frame is not predicted.
+        """
+        name = self.metric.name
+        if not self.metric.per_frame:
+            fix = "take .values, the numbers of whole rollouts"
+            others = [other for other in self.metric.of if other != name]
+            if others:
+                fix += f"; values in single frames has {' or '.join(others)}"
+            raise UsageError(
+                "the metric has no value in single frames",
+                where=f"{name}, frame {ascii(frame)[:40]}",
+                expected="a metric with a value in each frame",
+                got=f"{name}, a number of a whole rollout",
+                fix=fix,
+            )
+        try:
+            column = self.frames.index(frame)
+        except ValueError:
+            raise UsageError(
+                "the frame is not predicted",
+                where=f"{name}, frame",
+                expected=f"the absolute number of a predicted frame: "
+                f"{format_ids(self.frames)}",
+                got=ascii(frame)[:40],
+                fix=f"choose one of these, such as the last one: {self.frames[-1]}",
+            ) from None
+        return self.per_frame[:, column]
 
     def interval_at(self, frame: int) -> tuple[float, float]:
-        """Return the 95 % interval of the mean at one absolute frame."""
+        """Return the 95 % interval of the mean at one absolute frame.
+
+        Raises:
+            UsageError: as :meth:`at`.
+        """
         return interval_in_range(self.at(frame), self.metric.value_range)
+
+
+class ScoresByMetric(dict[str, Score]):
+    """Scores by the name of their metric.
+
+    Raises:
+        UnknownKeyError: on access to a name without a score; a KeyError as well.
+    """
+
+    def __missing__(self, name: object) -> Score:
+        """Refuse a name without a score."""
+        raise UnknownKeyError(
+            f"no score of a metric {ascii(name)[:80]}",
+            where="scores",
+            expected="the name of a metric that was measured",
+            got=ascii(name)[:80],
+            fix=suggest_name(str(name), self),
+        )
 
 
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
@@ -566,7 +620,7 @@ def aggregate(
     Raises:
         WorkFailedError: a metric gives no value per frame, or no number.
     """
-    scores: dict[str, Score] = {}
+    scores = ScoresByMetric()
     if not tallies:
         return scores
     statistics = _SeriesByStatistic(tallies)

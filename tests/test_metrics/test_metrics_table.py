@@ -22,6 +22,7 @@ from metric_flows import CONFIG, Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from lagbench.data.grid import Grid, Placement
+from lagbench.data.layout import format_ids
 from lagbench.data.registry import PluginWarning
 from lagbench.errors import (
     UsageError,
@@ -41,7 +42,6 @@ from lagbench.metrics import (
     available,
     bootstrap_interval,
     measure,
-    metric,
     score,
     select,
     snapshots,
@@ -49,6 +49,7 @@ from lagbench.metrics import (
 )
 from lagbench.metrics import table as table_module
 from lagbench.metrics.metric import FirstFrames, last
+from lagbench.metrics.metric import metric as make_metric
 
 ALL = select()
 MATERIAL = np.arange(400) // 200  # half liquid, half jelly
@@ -158,6 +159,42 @@ def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
     predicted, *_ = snapshots(scenario, prediction[5:], previous=prediction[4])
     late = FramePair(scenario, 5, true, predicted)
     assert measure(late, ALL) == measure(pairs()[3], ALL)
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        ("stable_frames", "vorticity_pearson"),
+        ("mse_avg", "attribute_mse"),
+        ("active_frames", ".values"),
+    ],
+)
+def test_a_number_of_a_rollout_has_no_value_in_single_frames(
+    name: str, other: str
+) -> None:
+    """The message names what has one."""
+    scores = aggregate(ALL, {0: tallied()})
+    frame = scores[name].frames[-1]
+    for call in (scores[name].at, scores[name].interval_at):
+        with pytest.raises(UsageError) as caught:
+            call(frame)
+        assert other in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("frame", [999, -1, "3", None])
+def test_a_frame_that_is_not_predicted_has_no_value(frame: Any) -> None:
+    rmse = aggregate(ALL, {0: tallied()})["position_rmse"]
+    with pytest.raises(UsageError) as caught:
+        rmse.at(frame)
+    assert format_ids(rmse.frames) in str(caught.value.expected)
+
+
+def test_a_wrong_name_of_a_metric_is_a_key_error_with_the_nearest_one() -> None:
+    scores = aggregate(ALL, {0: tallied()})
+    with pytest.raises(KeyError, match="did you mean 'vorticity_nrmse'"):
+        scores["vorticty_nrmse"]
+    assert "vorticty_nrmse" not in scores
+    assert scores.get("vorticty_nrmse") is None
 
 
 def test_undefined_frames_are_left_out_and_counted() -> None:
@@ -448,7 +485,7 @@ def test_our_metrics_are_registered_as_those_of_others_are(
     assert scores["enstrophy_error"].mean == 1.0
 
 
-@metric(unit="1", source="none")
+@make_metric(unit="1", source="none")
 def decorated(pair: FramePair) -> float:
     """One."""
     return 1.0
