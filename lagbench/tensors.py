@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -200,17 +201,23 @@ class Batch:
         `frame` becomes the first frame of the part. The wall velocities and forces of
         later frames are kept.
 
+        Args:
+            frames: the frames to take, as in ``slice(2)``.
+
         Raises:
-            UsageError: no frame is left, or not every frame is taken: forcing is given
-                per frame.
+            UsageError: no slice of whole numbers, no frame is left, or not every frame
+                is taken: forcing is given per frame.
         """
-        frame_numbers = range(self.frames)[frames]
+        frame_numbers = range(0)
+        if isinstance(frames, slice):
+            with suppress(TypeError, ValueError):  # ends that are no whole numbers
+                frame_numbers = range(self.frames)[frames]
         if not frame_numbers or frame_numbers.step != 1:
             raise UsageError(
                 "a part of a batch has consecutive frames",
                 where="Batch.part",
-                expected=f"some of {self.frames} frames, in steps of 1",
-                got=frames,
+                expected=f"a slice of some of {self.frames} frames, in steps of 1",
+                got=repr(frames)[:80],
                 fix="take frames in steps of 1, as in batch.part(slice(2))",
             )
         first = frame_numbers[0]

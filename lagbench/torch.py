@@ -250,7 +250,27 @@ class WindowSampler(Sampler[int]):
         return {"seed": self.seed, "epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue where another sampler of the same data stood."""
+        """Continue where another sampler of the same data stood.
+
+        Args:
+            state: what `state_dict` of that sampler returned.
+
+        Raises:
+            UsageError: a key is missing, or there is no such position.
+        """
+        keys = self.state_dict().keys()
+        is_mapping = isinstance(state, Mapping)
+        if not is_mapping or not keys <= state.keys():
+            got: object = type(state).__name__
+            if is_mapping:
+                got = ", ".join(map(repr, state)) or "no key"
+            raise UsageError(
+                "no state of a sampler",
+                where="WindowSampler.load_state_dict",
+                expected=f"a dictionary with the keys {', '.join(keys)}",
+                got=got,
+                fix="give what sampler.state_dict() returned",
+            )
         seed = _check_natural(state["seed"], "seed")
         self.seek(state["epoch"], state["position"])
         self.seed = seed

@@ -325,6 +325,38 @@ def mean_over_seeds(values: ArrayLike) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), math.nan)
 
 
+def as_method(values: ArrayLike) -> Floats:
+    """Return the values of a method as an array of shape [seed, scenario].
+
+    Args:
+        values: numbers, NaN where undefined, shape [scenario] or [seed, scenario].
+
+    Raises:
+        UsageError: the values are no numbers, or have another shape.
+    """
+    expected = "numbers of shape [scenario] or [seed, scenario], NaN where undefined"
+    fix = "give one number for each seed and scenario"
+    try:
+        method = np.asarray(values, np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise UsageError(
+            "the values of a method are no array of numbers",
+            where="values of a method",
+            expected=expected,
+            got=f"{type(values).__name__}: {values!r:.60}",
+            fix=fix,
+        ) from error
+    if method.ndim > 2:
+        raise UsageError(
+            "the values of a method have too many axes",
+            where="values of a method",
+            expected=expected,
+            got=f"shape {method.shape}",
+            fix=fix,
+        )
+    return np.atleast_2d(method)
+
+
 def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | None:
     """Draw scenarios and seeds with replacement: the two-way bootstrap of a mean.
 
@@ -350,11 +382,12 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
         None where fewer than two scenarios are defined.
 
     Raises:
-        UsageError: values are infinite, or the methods have different scenarios.
+        UsageError: values are infinite or no numbers, have another shape, or the
+            methods have different scenarios.
     """
-    methods = [np.atleast_2d(np.asarray(values, np.float64))]
+    methods = [as_method(values)]
     if minus is not None:
-        methods.append(np.atleast_2d(np.asarray(minus, np.float64)))
+        methods.append(as_method(minus))
     _check_values(methods)
 
     has_value = []
@@ -401,6 +434,9 @@ def bootstrap_interval(
     """Return the 95 % interval of a mean by the two-way bootstrap, :func:`resample`.
 
     NaN when fewer than four scenarios are defined.
+
+    Raises:
+        UsageError: as :func:`resample`.
     """
     resampling = resample(values, minus)
     if resampling is None:

@@ -19,7 +19,14 @@ from numpy.typing import ArrayLike
 
 from lagbench.errors import UsageError
 
-from .aggregate import RESAMPLES, Resampling, Score, mean_over_seeds, resample
+from .aggregate import (
+    RESAMPLES,
+    Resampling,
+    Score,
+    as_method,
+    mean_over_seeds,
+    resample,
+)
 from .frame import Floats
 from .metric import mean
 
@@ -45,9 +52,9 @@ def sign_flip_p(differences: ArrayLike) -> float:
     Zero differences count: they are the same under either sign. All zero gives 1.
 
     Raises:
-        UsageError: no difference, more than 40, or one that is not finite.
+        UsageError: no difference, more than 40, or one that is no finite number.
     """
-    signed = np.asarray(differences, np.float64)
+    signed = as_method(differences)
     d = np.abs(signed.ravel())
     if not np.isfinite(d).all():
         raise UsageError(
@@ -98,10 +105,11 @@ def differ(first: ArrayLike, second: ArrayLike) -> float:
     than six scenarios in which both have a value the result is NaN.
 
     Raises:
-        UsageError: the methods have different scenarios, or losses are infinite.
+        UsageError: the methods have different scenarios, or losses are infinite, no
+            numbers, or of another shape.
     """
-    a = np.atleast_2d(np.asarray(first, np.float64))
-    b = np.atleast_2d(np.asarray(second, np.float64))
+    a = as_method(first)
+    b = as_method(second)
     if a.shape[1] != b.shape[1]:
         raise UsageError(
             "methods over different scenarios", expected=a.shape[1], got=b.shape[1]

@@ -8,6 +8,7 @@ import operator
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,6 +135,22 @@ def test_losses_that_no_p_value_fits() -> None:
             differ(first, second)
     with pytest.raises(UsageError):
         bootstrap_interval(plain, minus=plain[:5])
+
+
+@pytest.mark.parametrize(
+    "values",
+    ["x", ["x", "y"], [[1.0], [1.0, 2.0]], [object()], np.ones((3, 12, 1))],
+)
+def test_what_is_no_array_of_seeds_and_scenarios_is_refused(values: Any) -> None:
+    """Neither texts, nor rows of different lengths, nor three axes."""
+    plain = np.ones((4, 12))
+    for first, second in ((plain, values), (values, plain)):
+        with pytest.raises(UsageError):
+            differ(first, second)
+        with pytest.raises(UsageError):
+            bootstrap_interval(first, minus=second)
+    with pytest.raises(UsageError):
+        sign_flip_p(values)
 
 
 def test_an_interval_over_many_scenarios_takes_little_memory() -> None:

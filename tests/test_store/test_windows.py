@@ -643,6 +643,15 @@ def test_seeds_epochs_and_positions_are_whole_numbers_from_0(
     assert sampler.state_dict() == before
 
 
+@pytest.mark.parametrize("state", [{}, {"seed": 1, "epoch": 0}, None, [1, 2, 3]])
+def test_no_state_of_a_sampler_moves_nothing(train: Open, state: Any) -> None:
+    sampler = WindowSampler(train(), seed=0)
+    before = sampler.state_dict()
+    with pytest.raises(UsageError):
+        sampler.load_state_dict(state)
+    assert sampler.state_dict() == before
+
+
 def test_the_last_position_is_the_end_of_the_epoch(train: Open) -> None:
     sampler = WindowSampler(train(), seed=0)
     epoch = np.int64(3)
@@ -1100,9 +1109,13 @@ def test_a_window_is_followed_by_a_frame(train: Open) -> None:
         slice(None, None, -1),
         slice(2, 2),
         slice(9, 12),
+        slice("a"),
+        slice(None, None, 0),
+        1,
+        None,
     ],
 )
-def test_parts_are_consecutive_frames(train: Open, frames: slice) -> None:
+def test_parts_are_consecutive_frames(train: Open, frames: Any) -> None:
     """With steps the forcing would be that of another frame."""
     data = train(history=3, future=2)
     batch = batch_of(data, 0, 4)
