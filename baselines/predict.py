@@ -202,6 +202,7 @@ def predict(
             parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
+        writer.option = "--output"
         with hold_output(output_path):
             # Another prediction may have written it since the first check.
             check_outputs(output_path, overwrite=overwrite)

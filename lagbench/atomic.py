@@ -31,6 +31,9 @@ LONGEST_KEPT_NAME = 200
 SIGNED_BYTES = 4 << 20
 """How much of a file is read to learn its kind [bytes]."""
 
+PROBE_BYTES = 1 << 20
+"""Length of a file that finds out why a library could not write [bytes]."""
+
 ROOT_OPTION = "--root or LAGBENCH_ROOT"
 """The option that names the folder for most files."""
 
@@ -275,12 +278,45 @@ def _process_token() -> str:
     return secrets.token_hex(4)
 
 
+def explain_write_error(
+    target: Path, error: Exception, *, option: str
+) -> WorkFailedError:
+    """Return the error for a file that a library could not write.
+
+    HDF5 and netCDF do not know the reason: on a full disk they may say that permission
+    is denied. So a probe is written beside the file, and the error of the probe counts.
+
+    Args:
+        target: the file.
+        error: what the library raised.
+        option: the option or argument that names another file, for the message.
+    """
+    probe = temporary_name(target.with_name("probe"))
+    try:
+        probe.write_bytes(bytes(PROBE_BYTES))
+        _flush(probe)
+    except OSError as probe_error:
+        return _write_error(target, option, probe_error)
+    finally:
+        _discard(probe)
+    return WorkFailedError(
+        "cannot write there",
+        where=str(target),
+        expected="a place that can be written to",
+        got=str(error),
+        fix=f"free disk space, or name a folder that you may write to: {option}; if "
+        f"there is space, {LIMIT_FIXES[errno.EFBIG]}",
+    )
+
+
 def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
     hint = "see that the disk is there and can be written to"
     if error.errno in DISK_FULL_ERRORS:
         hint = "free disk space"
     if error.errno in LIMIT_FIXES:
         hint = LIMIT_FIXES[error.errno]
+    if isinstance(error, PermissionError):
+        hint = "see who owns the folder"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
         hint = "a file is where a folder has to be: move it"
     if isinstance(error, IsADirectoryError):

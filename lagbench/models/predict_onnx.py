@@ -107,6 +107,7 @@ def predict_onnx(
         parameters=runner.parameters,
         device=f"{processor_name()}, 1 thread",
     )
+    writer.option = "--output"
     seconds = 0.0
     with hold_output(output_path):
         # Another prediction may have written it since the first check.

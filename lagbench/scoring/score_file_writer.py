@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.atomic import atomic_path
+from lagbench.atomic import atomic_path, explain_write_error
 from lagbench.data.variables import open_netcdf
-from lagbench.errors import WorkFailedError
 
 from .card import ScoreCard
 from .score_layout import (
@@ -46,14 +45,7 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
             with open_netcdf(temporary, "w") as file:
                 _write_card(file, card)
         except (OSError, RuntimeError) as error:
-            raise WorkFailedError(
-                "cannot write scores",
-                where=str(path),
-                expected="a folder that you may write to, on a disk with space",
-                got=error,
-                fix=f"free disk space, or name a folder that you may write to: "
-                f"{option}",
-            ) from error
+            raise explain_write_error(path, error, option=option) from error
 
 
 def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401

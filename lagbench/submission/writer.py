@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import operator
+import os
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.arguments import check_arguments
-from lagbench.atomic import atomic_path, check_output_file
+from lagbench.atomic import atomic_path, check_output_file, explain_write_error
 from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
@@ -49,6 +51,9 @@ from .truth import Truth
 
 CHUNK_CACHE_BYTES = 1 << 20
 """Memory for the chunks of a variable while it is written [bytes]."""
+
+ADDRESS_SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:")
+"""First part of the path of an address, such as s3://bucket/p.nc."""
 
 MAX_REASON = 200
 """Longest reason that a message repeats [characters]."""
@@ -104,7 +109,7 @@ class PredictionsWriter:
     scenario; on an error it is removed.
 
     Args:
-        path: file to write.
+        path: file to write. A file or a symbolic link of that name is replaced.
         split: name of the split.
         size: name of the size; None takes the only one with data, or mini where several
             have data.
@@ -119,7 +124,8 @@ class PredictionsWriter:
         **labels: see :meth:`label`.
 
     Raises:
-        UsageError: unknown split, size or label.
+        UsageError: unknown split, size or label, or the path is that of a folder or an
+            address of a store.
         DataError: the hash of the data set is not known.
     """
 
@@ -139,6 +145,10 @@ class PredictionsWriter:
         **labels: Label,
     ) -> None:
         self.path = Path(path)
+        # option or argument that named the path, for messages
+        self.option = "path"
+        _refuse_address(self.path, "path")
+        _refuse_folder(self.path)
         tier, folder, _ = locate(split, size, root=root, registry=registry)
         self.size = tier.scored_on(subset)
         if dataset_sha256 is None:
@@ -215,7 +225,7 @@ class PredictionsWriter:
         self._written.clear()
         self._diverged_at.fill(NEVER)
         with ExitStack() as stack:
-            temporary = stack.enter_context(atomic_path(self.path, option="--output"))
+            temporary = stack.enter_context(atomic_path(self.path, option=self.option))
             with self._writing():
                 self._file = open_netcdf(temporary, "w")
                 stack.callback(self._abandon)
@@ -468,13 +478,34 @@ class PredictionsWriter:
         try:
             yield
         except (OSError, RuntimeError) as error:
-            raise WorkFailedError(
-                "cannot write the predictions",
-                where=str(self.path),
-                expected="a place that can be written to",
-                got=error,
-                fix="free disk space, or name a folder that you may write to: --output",
-            ) from error
+            raise explain_write_error(self.path, error, option=self.option) from error
+
+
+def _refuse_address(path: Path, option: str) -> None:
+    """Refuse an address, whose name a local folder would get."""
+    parts = path.parts
+    if len(parts) < 2 or not ADDRESS_SCHEME.fullmatch(parts[0]):
+        return
+    raise UsageError(
+        "predictions are written to this machine only",
+        where=option,
+        expected="the path of a file",
+        got=f"{path}, an address",
+        fix=f"write {shlex.quote(path.name)}, then copy it there",
+    )
+
+
+def _refuse_folder(path: Path) -> None:
+    """Refuse a folder before the work, also that of an empty path."""
+    if not os.path.isdir(path):
+        return
+    raise UsageError(
+        "the output is a folder",
+        where="path",
+        expected="the name of a file",
+        got=str(path),
+        fix=f"name a file in it: {path / 'predictions.nc'}",
+    )
 
 
 def _recorded_hash(size: Size, root: Path) -> str:
@@ -526,7 +557,7 @@ def _no_positions(where: str, got: str) -> UsageError:
         expected="an array of numbers without a mask",
         got=got[:MAX_REASON],
         fix="convert it to one NumPy array of float32; of a tensor: "
-        "tensor.detach().cpu().numpy()",
+        "tensor.detach().float().cpu().numpy()",
     )
 
 
@@ -549,7 +580,8 @@ def write(
     """Write a predictions.nc from arrays.
 
     Args:
-        path: file to write.
+        path: file to write. A file of that name is replaced. So is a symbolic link: the
+            file that it leads to stays as it is.
         positions: scenario id to positions [length], shape [frame, particle, space]; or
             one array [scenario, frame, particle, space] with the test scenarios by
             ascending id.
@@ -572,7 +604,7 @@ def write(
 
     Raises:
         UsageError: unknown names or scenarios, wrong shapes, missing scenarios, values
-            that are not finite.
+            that are not finite, or the path is that of a folder or an address.
         DataError: the hash of the data set is not known.
         WorkFailedError: the disk is full or not writable.
     """
@@ -666,9 +698,10 @@ def check_predictions_output(output: Path, *, overwrite: bool) -> None:
         overwrite: whether the user allows to replace predictions of that name.
 
     Raises:
-        UsageError: it is a folder or a file of another kind, there are such
+        UsageError: it is an address, a folder or a file of another kind, there are such
             predictions, or its name has the ending of another format.
     """
+    _refuse_address(output, "--output")
     check_output_file(output, overwrite=overwrite, signs=PREDICTIONS_SIGNS)
     ending = output.suffix
     if ending.lower() in OTHER_ENDINGS:
@@ -726,6 +759,7 @@ def template(
         root=folder,
         registry=splits,
     )
+    writer.option = "--output"
     scenarios = tuple(sorted(entry.subsets[subset]))
     particle_counts = []
     with writer:

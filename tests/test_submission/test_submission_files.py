@@ -4,11 +4,17 @@ what is refused.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import shutil
 import socket
+import subprocess
+import sys
 import tracemalloc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -390,7 +396,7 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with pytest.raises(WorkFailedError) as caught:
         write(bench.valid / "p.nc", RIGHT, **options(bench))
     assert caught.value.where.endswith("valid.nc/p.nc")
-    assert "--output" in str(caught.value.fix)
+    assert str(caught.value.fix).endswith(" path")
 
 
 @pytest.mark.parametrize("size", [0, 5_000])
@@ -406,8 +412,131 @@ def test_a_full_disk_is_named_and_leaves_no_file(
     values = RIGHT if whole else {first: RIGHT[first]}
     with largest_file(size), pytest.raises(WorkFailedError) as caught:
         write(tmp_path / "p.nc", values, **options(bench))
-    assert "--output" in str(caught.value.fix)
+    assert "ulimit -f" in str(caught.value.fix)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path", ["", ".", "/", "folder"])
+def test_predictions_are_not_written_to_a_folder(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """Neither an empty path nor that of a folder names a file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UsageError) as caught:
+        write(path, RIGHT, **options(bench))
+    assert caught.value.where == "path"
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_predictions_are_not_written_to_an_address(
+    bench: Bench,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: Callable[[str], Any],
+) -> None:
+    """No local folder gets the name of the scheme."""
+    monkeypatch.chdir(tmp_path)
+    address = kind("s3://bucket/x.nc")
+    with pytest.raises(UsageError) as caught:
+        write(address, RIGHT, **options(bench))
+    assert caught.value.where == "path"
+    with pytest.raises(UsageError) as caught:
+        template("cavity", "tiny", output=address, registry=bench.registry)
+    assert caught.value.where == "--output"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_is_replaced_by_the_file(bench: Bench, tmp_path: Path) -> None:
+    """The file that it leads to stays as it is."""
+    target = tmp_path / "target.nc"
+    target.write_text("something else")
+    link = tmp_path / "link.nc"
+    link.symlink_to(target)
+    write(link, RIGHT, **options(bench))
+    assert not link.is_symlink()
+    assert target.read_text() == "something else"
+
+
+def test_the_advice_for_a_tensor_works(bench: Bench, tmp_path: Path) -> None:
+    """Also for a type that NumPy lacks, on a tensor with gradients."""
+    tensors = {}
+    for scenario, values in RIGHT.items():
+        tensors[scenario] = torch.tensor(values, dtype=torch.bfloat16)
+        tensors[scenario].requires_grad_()
+    path = tmp_path / "p.nc"
+    with pytest.raises(UsageError) as caught:
+        write(path, tensors, **options(bench))
+    advice = str(caught.value.fix).rpartition(" ")[2]
+    arrays = {}
+    for scenario, tensor in tensors.items():
+        arrays[scenario] = eval(advice, {"tensor": tensor})
+    assert write(path, arrays, **options(bench)) == path
+
+
+WRITE_LOCKED = """
+import errno, os, sys
+from pathlib import Path
+import numpy as np
+from lagbench.data.registry import load
+from lagbench.errors import WorkFailedError
+from lagbench.submission import write
+registry_path, folder = map(Path, sys.argv[1:])
+try:
+    write(folder / "p.nc", np.zeros(SHAPE), split="cavity", size="tiny", method="m",
+          registry=load(registry_path))
+except WorkFailedError as error:
+    print(error.got == os.strerror(errno.EACCES), "space" in error.fix)
+""".replace("SHAPE", repr((len(TESTS), *SHAPE)))
+
+
+def test_a_folder_without_permission_is_no_full_disk(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """The advice names the owner, not the space."""
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o500)
+    command = [
+        sys.executable,
+        "-c",
+        WRITE_LOCKED,
+        str(bench.registry_path),
+        str(folder),
+    ]
+    if os.geteuid() == 0:
+        if shutil.which("setpriv") is None:
+            pytest.skip("the root may write everywhere")
+        bounds = "--bounding-set=-dac_override,-dac_read_search"
+        command = ["setpriv", bounds, *command]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.stdout.strip() == "True False", run.stderr
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system that one file fills."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(disk)]
+    if (
+        shutil.which("mount") is None
+        or subprocess.run(mount, capture_output=True, check=False).returncode
+    ):
+        pytest.skip("a tmpfs cannot be mounted here: it takes root rights")
+    with suppress(OSError):
+        (disk / "filler").write_bytes(bytes(1 << 17))
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_full_disk_is_not_called_forbidden(bench: Bench, full_disk: Path) -> None:
+    """The netCDF library says so where it cannot create a file."""
+    filler = full_disk / "filler"
+    with pytest.raises(WorkFailedError) as caught:
+        write(full_disk / "p.nc", RIGHT, **options(bench))
+    assert "free disk space" in str(caught.value.fix)
+    assert caught.value.got == os.strerror(errno.ENOSPC)
+    assert list(full_disk.iterdir()) == [filler]
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:

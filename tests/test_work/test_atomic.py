@@ -90,6 +90,7 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     ("code", "hint"),
     [
         (errno.ENOSPC, "free disk space"),
+        (errno.EACCES, "owns"),
         (errno.EROFS, "can be written to"),
         (errno.ENOENT, "can be written to"),
         (errno.EIO, "can be written to"),
