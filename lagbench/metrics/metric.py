@@ -350,7 +350,8 @@ class Metric:
     def raise_named(self, error: Exception | SystemExit, place: str) -> NoReturn:
         """Raise an error of the metric's functions again, with name and place added.
 
-        The name is also the error's attribute ``metric_name``.
+        The name is also the error's attribute ``metric_name``, and the module of the
+        function its attribute ``metric_module``.
 
         Raises:
             WorkFailedError: the error would end the program, or takes no attribute.
@@ -363,6 +364,7 @@ class Metric:
         try:
             error.add_note(f"in metric {self.name}, {place}")
             error.metric_name = self.name  # type: ignore[attr-defined]
+            error.metric_module = _module_of_call(error)  # type: ignore[attr-defined]
         except AttributeError:  # such as an exception that is a frozen dataclass
             what = "a metric failed"
             failure = self._failure(what, where, expected="a number", got=error)
@@ -448,6 +450,15 @@ def _line_of_call(error: BaseException) -> str:
         return "?"
     file = trace.tb_next.tb_frame.f_code.co_filename
     return f"{file}, line {trace.tb_next.tb_lineno}"
+
+
+def _module_of_call(error: BaseException) -> str | None:
+    """Return the name of the module whose function was called here and failed."""
+    trace = error.__traceback__
+    if trace is None or trace.tb_next is None:  # a function without lines in Python
+        return None
+    name: str | None = trace.tb_next.tb_frame.f_globals.get("__name__")
+    return name
 
 
 def metric(

@@ -63,8 +63,11 @@ def package_metric_errors() -> Iterator[None]:
         if name is None or name in METRICS:
             raise
         notes = ", ".join(getattr(error, "__notes__", ()))
+        # a metric that a user hands over is in no package
+        module = getattr(error, "metric_module", None)
+        modules = () if module is None else (module,)
         places = [
-            find_place_in_extension(error),
+            find_place_in_extension(error, *modules),
             getattr(error, "where", None),
             notes or None,
         ]

@@ -605,6 +605,26 @@ def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) ->
     assert "scenario" in str(caught.value.where)
     assert "metrics=" in str(caught.value.fix)
     assert "package" not in str(caught.value)
+    line = broken.__code__.co_firstlineno + 1
+    assert str(caught.value.where).startswith(f"{__file__}, line {line}, ")
+
+
+def test_the_failing_line_of_an_own_metric_is_that_in_its_file(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """Not a line of NumPy, in which the error was raised."""
+
+    def reshape(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.split(values, 7)[0]
+
+    def broken(pair: FramePair) -> float:
+        return float(reshape(np.ones(3)).mean())
+
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    with pytest.raises(WorkFailedError) as caught:
+        bench.evaluate(path, metrics=[broken])
+    line = reshape.__code__.co_firstlineno + 1
+    assert str(caught.value.where).startswith(f"{__file__}, line {line}, ")
 
 
 NO_NUMBER = """
