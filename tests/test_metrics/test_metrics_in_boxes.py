@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import entropy
 
 from lagbench.data.box import Box
 from lagbench.data.grid import Grid, Placement
@@ -348,3 +349,23 @@ def test_vorticity_of_a_solid_rotation_is_twice_its_rate_at_every_node() -> None
     assert pair.node_count == 6**3
     # The transfer bends the flow at walls.
     assert np.quantile(error, 0.25) < 1e-12
+
+
+def test_divergences_in_space_compare_the_components_of_the_vorticity() -> None:
+    """The prediction turns about another axis, so at most nodes its vorticity has the
+    same length: only the components tell it from the truth.
+    """
+    position = lattice(3, 16)
+    arm = position - 0.5
+    rate = np.array([0.01, -0.02, 0.03])
+    scenario = scenario_in(SOLID, position)
+    truth = scenario.snapshot(position, position - np.cross(rate, arm))
+    turned = np.cross(np.roll(rate, 1), arm)
+    prediction = scenario.snapshot(position, position - turned)
+    pair = FramePair(scenario, 2, truth, prediction)
+    p = np.abs(pair.true_vorticity).reshape(-1, 3)
+    q = np.abs(pair.predicted_vorticity).reshape(-1, 3)
+    divergence = METRICS["vorticity_kl"].measure(pair)
+    assert divergence == pytest.approx(entropy(p.ravel(), q.ravel()), rel=1e-6)
+    lengths = np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)
+    assert divergence > 10.0 * entropy(*lengths)
