@@ -8,7 +8,8 @@ submission that a board page shows are taken while it is scored.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,14 +157,18 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
             package_metric_errors(),
             job.task.opened(number) as truth,
             open_predictions(job.predictions, info=job.info) as predictions,
+            ExitStack() as open_rows,
         ):
             scenario = truth.scenario
             frames = _predicted_frames(predictions, number)
             rows = {SUBMISSION: snapshots(scenario, frames)}
             for name in job.references:
                 given = given_in(truth.file, job.task.size, job.task.truth.root)
-                frames = predict_reference(REFERENCES[name], given)
-                rows[name] = snapshots(scenario, frames)
+                prediction = predict_reference(REFERENCES[name], given)
+                # where a metric fails, the traceback would keep the files open
+                if isinstance(prediction, Generator):
+                    open_rows.callback(prediction.close)
+                rows[name] = snapshots(scenario, prediction)
 
             if job.has_preview:
                 obstacle = truth.obstacle

@@ -609,6 +609,23 @@ def test_an_own_metric_that_fails_is_named(bench: ScoreBench, tmp_path: Path) ->
     assert str(caught.value.where).startswith(f"{__file__}, line {line}, ")
 
 
+def test_an_own_metric_that_fails_leaves_no_file_open(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    """Though the traceback is kept, as in a notebook."""
+
+    def broken(pair: FramePair) -> float:
+        raise ValueError
+
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    before = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
+    with pytest.raises(WorkFailedError) as caught:
+        bench.evaluate(path, metrics=[broken])
+    after = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE)
+    assert after == before
+    assert caught.value.__cause__ is not None
+
+
 def test_the_failing_line_of_an_own_metric_is_that_in_its_file(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
