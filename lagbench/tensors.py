@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lagbench.arguments import check_arguments
 from lagbench.data.box import Box
 from lagbench.data.summary import summarise_arrays
 from lagbench.errors import UsageError
@@ -27,6 +28,7 @@ class TensorBox(nn.Module):
     start: Tensor
     period: Tensor
 
+    @check_arguments
     def __init__(self, box: Box) -> None:
         super().__init__()
         self.box = box

@@ -29,6 +29,7 @@ REQUIRED_LIBRARIES = (
     "xarray",
     "netCDF4",
     "h5py",
+    "h5netcdf",
     "dask",
     "pandas",
     "pydantic",

@@ -105,8 +105,8 @@ _distance = partial(metric, unit="nat", direction=Direction.LOWER, defined=has_r
 
 @_distance(source="Eqs. 5.23-5.25")
 def vorticity_kl(pair: FramePair) -> float:
-    """Kullback-Leibler divergence of the absolute vorticity over the nodes, in three
-    dimensions of its absolute components.
+    """Kullback-Leibler divergence of the absolute vorticity, in 3-D of its components,
+    over the nodes.
 
     The thesis's models range from 0.128 to 0.391 at frame 54 of the cavity (Table 5.5).
     """
@@ -121,8 +121,8 @@ def vorticity_kl_hist(pair: FramePair) -> float:
 
 @_distance(source="Fig. 5.12")
 def vorticity_kl_hist_abs(pair: FramePair) -> float:
-    """Kullback-Leibler divergence of the histograms of the absolute vorticity, in three
-    dimensions of its absolute components.
+    """Kullback-Leibler divergence of histograms of the absolute vorticity, in 3-D of
+    its components.
     """
     return _histogram_kl(np.abs(pair.true_vorticity), np.abs(pair.predicted_vorticity))
 

@@ -28,7 +28,7 @@ from lagbench.data.layout import PICTURES
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DataError, UsageError
 from lagbench.generators.batch import (
     draw_initial_state,
     start_frame,
@@ -666,7 +666,7 @@ def test_a_root_that_is_a_file_is_refused_dry_or_not(
     """
     (tmp_path / "file").write_text("mine")
     for root in (tmp_path / "file", tmp_path / "file" / "data"):
-        with pytest.raises(WorkFailedError) as caught:
+        with pytest.raises(UsageError) as caught:
             generate(SPLIT, SIZE, root=root, dry_run=dry_run, registry=unmeasured)
         assert str(tmp_path / "file") in str(caught.value)
 
