@@ -521,7 +521,8 @@ class Score:
             fix = "take .values, the numbers of whole rollouts"
             others = [other for other in self.metric.of if other != name]
             if others:
-                fix += f"; values in single frames has {' or '.join(others)}"
+                names = " or ".join(others)
+                fix += f"; or use {names}, which has values in single frames"
             raise UsageError(
                 "the metric has no value in single frames",
                 where=f"{name}, frame {ascii(frame)[:40]}",
