@@ -210,11 +210,11 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     clock = "as wall-clock time in milliseconds"
     if device == Device.CPU:
         clock = "as processor time in milliseconds"
-    consequence = "On a CPU the difference is small, often smaller than the noise."
+    consequence = "On a CPU they differ little, often by less than the noise."
     if device == Device.CUDA:
         consequence = (
             "On a GPU a copy takes long. So where a frame has many substeps, t/frame "
-            "is much less than this product."
+            "is much less than t/substep times the number of substeps."
         )
     return [
         "## Table 3.1: time of the solver for more and more particles",
@@ -229,9 +229,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "number of frames per second. t/frame is the time of a run with all substeps "
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
-        f"contains 1/{FIXED} of the time of a copy. The product of t/substep and the "
-        f"number of substeps therefore contains one copy for every {FIXED} substeps, "
-        f"but t/frame contains only one. {consequence}",
+        f"contains 1/{FIXED} of the time of a copy. For a frame of {2 * FIXED} "
+        f"substeps, {2 * FIXED} times t/substep contains the time of two copies, but "
+        f"t/frame contains the time of one. So these two times differ. {consequence}",
         "",
     ]
 
