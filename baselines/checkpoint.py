@@ -32,7 +32,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from lagbench.atomic import atomic_path
+from lagbench.atomic import atomic_path, explain_write_error
 from lagbench.data.box import Box, parse_periodic
 from lagbench.data.field_errors import describe_expectation, describe_input
 from lagbench.data.hdf5 import SIGNATURE as HDF5_SIGNATURE
@@ -42,7 +42,6 @@ from lagbench.errors import (
     LagbenchError,
     UnreadableFileError,
     UsageError,
-    WorkFailedError,
     check_regular,
 )
 from lagbench.submission.budget import Budget, parse_budget
@@ -164,14 +163,7 @@ def save(path: Path, checkpoint: Checkpoint, *, replaced: Iterable[Path] = ()) -
         try:
             torch.save(content, temporary)
         except RuntimeError as error:  # torch raises it for any error of the system
-            first_line = str(error).split("\n")[0]
-            raise WorkFailedError(
-                "cannot write there",
-                where=str(path),
-                expected="a folder that you may write to, on a disk with space",
-                got=first_line[:200],
-                fix="free disk space, or name a folder that you may write to: --output",
-            ) from error
+            raise explain_write_error(path, error, option="--output") from error
 
 
 def check_weights(weights: Mapping[str, object], *, where: str) -> None:

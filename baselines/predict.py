@@ -198,11 +198,11 @@ def predict(
             dataset_sha256=info.dataset_sha256,
             root=root_folder,
             registry=known_splits,
+            option="--output",
             device=hardware_label,
             parameters=count_parameters(model),
             **_training_attributes(trained, info, settings),
         )
-        writer.option = "--output"
         with hold_output(output_path):
             # Another prediction may have written it since the first check.
             check_outputs(output_path, overwrite=overwrite)

@@ -62,6 +62,9 @@ FIT_STEPS = 1  # a closed form counts as one step
 READING = "reading"  # the stage in which a fit reads scenarios
 FITTING = "fitting"  # the stage in which it evaluates
 
+# what an interrupted training says that has stored nothing yet
+NOTHING_STORED = "the earlier training in the folder is still there"
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingResult:
@@ -342,10 +345,6 @@ def _result(
         first_step=first_step,
         **log_values,
     )
-
-
-NOTHING_STORED = "the earlier training in the folder is still there"
-"""What an interrupted training says that has stored nothing yet."""
 
 
 class StepBatches(Sampler[list[int]]):

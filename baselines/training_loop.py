@@ -180,15 +180,10 @@ class TrainingLoop:
             if self.validation is not None and self._is_validation_due(self.validation):
                 self._validate(self.validation)
             self._check_end()
-            is_in_vain = self.log.state == "interrupted" and self._keeps_earlier_files()
-            if not is_in_vain and (self._is_over or self._is_checkpoint_due()):
+            if self._is_over or self._is_checkpoint_due():
                 self._store()
             if self._is_over:
                 return
-
-    def _keeps_earlier_files(self) -> bool:
-        """Return whether nothing is stored yet that replaces an earlier training."""
-        return self.job.folder.has_earlier_files
 
     def _starts_from_weights(self) -> bool:
         """Return whether the training is at its start, and starts from weights."""
@@ -303,6 +298,9 @@ class TrainingLoop:
     def _store(self) -> None:
         """Write checkpoint and log.
 
+        An interrupted training that has stored nothing yet leaves an earlier training
+        in the folder.
+
         Raises:
             WorkFailedError: weights are not finite; the files stay as they are.
         """
@@ -311,11 +309,13 @@ class TrainingLoop:
             self.log.state = "finished"
         if not self.fabric.is_global_zero:
             return
+        folder = self.job.folder
+        if self.log.state == "interrupted" and folder.has_earlier_files:
+            return
         weights = self.optimisation.model.state_dict()
         for value in weights.values():
             if not torch.isfinite(value).all():
                 raise self.optimisation.not_finite()
-        folder = self.job.folder
         self._read_clocks()
         optimizer_state = self.optimisation.optimizer.state_dict()
         checkpoint = self.job.checkpoint(self.log, weights, optimizer_state)

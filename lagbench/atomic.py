@@ -146,15 +146,20 @@ def refuse_folders(paths: Iterable[Path]) -> None:
 
 
 def check_output_file(
-    output: Path, *, overwrite: bool, signs: Sequence[bytes] = ()
+    output: Path,
+    *,
+    overwrite: bool,
+    signs: Sequence[bytes] = (),
+    option: str = "--output",
 ) -> None:
     """Refuse, before the work, a file to write that must not be replaced.
 
     Args:
-        output: the file that ``--output`` names, or one beside it.
+        output: the file that ``option`` names, or one beside it.
         overwrite: whether the user allows to replace a file of that name.
         signs: bytes that a file of the kind that is written has near its beginning;
             files that lack one are never replaced.
+        option: the option or argument that names the file, for messages.
 
     Raises:
         UsageError: it is a folder, a device or a file of another kind, or there is such
@@ -165,7 +170,7 @@ def check_output_file(
     if output.is_dir():
         raise UsageError(
             "the output is a folder",
-            where="--output",
+            where=option,
             expected="the name of a file",
             got=str(output),
             fix="name a file, also one in that folder",
@@ -173,7 +178,7 @@ def check_output_file(
     if output.exists() and not output.is_file():
         raise UsageError(
             "the output is no file",
-            where="--output",
+            where=option,
             expected="the name of a file",
             got=f"{output}, a device, socket or pipe",
             fix="name a file",
@@ -181,7 +186,7 @@ def check_output_file(
     if signs and not _has_signs(output, signs):
         raise UsageError(
             "the output would replace a file that is something else",
-            where="--output",
+            where=option,
             expected="no file, or one of the kind that is written",
             got=str(output),
             fix="name another file",
@@ -190,7 +195,7 @@ def check_output_file(
         other = output.with_name(f"{output.stem}-2{output.suffix}")
         raise UsageError(
             "there is such a file already",
-            where="--output",
+            where=option,
             expected="a file that is not there yet",
             got=str(output),
             fix="replace it: --overwrite; or write elsewhere, as in -o "
@@ -283,8 +288,9 @@ def explain_write_error(
 ) -> WorkFailedError:
     """Return the error for a file that a library could not write.
 
-    HDF5 and netCDF do not know the reason: on a full disk they may say that permission
-    is denied. So a probe is written beside the file, and the error of the probe counts.
+    HDF5, netCDF and PyTorch do not know the reason: on a full disk netCDF may say that
+    permission is denied. So a probe is written beside the file, and the error of the
+    probe counts.
 
     Args:
         target: the file.
@@ -303,7 +309,7 @@ def explain_write_error(
         "cannot write there",
         where=str(target),
         expected="a place that can be written to",
-        got=str(error),
+        got=str(error).partition("\n")[0],
         fix=f"free disk space, or name a folder that you may write to: {option}; if "
         f"there is space, {LIMIT_FIXES[errno.EFBIG]}",
     )

@@ -60,6 +60,25 @@ WRITE_AGAIN = "write the file again; if it was copied or downloaded, compare its
 # --- opening --------------------------------------------------------------------------
 
 
+def read_beginning(path: Path, most: int) -> bytes:
+    """Return the first bytes of a file, at most so many.
+
+    Raises:
+        UnreadableFileError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return stream.read(most)
+    except OSError as error:
+        raise UnreadableFileError(
+            "cannot open the file",
+            where=str(path),
+            expected="a readable file",
+            got=error.strerror or error,
+            fix="check the path and that you may read the file",
+        ) from error
+
+
 def check_file(
     path: Path, *, longest: int | None = None, fix: str = WRITE_AGAIN
 ) -> None:
@@ -69,17 +88,7 @@ def check_file(
         UnreadableFileError: no regular file, too long, or another signature.
     """
     check_regular(path, longest=longest, fix=fix)
-    try:
-        with path.open("rb") as stream:
-            first_bytes = stream.read(FIRST_BYTES)
-    except OSError as error:
-        raise UnreadableFileError(
-            "cannot open the file",
-            where=str(path),
-            expected="a readable file",
-            got=error.strerror or error,
-            fix="check the path and that you may read the file",
-        ) from error
+    first_bytes = read_beginning(path, FIRST_BYTES)
     if not first_bytes.startswith(SIGNATURE):
         raise UnreadableFileError(
             "not an HDF5 file",

@@ -340,7 +340,7 @@ def locate_split(
             where=SPLIT_NAMED,
             expected="the name of a split, or the folder of a local one",
             got=ascii(text),
-            fix="name one, as in --split cavity; . is the split of the current folder",
+            fix="name one, as in --split cavity; --split . takes the current folder",
         )
     path = Path(os.path.abspath(expand_path(text, "--split")))
     has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}

@@ -103,11 +103,11 @@ def predict_onnx(
         subset=subset,
         root=folder,
         registry=known,
+        option="--output",
         seed=seed,
         parameters=runner.parameters,
         device=f"{processor_name()}, 1 thread",
     )
-    writer.option = "--output"
     seconds = 0.0
     with hold_output(output_path):
         # Another prediction may have written it since the first check.

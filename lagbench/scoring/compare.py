@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lagbench.arguments import check_arguments
+from lagbench.data.hdf5 import read_beginning
 from lagbench.data.layout import format_ids
 from lagbench.data.local import locate, locate_split, suggest_split_of
 from lagbench.data.registry import Registry, Size, load
@@ -871,7 +872,7 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
             examined=examine,
         )
     except (UnreadableFileError, ChecksFailedError) as error:
-        head = _read_head(path)
+        head = read_beginning(path, MAX_SCORE_BYTES)
         if isinstance(error, ChecksFailedError) and b"lagbench_scores" not in head:
             raise  # predictions that are not valid
         raise UnreadableFileError(
@@ -884,25 +885,6 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
         ) from error
     # through JSON, so that its digits are those of a scores.json
     return parse_scores(card.as_json())
-
-
-def _read_head(path: Path) -> bytes:
-    """Return as many first bytes of a file as scores take.
-
-    Raises:
-        UnreadableFileError: the file may not be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            return stream.read(MAX_SCORE_BYTES)
-    except OSError as error:
-        raise UnreadableFileError(
-            "cannot open the file",
-            where=str(path),
-            expected="a file that you may read",
-            got=error.strerror,
-            fix="see who owns it, or name another",
-        ) from error
 
 
 def _load_entry(

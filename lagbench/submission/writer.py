@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import os
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -121,6 +120,7 @@ class PredictionsWriter:
         root: folder of all data sets; read where no size is named, where the split is a
             folder of its own, or where no hash is recorded.
         registry: where splits are described; ours when None.
+        option: option or argument that names the path, for messages.
         **labels: see :meth:`label`.
 
     Raises:
@@ -142,13 +142,13 @@ class PredictionsWriter:
         dataset_sha256: str | None = None,
         root: str | Path | None = None,
         registry: Registry | None = None,
+        option: str = "path",
         **labels: Label,
     ) -> None:
         self.path = Path(path)
-        # option or argument that named the path, for messages
-        self.option = "path"
-        _refuse_address(self.path, "path")
-        _refuse_folder(self.path)
+        self._option = option
+        _refuse_address(self.path, option)
+        check_output_file(self.path, overwrite=True, option=option)
         tier, folder, _ = locate(split, size, root=root, registry=registry)
         self.size = tier.scored_on(subset)
         if dataset_sha256 is None:
@@ -225,7 +225,7 @@ class PredictionsWriter:
         self._written.clear()
         self._diverged_at.fill(NEVER)
         with ExitStack() as stack:
-            temporary = stack.enter_context(atomic_path(self.path, option=self.option))
+            temporary = stack.enter_context(atomic_path(self.path, option=self._option))
             with self._writing():
                 self._file = open_netcdf(temporary, "w")
                 stack.callback(self._abandon)
@@ -478,7 +478,7 @@ class PredictionsWriter:
         try:
             yield
         except (OSError, RuntimeError) as error:
-            raise explain_write_error(self.path, error, option=self.option) from error
+            raise explain_write_error(self.path, error, option=self._option) from error
 
 
 def _refuse_address(path: Path, option: str) -> None:
@@ -492,19 +492,6 @@ def _refuse_address(path: Path, option: str) -> None:
         expected="the path of a file",
         got=f"{path}, an address",
         fix=f"write {shlex.quote(path.name)}, then copy it there",
-    )
-
-
-def _refuse_folder(path: Path) -> None:
-    """Refuse a folder before the work, also that of an empty path."""
-    if not os.path.isdir(path):
-        return
-    raise UsageError(
-        "the output is a folder",
-        where="path",
-        expected="the name of a file",
-        got=str(path),
-        fix=f"name a file in it: {path / 'predictions.nc'}",
     )
 
 
@@ -618,6 +605,7 @@ def write(
         dataset_sha256=dataset_sha256,
         root=root,
         registry=registry,
+        option="path",
         **labels,
     )
     scenarios = sorted(writer.size.scored_scenarios)
@@ -758,8 +746,8 @@ def template(
         subset=subset,
         root=folder,
         registry=splits,
+        option="--output",
     )
-    writer.option = "--output"
     scenarios = tuple(sorted(entry.subsets[subset]))
     particle_counts = []
     with writer:

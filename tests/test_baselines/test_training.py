@@ -784,10 +784,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
     checkpoint = load(path)
     weights = checkpoint.weights | {"more": torch.ones(10**5)}
     larger = replace(checkpoint, weights=weights)
-    with (
-        largest_file(10**5),
-        pytest.raises(WorkFailedError, match="free disk space") as caught,
-    ):
+    with largest_file(10**5), pytest.raises(WorkFailedError) as caught:
         save(path, larger)
     assert "checkpoint.pt" in str(caught.value)
     names = {file.name for file in path.parent.iterdir() if file.is_file()}
