@@ -22,6 +22,24 @@ from .torch_grid import transfer
 DropoutRate = Annotated[float, Field(ge=0, lt=1)]
 
 
+class LSTMOptions(FrameNetworkOptions):
+    """Options of both LSTMs."""
+
+    in_training = FrameNetworkOptions.in_training | {"dropout", "density_weight"}
+
+    # length of the latent vector of a frame and width of both LSTM layers
+    latent: PositiveInt = 1250
+    # widths of pointwise layers before the latent one
+    encoder: tuple[PositiveInt, ...] = ()
+    # widths of hidden layers after the second LSTM layer
+    decoder: tuple[PositiveInt, ...] = (1250,)
+    # after the first and after the second LSTM layer
+    dropout: tuple[DropoutRate, DropoutRate] = (0.2, 0.1)
+    # of the density term in the loss. The thesis states none; with 1 the gradient
+    # within a cell drowns that of the positions, which then are not learned.
+    density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
+
+
 class LSTM(FrameNetwork):
     """Two frames in, the next one out (Table 4.6).
 
@@ -35,26 +53,10 @@ class LSTM(FrameNetwork):
     inputs = 2
     interleaved: ClassVar[bool] = False
 
-    class Options(FrameNetworkOptions):
-        """Options of both LSTMs."""
+    Options = LSTMOptions
+    options: LSTMOptions
 
-        in_training = FrameNetworkOptions.in_training | {"dropout", "density_weight"}
-
-        # length of the latent vector of a frame and width of both LSTM layers
-        latent: PositiveInt = 1250
-        # widths of pointwise layers before the latent one
-        encoder: tuple[PositiveInt, ...] = ()
-        # widths of hidden layers after the second LSTM layer
-        decoder: tuple[PositiveInt, ...] = (1250,)
-        # after the first and after the second LSTM layer
-        dropout: tuple[DropoutRate, DropoutRate] = (0.2, 0.1)
-        # of the density term in the loss. The thesis states none; with 1 the gradient
-        # within a cell drowns that of the positions, which then are not learned.
-        density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
-
-    options: Options
-
-    def __init__(self, options: Options, info: DatasetInfo) -> None:
+    def __init__(self, options: LSTMOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         latent = options.latent
         encoder_widths = (self.input_features, *options.encoder, latent)

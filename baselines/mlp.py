@@ -42,6 +42,16 @@ def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+class MLPOptions(FrameNetworkOptions):
+    """Options of the MLP."""
+
+    of_weights = FrameNetworkOptions.of_weights | {"activation"}
+
+    # units of each hidden layer
+    widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)
+    activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
+
+
 class MLP(FrameNetwork):
     """``z(f+1) = W_n a(... a(W_1 z(f) + b_1) ...) + b_n`` of all particles at once.
 
@@ -51,18 +61,10 @@ class MLP(FrameNetwork):
     method = "mlp"
     inputs = 1
 
-    class Options(FrameNetworkOptions):
-        """Options of the MLP."""
+    Options = MLPOptions
+    options: MLPOptions
 
-        of_weights = FrameNetworkOptions.of_weights | {"activation"}
-
-        # units of each hidden layer
-        widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)
-        activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
-
-    options: Options
-
-    def __init__(self, options: Options, info: DatasetInfo) -> None:
+    def __init__(self, options: MLPOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         inputs = self.input_features * info.particles
         widths = (inputs, *options.widths, self.features)

@@ -124,6 +124,12 @@ class Fitted(FrameModel):
         return single_precision_rows.numpy()
 
 
+class VAROptions(baseline.Options):
+    """Options of the VAR."""
+
+    lags: PositiveInt = 1  # order p
+
+
 class VAR(Fitted):
     """``z(f) = c + A_1 z(f-1) + ... + A_p z(f-p)``, by ordinary least squares.
 
@@ -136,16 +142,13 @@ class VAR(Fitted):
 
     method = "var"
 
-    class Options(baseline.Options):
-        """Options of the VAR."""
-
-        lags: PositiveInt = 1  # order p
+    Options = VAROptions
 
     precision = torch.float64
-    options: Options
+    options: VAROptions
     coefficients: Tensor
 
-    def __init__(self, options: Options, info: DatasetInfo) -> None:
+    def __init__(self, options: VAROptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         regressor_count = 1 + options.lags * self.features
         shape = (regressor_count, self.features)
@@ -183,6 +186,17 @@ class VAR(Fitted):
         return predicted.view(windows, *state_shape)
 
 
+class StableVAROptions(baseline.Options):
+    """Options of the stable VAR."""
+
+    in_training = frozenset({"ridge"})
+
+    # principal directions kept; all there are if they are fewer
+    rank: PositiveInt = 200
+    # added to the variance of each direction [standardised^2]
+    ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
+
+
 class StableVAR(Fitted):
     """``z(f) = z(f-1) + b + A' V' (z(f-1) - m)``: persistence, truncation and ridge.
 
@@ -201,24 +215,16 @@ class StableVAR(Fitted):
     method = "var-stable"
     inputs = 1
 
-    class Options(baseline.Options):
-        """Options of the stable VAR."""
-
-        in_training = frozenset({"ridge"})
-
-        # principal directions kept; all there are if they are fewer
-        rank: PositiveInt = 200
-        # added to the variance of each direction [standardised^2]
-        ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
+    Options = StableVAROptions
 
     precision = torch.float32
-    options: Options
+    options: StableVAROptions
     mean: Tensor
     drift: Tensor
     directions: Tensor
     response: Tensor
 
-    def __init__(self, options: Options, info: DatasetInfo) -> None:
+    def __init__(self, options: StableVAROptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
         features = self.features
         rank = min(options.rank, features)
