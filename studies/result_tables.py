@@ -6,15 +6,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 
-from lagbench.board.overview import (
-    LearningVerdict,
-    place_among_solvers,
-    verdict_of_interval,
-)
+from lagbench.board.overview import LearningVerdict, verdict_of_interval
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.predictor import Kind
+from lagbench.scoring.skill import AgainstClassical
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
@@ -78,8 +75,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     open_sets = []
     without_interval = []
     does_not_pay = []
-    no_verdict = []
-    places: list[str] = []  # sentences on models without a verdict beside the solvers
+    no_verdict = []  # sentences
     for results in all_results:
         model = deciding_model(results)
         if model is None:
@@ -91,8 +87,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             *against.interval, solver_costs_more=against.solver_costs_more
         )
         if verdict is LearningVerdict.NO_SOLVER:
-            no_verdict.append(results.where)
-            places += _place_of(results, model)
+            sentence = _without_verdict(results, model, against)
+            no_verdict.append(sentence)
         elif verdict is LearningVerdict.PAYS:
             pays.append(results.where)
             time_ratios.append(time_over_simulator(results, model))
@@ -125,13 +121,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             " that costs no more is more accurate than the best learned or hybrid"
             " model."
         )
-    if no_verdict:
-        sentences.append(
-            f"On {_join(no_verdict)} there is no verdict. There every classical solver"
-            " costs more than the best model, and the test does not find this model"
-            " more accurate than the cheapest solver."
-        )
-        sentences += places
+    sentences += no_verdict
     return " ".join(sentences)
 
 
@@ -190,31 +180,18 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
     return [sentence[0].upper() + sentence[1:]]
 
 
-def _place_of(results: SplitResults, model: str) -> list[str]:
-    """Return which classical solvers are better or worse than a model, in sentences."""
-    error = results.methods[model].scores[results.ranking].mean
-    behind = []
-    equal = []
-    ahead = []
-    for name in results.order(results.references):
-        method = results.methods[name]
-        if method.kind is not Kind.CLASSICAL:
-            continue
-        solver_error = method.scores[results.ranking].mean
-        if solver_error > error:
-            behind.append(label(name))
-        elif solver_error < error:
-            ahead.append(label(name))
-        else:
-            equal.append(label(name))
-    name = label(model)
-    if name[0].islower():
-        name = f"the {name}"  # a description, and no proper name
-    sentences = place_among_solvers(name, behind=behind, equal=equal, ahead=ahead)
-    if sentences:
-        first = sentences[0]
-        sentences[0] = f"On {results.where} {first[0].lower()}{first[1:]}"
-    return sentences
+def _without_verdict(
+    results: SplitResults, model: str, against: AgainstClassical
+) -> str:
+    """Return sentences on a model that costs less than every classical solver."""
+    low, high = against.interval
+    return (
+        f"On {results.where} there is no verdict. There every classical solver costs"
+        f" more than the best model ({label(model)}). The error of this model is"
+        f" {number(against.value)} of the error of the cheapest solver"
+        f" ({label(against.reference)}), with a 95 % interval from {number(low)} to"
+        f" {number(high)}."
+    )
 
 
 def _join(names: Sequence[str]) -> str:

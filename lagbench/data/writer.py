@@ -51,7 +51,7 @@ CHUNK_CACHE = 1 << 20
 """Chunk cache of a variable [bytes]; frames are written once, in order."""
 
 PARTICLES_PER_CHUNK = 1 << 17
-"""Most particles in a chunk: 1 MiB, the default chunk cache of HDF5.
+"""Most particles in a chunk: in two dimensions 1 MiB, the default chunk cache of HDF5.
 
 Larger frames have several chunks.
 """
