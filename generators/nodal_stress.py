@@ -44,6 +44,7 @@ from .transfer import (
     fixed_point_scale,
     from_fixed,
     largest,
+    masked,
     stencil,
     stepped,
 )
@@ -231,7 +232,7 @@ class NodalStress:
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        base, offset = base_node(self.weight_rows, s, p)
         scale = vec4(
             self.velocity_scale,
             self.velocity_scale,
@@ -405,7 +406,8 @@ class NodalStress:
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
         """Interpolate (v, r, Jbar), their slopes and dt a."""
-        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        lowest, offset = base_node(self.weight_rows, s, p)
+        base = masked(lowest, self.node_count)
         state = vec4(0.0)
         slope_x = vec4(0.0)
         slope_y = vec4(0.0)

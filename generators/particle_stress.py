@@ -46,6 +46,7 @@ from .transfer import (
     base_node,
     bounded,
     from_fixed,
+    masked,
     stencil,
     stepped,
 )
@@ -179,7 +180,7 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        base, offset = base_node(self.weight_rows, s, p)
         scale = vec4(
             self.velocity_scale,
             self.velocity_scale,
@@ -282,7 +283,8 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
         """Gather (v, r, Jbar) and their slopes."""
-        base, offset = base_node(self.weight_rows, s, p, self.node_count)
+        lowest, offset = base_node(self.weight_rows, s, p)
+        base = masked(lowest, self.node_count)
         state = vec4(0.0)
         slope_x = vec4(0.0)
         slope_y = vec4(0.0)

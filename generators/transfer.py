@@ -101,7 +101,7 @@ def stencil(x: vec4, inv_dx: f32, width: i32) -> Value:
 
 
 @ti.func
-def base_node(rows: Template, s: i32, p: i32, node_count: Template) -> Value:
+def base_node(rows: Template, s: i32, p: i32) -> Value:
     """Return a particle's base node and its offset from the middle node [cells].
 
     Both stand in its stencil, see :func:`stencil`.
@@ -109,7 +109,7 @@ def base_node(rows: Template, s: i32, p: i32, node_count: Template) -> Value:
     node_bits = rows[0][s, p][3]
     offset_x = rows[1][s, p][3]
     offset_y = rows[2][s, p][3]
-    base = node_number(node_bits, node_count)
+    base = ti.bit_cast(node_bits, i32)
     return base, vec2(offset_x, offset_y)
 
 
@@ -117,12 +117,22 @@ def base_node(rows: Template, s: i32, p: i32, node_count: Template) -> Value:
 def node_number(bits: f32, node_count: Template) -> Value:
     """Return the number of a node, below ``node_count``, from a float with its bits.
 
+    It is masked, see :func:`masked`.
+    """
+    number = ti.bit_cast(bits, i32)
+    return masked(number, node_count)
+
+
+@ti.func
+def masked(number: i32, node_count: Template) -> Value:
+    """Return the number of a node, below ``node_count``, with a mask on its bits.
+
     The mask changes no such number. It tells LLVM that the numbers of the neighbours do
     not overflow either: their addresses are then one address plus constants. Without it
-    each address is computed anew.
+    each address is computed anew. In two dimensions P2G is faster without the mask, and
+    G2P with it.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
-    number = ti.bit_cast(bits, i32)
     return number & mask
 
 
