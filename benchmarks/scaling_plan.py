@@ -425,9 +425,9 @@ def main() -> int:
         "A *whole generation* makes one scenario of train, one scenario of test, and "
         "the [perturbed run](../glossary.md) of the test scenario. In this measurement "
         "all three runs have the same number of frames. The column *sum of the parts* "
-        "follows from three columns of the first table: drawing and substeps for three "
-        "runs of the solver, and writing for two scenarios, because the perturbed run "
-        "is not written. A whole generation takes longer: it also imports and "
+        "is computed from the first table. It is the time of three initial states, of "
+        "three runs of the solver, and of two written files. (The perturbed run is not "
+        "written.) A whole generation takes longer: it also imports and "
         "compiles, and it writes the manifest and draws the pictures. The *client* is "
         "the process that you start; it starts the workers.",
         "",
