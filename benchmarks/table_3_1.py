@@ -229,9 +229,10 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "number of frames per second. t/frame is the time of a run with all substeps "
         f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
         f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
-        f"contains 1/{FIXED} of the time of a copy. For a frame of {2 * FIXED} "
-        f"substeps, {2 * FIXED} times t/substep contains the time of two copies, but "
-        f"t/frame contains the time of one. So these two times differ. {consequence}",
+        f"contains 1/{FIXED} of the time of a copy. Take a frame of {2 * FIXED} "
+        f"substeps. The product {2 * FIXED} x t/substep contains the time of two "
+        "copies, but t/frame contains the time of only one. So the product and t/frame "
+        f"differ. {consequence}",
         "",
     ]
 
