@@ -748,7 +748,7 @@ def attempts_on(library: Library) -> tuple[Attempt, ...]:
 def _shipped_predictor(predictors: Predictors) -> Attempt:
     return Attempt(
         name="shipped",
-        what="ballistic-analog as shipped, every fourth state",
+        what="the method `ballistic-analog`, with every fourth state",
         predict=predictors.shared,
         choices=grid(lag=(0, 5, 10, 15), analogs=(1, 2, 4)),
     )

@@ -95,7 +95,8 @@ HOW_TO_READ = """\
 - **Tables of scores** contain models and reference predictors. A cell has the mean over
   the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
   several seeds, the number after ± is the standard deviation over the seeds. For such a
-  model the leaderboard resamples the seeds too, so its intervals are wider.
+  model the leaderboard resamples the seeds too, so the intervals on
+  the leaderboard are wider than those on this page.
   "1440 undefined" means that the metric is undefined in 1440 frames. The tables of
   `fluid` and `multimaterial` leave out the metrics of the vorticity. The column
   `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
@@ -131,7 +132,8 @@ CLAIMS_NOTE = """\
 The table has one question per row, and one answer per data set. It has the data sets of
 the thesis: `cavity`, `curl-noise`, `fluid` and `multimaterial`. Tables, figures and
 sections in the questions are those of the thesis. The answers use the ranking metric
-over the horizon. These words have a fixed meaning in the answers:
+over the horizon. Tables under some questions also compare another metric of the thesis.
+The answers do not use it. These words have a fixed meaning in the answers:
 
 - "Yes" and "better" mean significantly better at 5 %. "No" and "worse" mean
   significantly worse. "Open" means that the test finds no difference.

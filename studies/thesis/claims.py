@@ -87,9 +87,8 @@ _CLAIMS = {
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
     "Is one velocity grid for all materials better for NeuralMPM than one grid per "
-    "material with at least as many training steps?": Claim(
-        "neuralmpm", ("neuralmpm-unmixed",)
-    ),
+    "material, if the model with one grid per material has at least as many training "
+    "steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
     "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
     "predicts fewer frames, and more of the windows are from the first frames?": Claim(
         "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
