@@ -27,6 +27,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from lagbench.data.fringe_region import has_fringe
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
@@ -69,8 +70,7 @@ def check_symmetry(
             images of the square where gravity or a force on layers acts, or where only
             some axes are periodic.
     """
-    has_stream = "fringe_rate" in size.parameters
-    if has_stream and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
+    if has_fringe(size) and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
         raise UsageError(
             f"the stream in {size.split} flows along x; in a mirror image it would "
             "flow backwards",

@@ -11,10 +11,22 @@ start.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["fringe_rates"]
+if TYPE_CHECKING:
+    from .registry import Size
+
+__all__ = ["fringe_rates", "has_fringe"]
+
+
+def has_fringe(size: Size) -> bool:
+    """Return whether a data set states a fringe: a rate of 0 stands for none."""
+    if "fringe_rate" not in size.parameters:
+        return False
+    return bool(size.value("fringe_rate"))
 
 
 def fringe_rates(
@@ -29,8 +41,10 @@ def fringe_rates(
         place: coordinates along x [length].
         end: coordinate at which the fringe ends [length].
         length: of the fringe [length].
-        rate: in the middle of the fringe [1/s].
+        rate: in the middle of the fringe [1/s]; 0 for no fringe, whatever the length.
     """
+    if rate == 0.0:
+        return np.zeros_like(place)
     share = np.clip((place - (end - length)) / length, 0.0, 1.0)
     rest = 1.0 - share
     return 16.0 * rate * (share * share) * (rest * rest)

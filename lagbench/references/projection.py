@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.fringe_region import has_fringe
 from lagbench.data.registry import Size
 
 from .predictor import (
@@ -47,7 +48,7 @@ def forcing_of(size: Size, obstacle: NDArray[np.floating] | None) -> Forcing | N
         obstacle: centre and radius of the body [length], shape [axis + 1]; None without
             a body.
     """
-    if obstacle is None or "fringe_rate" not in size.parameters:
+    if obstacle is None or not has_fringe(size):
         return None
     stream = np.zeros(size.dimension)
     stream[0] = float(size.value("speed"))
