@@ -21,7 +21,7 @@ import pytest
 import torch
 from file_size_limit import largest_file
 from scipy.special import comb
-from simple_models import INFO, Drift, read_training_log, trainer
+from simple_models import INFO, Drift, read_folder, read_training_log, trainer
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load, save
@@ -374,15 +374,6 @@ def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) 
     assert checkpoint.training["step"] == 4
     assert torch.isfinite(checkpoint.weights["a"]).all()
     assert read_training_log(tmp_path / "run")["state"] == "failed"
-
-
-def read_folder(folder: Path) -> dict[str, bytes]:
-    """Return the content of all files below a folder."""
-    contents = {}
-    for path in folder.rglob("*"):
-        if path.is_file():
-            contents[str(path.relative_to(folder))] = path.read_bytes()
-    return contents
 
 
 def test_a_fresh_training_that_fails_at_once_leaves_the_earlier_one(run: Run) -> None:
