@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Sampler
 
 from lagbench.atomic import check_writable
 from lagbench.data.contents import check_contents
+from lagbench.data.layout import expand_home
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
@@ -318,7 +319,7 @@ def _open_folder(
         if initial is not None:
             name += "-further"
         output = Path("runs") / recipe.name / f"{name}-{recipe.training.seed}"
-    folder = RunFolder(Path(output))
+    folder = RunFolder(expand_home(output))
     check_writable(folder.path, option="--output")
     if initial is not None and folder.holds(initial.path):
         raise UsageError(

@@ -165,6 +165,7 @@ def trainer(
             "root": root,
             "split": "curl-noise",
             "registry": registry,
+            "output": folder / to,
         }
         full_settings = []
         for setting in settings:
@@ -176,7 +177,6 @@ def trainer(
             baseline,
             size="tiny",
             settings=tuple(full_settings),
-            output=folder / to,
             threads=1,
             **(defaults | options),
         )

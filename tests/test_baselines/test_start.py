@@ -264,6 +264,34 @@ def test_a_fresh_training_keeps_its_start_where_every_step_is_worse(
     assert read_training_log(fresh.folder)["validation"] == of_alone_log
 
 
+def test_trainings_and_predictions_may_lie_in_the_home_folder(
+    run: Run,
+    stored: Callable[..., Path],
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As other files that functions of the package write; no folder named ~ appears."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    start = stored()
+    result = run("any", *STILL, start=f"~/{start.name}", output="~/trained")
+    assert result.weights == tmp_path / "trained" / "weights.pt"
+    prediction = predict(
+        "~/trained/weights.pt",
+        "~/made.nc",
+        root=generated.root,
+        registry=unmeasured,
+        threads=1,
+    )
+    assert prediction.path == tmp_path / "made.nc"
+    assert prediction.path.is_file()
+    assert list(here.iterdir()) == []
+
+
 def test_the_record_counts_the_hours_before_the_start(
     run: Run,
     stored: Callable[..., Path],
