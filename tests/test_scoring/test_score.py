@@ -29,7 +29,7 @@ from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.published_scores import read_scores
-from lagbench.scoring.score import score, scores_folder
+from lagbench.scoring.score import scores_folder
 from lagbench.scoring.score_file_checks import read_published_scores
 from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.tables import flag_lines
@@ -267,7 +267,7 @@ def test_predictions_and_scores_may_lie_in_the_home_folder(
     shutil.copy(predictions, tmp_path / "mine.nc")
     places = {None: tmp_path / "mine", "~/scores": tmp_path / "scores"}
     for output_dir, folder in places.items():
-        card = score(
+        card = scoring.score(
             "~/mine.nc", root=bench.root, registry=bench.registry, output_dir=output_dir
         )
         assert [path.parent for path in card.files] == [folder, folder]
