@@ -27,7 +27,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from lagbench.data.fringe_region import has_fringe
 from lagbench.data.registry import Size
 from lagbench.errors import UsageError
 from lagbench.tensors import Batch, TensorBox
@@ -70,7 +69,7 @@ def check_symmetry(
             images of the square where gravity or a force on layers acts, or where only
             some axes are periodic.
     """
-    if has_fringe(size) and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
+    if size.has_fringe and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
         raise UsageError(
             f"the stream in {size.split} flows along x; in a mirror image it would "
             "flow backwards",

@@ -37,7 +37,6 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from lagbench.data.box import Box, keep_outside
-from lagbench.data.fringe_region import has_fringe
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UsageError
@@ -609,7 +608,7 @@ def _find_channel(info: DatasetInfo) -> Size | None:
     if split is None or info.size not in split.sizes:
         return None
     size = registry.size(info.split, info.size)
-    if not has_fringe(size):
+    if not size.has_fringe:
         return None
     return size
 

@@ -11,22 +11,10 @@ start.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .registry import Size
-
-__all__ = ["fringe_rates", "has_fringe"]
-
-
-def has_fringe(size: Size) -> bool:
-    """Return whether a data set states a fringe: a rate of 0 stands for none."""
-    if "fringe_rate" not in size.parameters:
-        return False
-    return bool(size.value("fringe_rate"))
+__all__ = ["fringe_rates"]
 
 
 def fringe_rates(

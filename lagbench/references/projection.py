@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.fringe_region import has_fringe
 from lagbench.data.registry import Size
 
 from .predictor import (
@@ -48,7 +47,7 @@ def forcing_of(size: Size, obstacle: NDArray[np.floating] | None) -> Forcing | N
         obstacle: centre and radius of the body [length], shape [axis + 1]; None without
             a body.
     """
-    if obstacle is None or not has_fringe(size):
+    if obstacle is None or not size.has_fringe:
         return None
     stream = np.zeros(size.dimension)
     stream[0] = float(size.value("speed"))
