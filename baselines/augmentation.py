@@ -69,8 +69,7 @@ def check_symmetry(
             images of the square where gravity or a force on layers acts, or where only
             some axes are periodic.
     """
-    has_stream = "fringe_rate" in size.parameters
-    if has_stream and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
+    if size.has_fringe and symmetry in (Symmetry.MIRROR, Symmetry.SQUARE):
         raise UsageError(
             f"the stream in {size.split} flows along x; in a mirror image it would "
             "flow backwards",

@@ -608,7 +608,7 @@ def _find_channel(info: DatasetInfo) -> Size | None:
     if split is None or info.size not in split.sizes:
         return None
     size = registry.size(info.split, info.size)
-    if "fringe_rate" not in size.parameters:
+    if not size.has_fringe:
         return None
     return size
 

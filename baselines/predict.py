@@ -20,6 +20,7 @@ from typing import Any
 import torch
 
 from lagbench.atomic import check_output_file, write_atomically
+from lagbench.data.layout import expand_home
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
@@ -159,15 +160,15 @@ def predict(
             writes the same output.
     """
     _check_batch(batch)
-    checkpoint_path = Path(checkpoint)
-    trained = load(checkpoint)
-    output_path = Path(output)
+    checkpoint_path = expand_home(checkpoint, "checkpoint")
+    trained = load(checkpoint_path)
+    output_path = expand_home(output)
     check_outputs(output_path, overwrite=overwrite)
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = _find_root(split, trained, root, registry)
     known_splits = load_rooted_registry(root_folder, registry)
-    where = str(checkpoint)
+    where = str(checkpoint_path)
     info = check_data(
         trained, root=root_folder, registry=known_splits, size=size, where=where
     )
@@ -190,7 +191,7 @@ def predict(
         label = method or model.method
         hardware_label = _describe_hardware(machine)
         writer = PredictionsWriter(
-            output,
+            output_path,
             split=info.split,
             size=info.size,
             method=label,

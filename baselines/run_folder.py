@@ -202,6 +202,17 @@ class RunFolder:
             return (step, steps)
         return None
 
+    def has_log_of(self, training: Mapping[str, Any]) -> bool:
+        """Return whether training.json is the log of a training that is over.
+
+        Args:
+            training: the log in its checkpoint.
+        """
+        log = self._read_log()
+        is_same = log.get("recipe") == training.get("recipe")
+        has_all_steps = log.get("step") == training.get("step")
+        return is_same and has_all_steps and log.get("state") in OVER
+
     def _read_log(self) -> dict[str, Any]:
         """Return the content of training.json; nothing where there is no log."""
         try:

@@ -17,6 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import Budget
@@ -121,7 +122,7 @@ def start_from(
             got=str(path),
             fix="leave the option out",
         )
-    file = Path(path)
+    file = expand_home(path, WHERE)
     checkpoint, sha256 = _load_and_hash(file)
     _check_same("baseline", entry.name, checkpoint.baseline)
     _check_same("split", size.split, checkpoint.info.split)

@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Sampler
 
 from lagbench.atomic import check_writable
 from lagbench.data.contents import check_contents
+from lagbench.data.layout import expand_home
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
@@ -112,6 +113,10 @@ class UnseenForcingWarning(UserWarning):
     """A model is trained that does not see what drives the flow."""
 
 
+class DamagedLogWarning(UserWarning):
+    """A training is over, and training.json is not its log."""
+
+
 def train(
     baseline: str,
     split: str,
@@ -159,7 +164,8 @@ def train(
         registry: where splits are described; ours when None.
 
     An :class:`UnseenForcingWarning` tells of a force or an obstacle that the model does
-    not see.
+    not see, a :class:`DamagedLogWarning` of a training.json beside a training that was
+    over before.
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
@@ -247,7 +253,29 @@ def _train_model(job: TrainingJob, model: Baseline) -> TrainingResult:
             raise KeyboardInterrupt(advice) from None
     else:
         log, steps = descend(job, model)
-    return _result(job, model, log, steps)
+    result = _result(job, model, log, steps)
+    if job.earlier is not None and result.first_step == result.step:
+        _warn_of_damaged_log(job)
+    return result
+
+
+def _warn_of_damaged_log(job: TrainingJob) -> None:
+    """Warn where training.json is not the log of a training that was over before.
+
+    It is not written anew: hardware and versions of the training may be others than
+    those of today.
+    """
+    if is_helper() or job.earlier is None:
+        return
+    folder = job.folder
+    if folder.has_log_of(job.earlier.training):
+        return
+    message = (
+        f"{folder.log} is missing, damaged, or not the log of the finished training "
+        "beside it; the weights are unharmed: restore the file from a copy, or train "
+        "anew with --fresh"
+    )
+    warnings.warn(message, DamagedLogWarning, stacklevel=4)
 
 
 def _warn_of_unseen_forcing(model: Baseline, size: Size, root: Path) -> None:
@@ -291,7 +319,7 @@ def _open_folder(
         if initial is not None:
             name += "-further"
         output = Path("runs") / recipe.name / f"{name}-{recipe.training.seed}"
-    folder = RunFolder(Path(output))
+    folder = RunFolder(expand_home(output))
     check_writable(folder.path, option="--output")
     if initial is not None and folder.holds(initial.path):
         raise UsageError(

@@ -27,7 +27,7 @@ from torch.utils.tensorboard import SummaryWriter
 from lagbench.errors import WorkFailedError
 from lagbench.tensors import Batch, TensorWindow
 
-from .checkpoint import load, round_weights
+from .checkpoint import Checkpoint, load, round_weights
 from .job import TrainingJob
 from .machine import multiplies_bfloat16, return_memory
 from .optimisation import TOTAL, Optimisation
@@ -133,6 +133,8 @@ class TrainingLoop:
         self._interrupts = Interrupts()
         self._uses_bfloat16 = uses_bfloat16(job)
         self._is_over = False
+        # best weights so far that are not written yet
+        self._start_weights: Checkpoint | None = None
         self._tensorboard: SummaryWriter | None = None
 
     def run(self, loader: Loader) -> None:
@@ -171,8 +173,10 @@ class TrainingLoop:
         model.train()
         if self.validation is not None and self._starts_from_weights():
             self._validate(self.validation)
-            # No training could go on from weights without a checkpoint.
-            self._store()
+            # No training could go on from weights without a checkpoint. Weights of
+            # others replace no earlier training.
+            if not self.job.folder.has_earlier_files:
+                self._store()
 
         for batch in loader(fabric.global_rank, fabric.world_size):
             self._make_step(forward, batch.to(fabric.device))
@@ -289,11 +293,21 @@ class TrainingLoop:
         return self.optimisation.step % every == 0
 
     def _publish(self) -> None:
-        """Write the weights to predict from."""
+        """Write the weights to predict from.
+
+        Those of the start wait for the first :meth:`_store` where an earlier training
+        lies in the folder.
+        """
+        folder = self.job.folder
         with self.optimisation.use_mean():
             weights = round_weights(self.optimisation.model)
+            if self.log.step == 0 and folder.has_earlier_files:
+                copies = {name: value.clone() for name, value in weights.items()}
+                self._start_weights = self.job.checkpoint(self.log, copies)
+                return
             checkpoint = self.job.checkpoint(self.log, weights)
-            self.job.folder.save(self.job.folder.weights, checkpoint)
+            folder.save(folder.weights, checkpoint)
+        self._start_weights = None
 
     def _store(self) -> None:
         """Write checkpoint and log.
@@ -316,6 +330,9 @@ class TrainingLoop:
         for value in weights.values():
             if not torch.isfinite(value).all():
                 raise self.optimisation.not_finite()
+        if self._start_weights is not None:
+            folder.save(folder.weights, self._start_weights)
+            self._start_weights = None
         self._read_clocks()
         optimizer_state = self.optimisation.optimizer.state_dict()
         checkpoint = self.job.checkpoint(self.log, weights, optimizer_state)

@@ -4,7 +4,8 @@
 
 prints the metric that ranks, for the named entries (mean over their seeds) and for the
 reference predictors of a split: the mean over the test scenarios of each set of
-materials, and over all. Data are read for the materials alone.
+materials, and over all. Scenarios without a value do not count; a mean of none is nan.
+Data are read for the materials alone.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.figures.tables import markdown
+from lagbench.metrics.aggregate import mean_over_seeds
+from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped
 from lagbench.scoring.score_file_checks import read_published_scores
@@ -58,11 +61,8 @@ def main() -> int:
     lines = []
     for method, values in values_by_method.items():
         cells = [method]
-        for name in names:
-            is_kind = kinds == name
-            mean = np.mean(values[is_kind])
-            cells.append(f"{mean:.4f}")
-        cells.append(f"{np.mean(values):.4f}")
+        for kind_mean in means_by_kind(values, kinds):
+            cells.append(f"{kind_mean:.4f}")
         lines.append(cells)
     print(markdown(heads, lines))
     return 0
@@ -81,7 +81,10 @@ def read_kinds(size: Size, root: Path) -> list[str]:
 
 
 def read_values(size: Size, method: str, metric: str) -> NDArray[np.float64]:
-    """Return a metric of an entry, the mean over its seeds, shape [scenario]."""
+    """Return a metric of an entry, the mean over its seeds, shape [scenario].
+
+    Seeds without a value do not count.
+    """
     folder = BOARD / "scores" / size.split / size.name
     seed_files = []
     methods = set()
@@ -104,8 +107,22 @@ def read_values(size: Size, method: str, metric: str) -> NDArray[np.float64]:
         published = read_published_scores(path)
         score = published.scores["submission"][metric]
         seeds.append(score.values)
-    mean = np.mean(seeds, axis=0)
-    return np.asarray(mean)
+    return mean_over_seeds(seeds)
+
+
+def means_by_kind(values: NDArray[np.float64], kinds: NDArray[np.str_]) -> list[float]:
+    """Return the mean over the scenarios of each kind, then that over all.
+
+    Args:
+        values: a metric of a method, shape [scenario]; NaN does not count.
+        kinds: materials of the scenarios, shape [scenario].
+    """
+    means = []
+    for name in np.unique(kinds):
+        is_kind = kinds == name
+        means.append(mean(values[is_kind]))
+    means.append(mean(values))
+    return means
 
 
 if __name__ == "__main__":

@@ -542,6 +542,8 @@ class Predictors:
                     count=1,
                     without=case.without,
                 )
+                if not analogs:
+                    return self._fly(case)
                 path = self._paths(case, analogs[0], position, everybody)
             cloud = path(steps - start)
             clouds[frame] = box.inside(cloud)
@@ -568,6 +570,8 @@ class Predictors:
         chosen, _ = find_nearest_states(
             starts, feature, count=count, without=case.without
         )
+        if not chosen:
+            return self._fly(case)
         followers = []
         everybody = np.arange(len(position))
         for number, state in enumerate(chosen):

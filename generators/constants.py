@@ -70,8 +70,8 @@ LIMITS = {
     "force_layers": Limit(low=0, whole=True),
     "substeps_per_frame": Limit(low=1, whole=True),
     "obstacle_particles": Limit(low=0, whole=True),
-    "fringe_length": _POSITIVE,
-    "fringe_rate": _POSITIVE,
+    "fringe_length": _NOT_NEGATIVE,
+    "fringe_rate": _NOT_NEGATIVE,
     "dt": _POSITIVE,
     "density": _POSITIVE,
     "modulus": _POSITIVE,
@@ -120,6 +120,10 @@ def check_constants(
             _check_value(field, values, size)
         elif field.default is MISSING:
             raise _missing_parameter(field.name, kind, size)
+    has_fringe = bool(values.get("fringe_rate", 0.0))
+    fringe_length = values.get("fringe_length", 0.0)
+    if has_fringe and not _POSITIVE.holds(fringe_length):
+        raise _impossible_value("fringe_length", fringe_length, str(_POSITIVE), size)
 
 
 def place_of(size: Size) -> str:
@@ -166,13 +170,20 @@ def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) ->
         is_possible = limit.holds(value)
         expected = str(limit)
     if not is_possible:
-        raise UnreadableFileError(
-            "a parameter has no possible value",
-            where=f"{place_of(size)}, parameter {field.name}",
-            expected=expected,
-            got=repr(value),
-            fix="correct it in the file of the split",
-        )
+        raise _impossible_value(field.name, value, expected, size)
+
+
+def _impossible_value(
+    name: str, value: object, expected: str, size: Size
+) -> UnreadableFileError:
+    """Return the error for a parameter that a solver cannot use."""
+    return UnreadableFileError(
+        "a parameter has no possible value",
+        where=f"{place_of(size)}, parameter {name}",
+        expected=expected,
+        got=repr(value),
+        fix="correct it in the file of the split",
+    )
 
 
 @contextmanager

@@ -66,8 +66,6 @@ class FullBoxParameters:
         Args:
             place: coordinates along x [length].
         """
-        if self.fringe_rate == 0.0:
-            return np.zeros_like(place)
         return fringe_rates(
             place,
             end=self.box.high[0],

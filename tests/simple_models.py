@@ -165,6 +165,7 @@ def trainer(
             "root": root,
             "split": "curl-noise",
             "registry": registry,
+            "output": folder / to,
         }
         full_settings = []
         for setting in settings:
@@ -176,7 +177,6 @@ def trainer(
             baseline,
             size="tiny",
             settings=tuple(full_settings),
-            output=folder / to,
             threads=1,
             **(defaults | options),
         )
@@ -347,6 +347,15 @@ def greatest_difference(first: Tensor, second: Tensor) -> float:
     """Return the greatest difference of two tensors, in absolute value."""
     difference = first - second
     return float(difference.abs().max())
+
+
+def read_folder(folder: Path) -> dict[str, bytes]:
+    """Return the content of all files below a folder."""
+    contents = {}
+    for path in folder.rglob("*"):
+        if path.is_file():
+            contents[str(path.relative_to(folder))] = path.read_bytes()
+    return contents
 
 
 def read_training_log(folder: Path) -> dict[str, Any]:

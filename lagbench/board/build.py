@@ -41,7 +41,7 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
-from lagbench.scoring.boards import board_option
+from lagbench.scoring.boards import advise_board_check
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
     read_score_file,
@@ -426,8 +426,8 @@ def _require_present(board: Folder, score_path: Path, *, entry: Path) -> None:
         where=str(file),
         expected=f"the file that {entry} names",
         got="no such file",
-        fix="restore it, or submit the predictions again; lagbench leaderboard "
-        f"check{board_option(board.path)} lists all that is wrong",
+        fix="restore it, or submit the predictions again; "
+        f"{advise_board_check(board.path)}",
     )
 
 
@@ -509,14 +509,12 @@ def _require_possible(board: Folder, path: Path, score_file: ScoreFile) -> None:
     """Refuse a score file with values that no prediction can have."""
     impossible = next(find_impossible_values(score_file), None)
     if impossible is not None:
-        folder = shlex.quote(str(board.path))
         raise UnreadableFileError(
             "impossible scores",
             where=str(board.path / path),
             expected="scores that a prediction can have",
             got=impossible,
-            fix=f"lagbench leaderboard check --board {folder} lists every faulty file; "
-            "submit the predictions again",
+            fix=f"submit the predictions again; {advise_board_check(board.path)}",
         )
 
 

@@ -27,7 +27,7 @@ from lagbench.errors import (
     suggest_file,
     suggest_name,
 )
-from lagbench.scoring.boards import board_option
+from lagbench.scoring.boards import advise_board_check
 from lagbench.submission.issues import quote
 
 from .entry import Entry, Meta, Status, Weights
@@ -341,8 +341,7 @@ def require_unchanged_model(folder: Folder, weights: Weights) -> Path:
             where=str(path),
             expected=f"SHA-256 {weights.sha256[:16]}",
             got="another file, or none",
-            fix="restore the file; lagbench leaderboard "
-            f"check{board_option(folder.path)} lists all that is wrong",
+            fix=f"restore the file; {advise_board_check(folder.path)}",
         )
     return path
 

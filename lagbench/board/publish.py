@@ -68,7 +68,8 @@ class SubmitResult:
     board: Path
     # files that were written; verified.yaml, where the entry before had a line there
     files: tuple[Path, ...]
-    kept: tuple[Path, ...]  # weights of the entry before that are those of this one
+    # scores, weights and training logs of the entry before that are those of this one
+    kept: tuple[Path, ...]
     removed: tuple[Path, ...]  # files that only the entry before had
 
 
@@ -139,7 +140,7 @@ def publish(
         entry,
         board=folder.path,
         written=(*written, *references),
-        kept=_find_kept_weights(entry, moves, folder),
+        kept=_find_kept_files(entry, moves, removed, folder),
         removed=removed,
     )
 
@@ -389,16 +390,23 @@ def _find_files_to_remove(
     return tuple(whole_paths)
 
 
-def _find_kept_weights(
-    entry: Entry, moves: Mapping[Path, Path], folder: Folder
+def _find_kept_files(
+    entry: Entry,
+    moves: Mapping[Path, Path],
+    removed: Sequence[Path],
+    folder: Folder,
 ) -> tuple[Path, ...]:
+    """Return the files of the entry that stay as they are, by their whole paths.
+
+    Not all weights have a training log.
+    """
     kept_paths = []
-    for prediction in entry.predictions:
-        weights = prediction.weights
-        if weights is None or weights.shared_with is not None:
+    for path in entry.files:
+        whole_path = folder.path / path
+        if path in moves or whole_path in removed:
             continue
-        if Path(weights.path) not in moves:
-            kept_paths.append(folder.path / weights.path)
+        if os.path.lexists(whole_path):
+            kept_paths.append(whole_path)
     return tuple(kept_paths)
 
 

@@ -29,7 +29,7 @@ from lagbench.metrics.table import METRICS, select
 from lagbench.references.predictor import given_in
 from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.boards import board_option
+from lagbench.scoring.boards import advise_board_check, board_option
 from lagbench.scoring.references import check_train
 from lagbench.scoring.scenario import measure_rows, predict_reference
 from lagbench.scoring.score_file_checks import read_score_file
@@ -377,7 +377,7 @@ class _SeasonRun:
                 where=str(entry.score_paths[index]),
                 expected=data_set.metric,
                 got="scenarios without a value",
-                fix="lagbench leaderboard check says what is wrong with the entry",
+                fix=advise_board_check(self.folder.path),
             )
         wanted = dict(list(hashes.items())[: frozen.scenarios])
         # entries may share a model and still predict otherwise

@@ -29,8 +29,10 @@ def fringe_rates(
         place: coordinates along x [length].
         end: coordinate at which the fringe ends [length].
         length: of the fringe [length].
-        rate: in the middle of the fringe [1/s].
+        rate: in the middle of the fringe [1/s]; 0 for no fringe, whatever the length.
     """
+    if rate == 0.0:
+        return np.zeros_like(place)
     share = np.clip((place - (end - length)) / length, 0.0, 1.0)
     rest = 1.0 - share
     return 16.0 * rate * (share * share) * (rest * rest)

@@ -352,6 +352,13 @@ class Size(BaseModel):
             )
         return self.parameters[name].value
 
+    @property
+    def has_fringe(self) -> bool:
+        """Whether a fringe draws the fluid to a stream: a rate of 0 stands for none."""
+        if "fringe_rate" not in self.parameters:
+            return False
+        return bool(self.value("fringe_rate"))
+
     def viscosity(self, stated: float | None = None) -> float | None:
         """Return the kinematic viscosity that a model is given [length^2/s].
 

@@ -290,8 +290,11 @@ def _is_clear(box: LabelBox, dot: Point, others: Sequence[Point]) -> bool:
 def _points_of_line(start: Point, end: Point) -> list[Point]:
     """Return points along the line from the rim of a dot to a label."""
     length = math.dist(start, end)
+    first_step = math.ceil(DOT_RADIUS / STEP)
+    # the last point lies on the end, also where rounding makes the line too short
+    last_step = math.floor(length / STEP + 1e-6)
     points = []
-    for step in range(math.ceil(DOT_RADIUS / STEP), int(length / STEP) + 1):
+    for step in range(first_step, last_step + 1):
         share = step * STEP / length
         x = start[0] + share * (end[0] - start[0])
         y = start[1] + share * (end[1] - start[1])

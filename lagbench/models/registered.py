@@ -14,6 +14,7 @@ from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.recipe import validate_options
 from lagbench.baselines.safetensors_file import SUFFIX
+from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 
@@ -76,7 +77,7 @@ def export_safetensors(
             architecture, or the file is longer than an entry may carry.
         WorkFailedError: the file cannot be written.
     """
-    target = Path(path)
+    target = expand_home(path, "export_safetensors, path")
     if target.suffix != SUFFIX:
         raise UsageError(
             "a file of safetensors needs its suffix",

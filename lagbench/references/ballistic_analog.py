@@ -136,14 +136,15 @@ def frames_of_flight(given: Given) -> int:
     body = label_bodies(given.last, radius, given.box)
     low = given.box.lower_walls + 1e-9
     high = given.box.upper_walls - 1e-9
-    for frames_on in range(1, len(given.predicted_frames)):
+    horizon = len(given.predicted_frames)
+    for frames_on in range(1, horizon + 1):
         position = ballistic_positions(given, frames_on)
         on_wall = ((position <= low) | (position >= high)).any(axis=1)
         if on_wall.mean() > CONTACT_SHARE or bodies_touch(
             position, body, radius, given.box
         ):
             return frames_on - 1
-    return len(given.predicted_frames)
+    return horizon
 
 
 Division = Callable[[Floats, int], list[NDArray[np.intp]]]

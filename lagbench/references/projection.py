@@ -47,7 +47,7 @@ def forcing_of(size: Size, obstacle: NDArray[np.floating] | None) -> Forcing | N
         obstacle: centre and radius of the body [length], shape [axis + 1]; None without
             a body.
     """
-    if obstacle is None or "fringe_rate" not in size.parameters:
+    if obstacle is None or not size.has_fringe:
         return None
     stream = np.zeros(size.dimension)
     stream[0] = float(size.value("speed"))

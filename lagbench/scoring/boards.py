@@ -61,6 +61,16 @@ def board_option(board: str | Path) -> str:
     return f" --board {shlex.quote(str(board))}"
 
 
+def advise_board_check(board: str | Path) -> str:
+    """Return which command lists the faults of a leaderboard, for errors.
+
+    >>> advise_board_check("trial")
+    'lagbench leaderboard check --board trial lists all that is wrong'
+    """
+    option = board_option(board)
+    return f"lagbench leaderboard check{option} lists all that is wrong"
+
+
 def is_board(folder: Path) -> bool:
     """Return whether a folder has entries, or room for them."""
     return (folder / SUBMISSIONS).is_dir()

@@ -338,6 +338,7 @@ class _Redirections(urllib.request.HTTPRedirectHandler):
         try:
             return super().http_error_302(req, fp, code, msg, headers)
         except (ValueError, http.client.InvalidURL) as error:
+            fp.close()
             raise NotDataError(
                 "the store leads to no address",
                 where=req.full_url,

@@ -14,7 +14,7 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import Drift, read_training_log, trainer
+from simple_models import Drift, read_folder, read_training_log, trainer
 
 from lagbench.baselines.baseline import DatasetInfo
 from lagbench.baselines.checkpoint import Checkpoint, load, save
@@ -211,6 +211,85 @@ def test_the_start_weights_stay_best_where_every_step_is_worse(
                 start=start,
                 to="bad",
             )
+
+
+def test_a_fresh_training_that_makes_no_step_leaves_the_earlier_one(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
+    """The weights that it starts from are validated, and are nothing of its own: no
+    file of the earlier training changes, whether the first step fails or a user stops
+    after it.
+    """
+    earlier = run("any", "steps=2")
+    before = read_folder(earlier.folder)
+    start = stored()
+    with pytest.raises(WorkFailedError):
+        run("any", "model.fail_at=1", "steps=2", start=start, fresh=True)
+    assert read_folder(earlier.folder) == before
+
+    def stop(news: Progress) -> None:
+        if news.stage != "predicting" and news.done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run("any", "steps=90", start=start, fresh=True, progress=stop)
+    assert read_folder(earlier.folder) == before
+
+
+def test_a_fresh_training_keeps_its_start_where_every_step_is_worse(
+    run: Run,
+    stored: Callable[..., Path],
+) -> None:
+    """Its files are those of a training in an empty folder."""
+    start = stored()
+    settings = ("steps=4", "learning_rate=100.0", "validate_every=2")
+    alone = run("any", *settings, start=start, to="alone")
+    run("any", "steps=2", to="used")
+    fresh = run("any", *settings, start=start, to="used", fresh=True)
+    assert fresh.best_step == alone.best_step == 0
+    for name in ("weights.pt", "checkpoint.pt"):
+        of_fresh = load(fresh.folder / name)
+        of_alone = load(alone.folder / name)
+        assert of_fresh.weights.keys() == of_alone.weights.keys()
+        for key, value in of_alone.weights.items():
+            assert torch.equal(of_fresh.weights[key], value)
+        assert of_fresh.training["step"] == of_alone.training["step"]
+        steps_of_budgets = (
+            of_fresh.training["budget"]["steps"],
+            of_alone.training["budget"]["steps"],
+        )
+        assert steps_of_budgets == (4, 4)
+    of_alone_log = read_training_log(alone.folder)["validation"]
+    assert read_training_log(fresh.folder)["validation"] == of_alone_log
+
+
+def test_trainings_and_predictions_may_lie_in_the_home_folder(
+    run: Run,
+    stored: Callable[..., Path],
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As other files that functions of the package write; no folder named ~ appears."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    start = stored()
+    result = run("any", *STILL, start=f"~/{start.name}", output="~/trained")
+    assert result.weights == tmp_path / "trained" / "weights.pt"
+    prediction = predict(
+        "~/trained/weights.pt",
+        "~/made.nc",
+        root=generated.root,
+        registry=unmeasured,
+        threads=1,
+    )
+    assert prediction.path == tmp_path / "made.nc"
+    assert prediction.path.is_file()
+    assert list(here.iterdir()) == []
 
 
 def test_the_record_counts_the_hours_before_the_start(

@@ -21,14 +21,19 @@ import pytest
 import torch
 from file_size_limit import largest_file
 from scipy.special import comb
-from simple_models import INFO, Drift, read_training_log, trainer
+from simple_models import INFO, Drift, read_folder, read_training_log, trainer
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load, save
 from lagbench.baselines.optimisation import Optimisation
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.run_folder import RunFolder
-from lagbench.baselines.train import StepBatches, TrainingResult, train
+from lagbench.baselines.train import (
+    DamagedLogWarning,
+    StepBatches,
+    TrainingResult,
+    train,
+)
 from lagbench.data.registry import Registry
 from lagbench.errors import (
     DataError,
@@ -376,15 +381,6 @@ def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) 
     assert read_training_log(tmp_path / "run")["state"] == "failed"
 
 
-def read_folder(folder: Path) -> dict[str, bytes]:
-    """Return the content of all files below a folder."""
-    contents = {}
-    for path in folder.rglob("*"):
-        if path.is_file():
-            contents[str(path.relative_to(folder))] = path.read_bytes()
-    return contents
-
-
 def test_a_fresh_training_that_fails_at_once_leaves_the_earlier_one(run: Run) -> None:
     """No file of it changes, and none is added."""
     earlier = run("drift", "steps=2")
@@ -713,6 +709,27 @@ def test_weights_beside_a_damaged_log_are_not_replaced(
         run("drift", "steps=1")
     assert str(caught.value.where).endswith("/run")
     assert run("drift", "steps=2", fresh=True).step == 2
+
+
+@pytest.mark.parametrize("baseline", ["drift", "var"])
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"state": "running"}', None])
+def test_the_lost_log_of_a_finished_training_is_told(
+    run: Run, baseline: str, content: bytes | None
+) -> None:
+    """The same command again changes no file, and warns of the log alone."""
+    first = run(baseline)
+    log = first.folder / "training.json"
+    if content is None:
+        log.unlink()
+    else:
+        log.write_bytes(content)
+    before = read_folder(first.folder)
+    with pytest.warns(DamagedLogWarning, match="training.json"):
+        again = run(baseline)
+    assert again.state == "finished"
+    assert read_folder(first.folder) == before
+    run(baseline, fresh=True)
+    run(baseline)  # without a warning, which would be an error
 
 
 def test_a_damaged_checkpoint_is_no_dead_end(run: Run) -> None:

@@ -282,11 +282,13 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> No
         again = submitted(own, first, weights=weights, replace=True)
         assert kept_files(own) == before
         assert again.removed == ()
+        assert {file, record} <= {*again.kept, *again.files}
         assert_sound(own)
     # new weights without a record leave none of the old
     (first / "training.json").unlink()
     without_record = submitted(own, first, replace=True)
     assert without_record.removed == (record,)
+    assert without_record.kept == ()
     assert list(kept_files(own)) == ["drift_0.pt"]
     assert_sound(own)
     other = trained(own, 0, share=0.3)
@@ -933,6 +935,15 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
         "drift_5.json",
         "drift_5.nc",
         "drift_5.pt",
+    ]
+    kept_names = sorted(path.name for path in result.kept)
+    assert kept_names == [
+        "drift_0.json",
+        "drift_0.nc",
+        "drift_0.pt",
+        "drift_3.json",
+        "drift_3.nc",
+        "drift_3.pt",
     ]
     scores_of_one_seed = own.folder / "scores/cavity/tiny/drift.nc"
     assert not scores_of_one_seed.exists()

@@ -17,11 +17,13 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lagbench.baselines.augmentation import check_symmetry
 from lagbench.data import registry
 from lagbench.data.box import Box
 from lagbench.data.limits import NEEDED, SUBSETS, Limit, check_frames, check_parameters
@@ -30,9 +32,11 @@ from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.generators.batch import draw_initial_state
-from lagbench.generators.constants import LIMITS
+from lagbench.generators.constants import LIMITS, solver_constants
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
+from lagbench.references.projection import forcing_of
 
 SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
 LARGE_RELATIVES = (
@@ -482,6 +486,48 @@ def test_a_solver_that_cannot_be_fed_is_refused_before_work(
         assert file.is_dir() or file.name.startswith(".lock")
     regenerate = partial(verify, "fluid", "tiny", regenerate=1, **options)
     refused(path, parts, regenerate)
+
+
+def with_fringe(length: float | None, rate: float) -> Change:
+    """Return a change that states a fringe of poiseuille, perhaps without a length."""
+
+    def change(splits: dict[str, Any]) -> None:
+        values = {"fringe_rate": rate}
+        if length is not None:
+            values["fringe_length"] = length
+        for name, value in values.items():
+            splits["poiseuille"]["parameters"][name] = {
+                "value": value,
+                "unit": "1",
+                "description": "of the fringe",
+            }
+
+    return change
+
+
+@pytest.mark.parametrize("length", [None, 0.0, 0.2])
+def test_a_rate_of_zero_stands_for_no_fringe(
+    tmp_path: Path, length: float | None
+) -> None:
+    """The solver has its own constants, and references and models see no stream."""
+    path = edited(tmp_path, with_fringe(length, 0.0))
+    size = load(path).size("poiseuille", "tiny")
+    parameters = solver_constants(size)
+    assert isinstance(parameters, FullBoxParameters)
+    place = np.array([0.5, 0.95, 1.0])
+    assert parameters.fringe_rates(place).tolist() == [0.0, 0.0, 0.0]
+    assert forcing_of(size, np.array([0.5, 0.5, 0.1])) is None
+    check_symmetry("square", size, find_forcing=tuple)
+
+
+@pytest.mark.parametrize("length", [None, 0.0])
+def test_a_fringe_with_a_rate_needs_a_length(
+    tmp_path: Path, length: float | None
+) -> None:
+    path = edited(tmp_path, with_fringe(length, 20.0))
+    size = load(path).size("poiseuille", "tiny")
+    parts = ("parameter fringe_length", "a finite number, > 0", "0.0")
+    refused(path, parts, partial(solver_constants, size))
 
 
 UNUSABLE = always("area_min", value="big")

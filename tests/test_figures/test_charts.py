@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import re
 
 import numpy as np
@@ -259,6 +260,24 @@ def test_labels_cover_nothing(dots: list[tuple[float, float]]) -> None:
             for box in boxes:
                 assert not label.box.overlaps(box)
             boxes.append(label.box)
+
+
+@pytest.mark.parametrize("seed", [48, 160, 223, 271])
+def test_a_line_keeps_clear_of_labels_to_its_end(seed: int) -> None:
+    """Between crowded dots; labels that come first are in the way of the others."""
+    generator = random.Random(seed)
+    dots = []
+    for _ in range(20):
+        dots.append((generator.uniform(100, 300), generator.uniform(50, 150)))
+    names = ["m" * generator.randint(1, 8) for _ in dots]
+    boxes: list[LabelBox] = []
+    for label in place_joined_labels(names, dots, plot=PLOT_BOX):
+        if label is None:
+            continue
+        if label.line_end is not None:
+            for box in boxes:
+                assert box.distance(label.line_end) > 0.999
+        boxes.append(label.box)
 
 
 def test_a_lonely_dot_has_its_label_to_the_right() -> None:

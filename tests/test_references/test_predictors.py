@@ -862,6 +862,22 @@ def test_a_flight_ends_when_a_tenth_of_the_particles_lie_on_the_floor() -> None:
     assert abs(difference) < 2.0
 
 
+def test_a_flight_that_ends_with_the_last_frame_is_shorter_than_the_horizon() -> None:
+    """The block lies on the floor in the last predicted frame, and in no other."""
+    size = load().size("fluid", "tiny")
+    horizon = size.task.horizon
+    # of all frames before the last one, and half of the last one
+    fall_per_frame = size.value("gravity") * size.frame_interval**2
+    frames_fallen = horizon * horizon / 2
+    _, (floor, _) = size.bounds
+    height = floor + frames_fallen * fall_per_frame
+    x = np.linspace(0.4, 0.5, 200)
+    block = np.stack([x, np.full(200, height)], axis=1)
+    frames = np.stack([block, block])
+    scenario = given("fluid", frames)
+    assert frames_of_flight(scenario) == horizon - 1
+
+
 @pytest.fixture(scope="module")
 def splash(tiny_split: Callable[..., object], home: Path) -> tuple[Path, Size]:
     """Return the root of a generated splash and its size."""

@@ -4,8 +4,10 @@ nothing else.
 
 from __future__ import annotations
 
+import gc
 import shutil
 import socket
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -419,6 +421,22 @@ def test_each_lie_has_its_error_and_leaves_nothing(
     assert FIRST in faults or server.count(".nc") == 0
     server.faults = {}
     assert download("own", root=here, mirror=server.url).complete
+
+
+@pytest.mark.parametrize("fault", ["nowhere", "other kind"])
+def test_a_refused_redirection_leaves_no_connection(
+    server: Mirror, here: Path, fault: str
+) -> None:
+    """Python warns of a connection that nobody closed."""
+    server.faults = {FIRST: fault}
+    gc.collect()  # what other tests left
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with pytest.raises(objects.NotDataError):
+            download("own", root=here, mirror=server.url, connections=1)
+        gc.collect()
+    leaks = [item for item in caught if item.category is ResourceWarning]
+    assert leaks == []
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,12 +17,21 @@ import pytest
 from numpy.testing import assert_allclose
 from score_bench import ScoreBench, still
 
-from benchmarks import free_flight, inference_cost, table_3_1
-from benchmarks.naive_attempts import AnalogCase, Predictors, measured_frames
+from benchmarks import by_materials, free_flight, inference_cost, table_3_1
+from benchmarks.naive_attempts import (
+    AnalogCase,
+    Kinds,
+    Library,
+    Predictors,
+    State,
+    States,
+    describe,
+    measured_frames,
+)
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
 from lagbench.generators.split import Device
-from lagbench.references.predictor import Given
+from lagbench.references.predictor import Floats, Given
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -140,16 +150,18 @@ def test_a_scenario_at_rest_is_compared_at_a_predicted_frame() -> None:
     assert measured_frames(size, 30, 0) == (first_predicted,)
 
 
-def test_damped_flight_without_contact_is_free_flight() -> None:
-    """The parabola of a falling point in time steps, in a closed form."""
+START = np.array([[0.5, 0.8], [0.52, 0.8]])  # last given positions [length]
+VELOCITY = np.array([0.002, 0.001])  # of both particles [length/frame]
+
+
+def falling_case(**changes: Any) -> AnalogCase:
+    """Return two particles that fly and meet nothing before the last frame."""
     size = load().size("fluid", "mini")
     end = size.task.input_frames + size.task.horizon
-    start = np.array([[0.5, 0.8], [0.52, 0.8]])
-    velocity = np.array([0.002, 0.001])
     given = Given(
         size=size,
         root=Path(),
-        position=np.array([start - velocity, start]),
+        position=np.array([START - VELOCITY, START]),
         material=np.zeros(2, np.int8),
         walls=np.zeros((end, 4, 2)),
         area=0.01,
@@ -157,14 +169,59 @@ def test_damped_flight_without_contact_is_free_flight() -> None:
     )
     last_given = size.task.input_frames - 1
     frames = (last_given + 1, last_given + 2, last_given + 12)
-    case = AnalogCase(given=given, frames=frames, without=None, thinning=1)
+    keys = {"given": given, "frames": frames, "without": None, "thinning": 1}
+    return AnalogCase(**(keys | changes))
+
+
+def assert_falling(case: AnalogCase, clouds: Mapping[int, Floats]) -> None:
+    """Assert the parabola of falling points in time steps, in a closed form."""
+    last_given = case.given.size.task.input_frames - 1
+    for frame in case.frames:
+        k = frame - last_given
+        expected = START + k * VELOCITY + case.given.fall * (k * (k + 1) / 2)
+        assert_allclose(clouds[frame], expected, rtol=0.0, atol=1e-12)
+
+
+def test_damped_flight_without_contact_is_free_flight() -> None:
+    case = falling_case()
     no_library: Any = None
     predictors = Predictors(no_library)
     clouds = predictors.damped(case, {"bounce": 0.6, "friction": 0.0})
-    for frame in frames:
-        k = frame - last_given
-        expected = start + k * velocity + given.fall * (k * (k + 1) / 2)
-        assert_allclose(clouds[frame], expected, rtol=0.0, atol=1e-12)
+    assert_falling(case, clouds)
+
+
+class OneScenario(Library):
+    """A library of one scenario of train, with one state."""
+
+    def states(
+        self, kinds: Kinds, velocity_weight: float, *, is_exact: bool
+    ) -> States | None:
+        """Return that state."""
+        position = START
+        velocity = np.broadcast_to(VELOCITY, START.shape)
+        material = np.zeros(len(START), np.int8)
+        feature = describe(position, velocity, material, kinds, velocity_weight)
+        return States((State(0, 0, 1),), feature[None])
+
+
+@pytest.mark.parametrize("name", ["windows", "from_the_start"])
+def test_the_only_scenario_of_train_is_predicted_by_free_flight(name: str) -> None:
+    """It may not be looked at, and there is no other one."""
+    case = falling_case(without=0)
+    predictors = Predictors(OneScenario(case.given.size, Path()))
+    # analogs would take over at the first frame
+    choice = {"window": 5, "lag": -case.flight, "velocity_weight": 20.0, "analogs": 2}
+    predict = getattr(predictors, name)
+    assert_falling(case, predict(case, choice))
+
+
+def test_scenarios_without_a_value_do_not_count_in_means_by_materials() -> None:
+    """As in the scores of the leaderboard; a mean of none is NaN."""
+    kinds = np.array(["liquid", "snow", "liquid", "jelly"])
+    values = np.array([1.0, 3.0, np.nan, np.nan])
+    jelly, liquid, snow, of_all = by_materials.means_by_kind(values, kinds)
+    assert np.isnan(jelly)
+    assert (liquid, snow, of_all) == (1.0, 3.0, 2.0)
 
 
 @pytest.mark.parametrize("device", list(Device))

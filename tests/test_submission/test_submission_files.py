@@ -52,7 +52,13 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.store import fetch
-from lagbench.submission import PredictionsWriter, open_predictions, template, write
+from lagbench.submission import (
+    PredictionsWriter,
+    open_predictions,
+    template,
+    validate,
+    write,
+)
 from lagbench.submission.writer import check_predictions_output
 
 SHAPE = (HORIZON, PARTICLES, 2)
@@ -164,6 +170,7 @@ def test_predictions_may_be_written_to_the_home_folder(
     result = template("cavity", "tiny", output="~/t.nc", **location)
     assert result.path == home / "t.nc"
     assert bench.validate(result.path).exit_code == 0
+    assert validate("~/t.nc", isolated=False, **location).valid
     with pytest.raises(UsageError) as caught:
         template("cavity", "tiny", output="~/t.nc", **location)
     assert "--overwrite" in caught.value.fix
