@@ -11,6 +11,7 @@ import numpy as np
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_writable
+from lagbench.data.layout import expand_home
 from lagbench.data.local import (
     DESCRIPTION,
     load_rooted_registry,
@@ -137,15 +138,16 @@ def score(
     if packages:
         table = available()
     measured_metrics = select((*_select_metrics(extras, table), *own), known=table)
-    path = Path(predictions).absolute()
+    file = expand_home(predictions, "predictions")
+    path = file.absolute()
     expected_split = None
     if split is not None:
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
     data_root = resolve_root(root)
     rooted_registry = load_rooted_registry(data_root, registry)
-    folder = scores_folder(Path(predictions))
+    folder = scores_folder(file)
     if output_dir is not None:
-        folder = Path(output_dir)
+        folder = expand_home(output_dir, "--output")
 
     result = validated
     if result is None:

@@ -22,7 +22,7 @@ import h5py
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.layout import ClosedFolderError
+from lagbench.data.layout import ClosedFolderError, expand_home
 from lagbench.data.local import (
     load_rooted_registry,
     locate_split,
@@ -178,7 +178,7 @@ def _validate_file(
 ) -> ValidationResult:
     """Check a predictions.nc for whatever split; :func:`validate` has the arguments."""
     folder = resolve_root(root)
-    file = Path(path).absolute()
+    file = expand_home(path, "path").absolute()
     splits = load_rooted_registry(folder, registry)
     try:
         refuse_other_files(file)

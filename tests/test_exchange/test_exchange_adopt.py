@@ -442,6 +442,17 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(
     assert_allclose(size.bounds, expected)
 
 
+def test_trajectories_may_lie_in_the_home_folder(
+    tmp_path: Path, adopt_here: Adopt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_runs(tmp_path / "in", straight_runs(3))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert adopt_here("~/in").scenarios == {"train": 1, "valid": 1, "test": 1}
+    several = [f"~/in/run{number}.npy" for number in range(3)]
+    own_split = adopt_here(several, output=tmp_path / "other")
+    assert own_split.scenarios == {"train": 1, "valid": 1, "test": 1}
+
+
 def test_without_bounds_a_fitted_extent_is_that_of_one_dimension(
     tmp_path: Path, adopt_here: Adopt
 ) -> None:

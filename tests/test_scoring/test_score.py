@@ -752,6 +752,24 @@ def test_the_own_metric_of_the_docs_is_measured(
     assert card.submission["mean_height_error"].mean == 0.0
 
 
+def test_predictions_and_scores_may_lie_in_the_home_folder(
+    bench: ScoreBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No folder named ~ appears, neither beside the predictions nor elsewhere."""
+    home = tmp_path / "home"
+    here = tmp_path / "here"
+    for folder in (home, here):
+        folder.mkdir()
+    bench.submit(home / "guess.nc", still)
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(home))
+    for output_dir, folder in ((None, home / "guess"), ("~/scores", home / "scores")):
+        card = bench.score(Path("~/guess.nc"), output_dir=output_dir)
+        assert {file.parent for file in card.files} == {folder}
+        assert (folder / "scores.json").is_file()
+    assert list(here.iterdir()) == []
+
+
 def test_scores_stay_out_of_the_folder_of_a_split(tmp_path: Path) -> None:
     """Predictions that are named after their local split are scored beside it."""
     predictions = tmp_path / "own.nc"
