@@ -19,6 +19,7 @@ from lagbench.board.entry import Entry, Status
 from lagbench.board.entry_file import read_entry
 from lagbench.board.folder import Folder
 from lagbench.board.verified import read_verified, verification_of
+from lagbench.errors import LagbenchError
 from lagbench.figures.tables import markdown
 from lagbench.references.predictor import Kind
 
@@ -86,7 +87,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--board", type=Path, default=BOARD)
     options = parser.parse_args(arguments)
-    sys.stdout.write(f"{table(read_speed_ups(Folder(options.board)))}\n")
+    folder = Folder(options.board)
+    try:
+        folder.require()
+        speed_ups = read_speed_ups(folder)
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    sys.stdout.write(f"{table(speed_ups)}\n")
     return 0
 
 

@@ -63,6 +63,7 @@ The densest cell may reach its limit.
 """
 
 FORMAT = 1  # of gates.json
+TEXTS = ("split", "size", "dataset_version", "method", "weights_sha256")  # of a row
 FRAME_STEP = 20  # frames between the windows of a scenario
 ROLLOUT_STEP = 10  # frames between the states in which the fullest cell is sought
 FALL_TOLERANCE = 0.02  # of a window in free flight: mean acceleration off g, in g
@@ -322,7 +323,20 @@ def read_recorded(path: Path) -> list[dict[str, Any]]:
         missing = keys - line.keys()
         if missing:
             raise _damaged(path, f"no {', '.join(sorted(missing))} in row {number}")
+        for name in TEXTS:
+            if not isinstance(line[name], str):
+                raise _damaged(path, f"no text for {name} in row {number}")
+        for name in LIMITS:
+            if not _is_measure(line[name]):
+                raise _damaged(path, f"no number for {name} in row {number}")
     return lines
+
+
+def _is_measure(value: object) -> bool:
+    """Tell whether a gate may have a value: a number, or None."""
+    if isinstance(value, bool):
+        return False
+    return value is None or isinstance(value, (int, float))
 
 
 def _damaged(path: Path, reason: object) -> UnreadableFileError:

@@ -66,6 +66,26 @@ simple(
     says="leading",
 )
 simple(
+    "dims",
+    "one_frame_only",
+    lambda f: replace(
+        f, "position", ("scenario", "particle", "space"), positions(f)[:, 0]
+    ),
+    says="'frame'",
+)
+simple(
+    "dims",
+    "one_component_only",
+    lambda f: replace(f, "position", DIMS[:3], positions(f)[..., 0]),
+    says="'space'",
+)
+simple(
+    "dims",
+    "one_scenario_without_names",
+    lambda f: _bare(f, positions(f)[0]),
+    says="scales",
+)
+simple(
     "dims", "dimensions_without_names", lambda f: _bare(f, positions(f)), says="scales"
 )
 simple("dims", "flattened", lambda f: _bare(f, positions(f).reshape(3, -1)))

@@ -31,8 +31,14 @@ def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
     try:
         with path.open("rb") as file:
             content = json.loads(file.read(MOST_BYTES))
-        for row in content["weights"]:
-            failed[str(row["weights_sha256"])] = tuple(map(str, row["failed"]))
+        rows = content["weights"]
+        if not isinstance(rows, list):
+            raise TypeError(f"weights is no list: {ascii(rows)[:80]}")
+        for row in rows:
+            gates = row["failed"]
+            if not isinstance(gates, list):
+                raise TypeError(f"failed is no list: {ascii(gates)[:80]}")
+            failed[str(row["weights_sha256"])] = tuple(map(str, gates))
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise UnreadableFileError(
             "the gates cannot be read",

@@ -233,7 +233,7 @@ class _SeasonRun:
         try:
             content = json.loads((self.blind_root / SAVED).read_bytes())
             self._saved = SAVED_VALUES.validate_python(content)
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             self._saved = {}
 
     def score(self, data_set: SeasonDataSet) -> DataSetScores:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -137,7 +138,8 @@ def install_command(extras: str) -> str:
     """Return the command that installs extras, in a clone from the clone."""
     clone = Path(__file__).resolve().parents[2]
     if (clone / CONSTRAINTS).is_file():
-        return f"cd {clone} && pip install -c {CONSTRAINTS} -e '.[{extras}]'"
+        folder = shlex.quote(str(clone))
+        return f"cd {folder} && pip install -c {CONSTRAINTS} -e '.[{extras}]'"
     return f"pip install 'lagbench[{extras}]'"
 
 

@@ -266,7 +266,7 @@ def expand_path(path: str | Path, where: str) -> Path:
 
 
 def expand_home(output: str | Path, where: str = "--output") -> Path:
-    """Return the path of a file to write, a first part ~ replaced by the home folder.
+    """Return the path of a file, a first part ~ replaced by the home folder.
 
     Other paths stay as they are, also names that begin with ~.
 

@@ -15,6 +15,7 @@ import numpy as np
 from lagbench.arguments import check_arguments
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
+from lagbench.data.layout import expand_home
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import (
     UnreadableFileError,
@@ -112,9 +113,9 @@ def adopt(
     """
     options = check_options(options)
     if isinstance(sources, str | Path):
-        paths = [Path(sources)]
+        paths = [expand_home(sources, "sources")]
     else:
-        paths = [Path(source) for source in sources]
+        paths = [expand_home(source, "sources") for source in sources]
 
     rows_of: Mapping[str, list[Row]] = {}
     mistakes = UsageErrorCollector()

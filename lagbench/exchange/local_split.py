@@ -155,7 +155,8 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
     """Return the extent of all positions of trajectories, in their length.
 
     Raises:
-        DataError: a position is not finite.
+        DataError: a position is not finite in float32, or trajectories differ in their
+            number of components.
     """
     low: NDArray[np.float64] | None = None
     high: NDArray[np.float64] | None = None
@@ -163,17 +164,38 @@ def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
         for number, (position, _) in enumerate(trajectory.read()):
             frame_low = position.min(axis=0).astype(np.float64)
             frame_high = position.max(axis=0).astype(np.float64)
-            if not (np.isfinite(frame_low).all() and np.isfinite(frame_high).all()):
+            ends = np.stack([frame_low, frame_high])
+            if not _in_float32(ends).all():
                 where = f"{trajectory.name}, frame {number}"
                 raise _not_finite(position, position, where)
-            if low is None or high is None or len(low) != len(frame_low):
+            if low is None or high is None:
                 low = frame_low
                 high = frame_high
+            if len(low) != len(frame_low):
+                raise _mixed_dimensions(trajectory, len(low))
             low = np.minimum(low, frame_low)
             high = np.maximum(high, frame_high)
     if low is None or high is None:
         return ()
     return tuple(zip(low.tolist(), high.tolist(), strict=True))
+
+
+def _in_float32(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return whether each value is a finite number of float32."""
+    with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+        return np.isfinite(values.astype(np.float32))
+
+
+def _mixed_dimensions(trajectory: Trajectory, dimension: int) -> DataError:
+    """Return the error for a trajectory of another dimension than those before."""
+    return DataError(
+        "positions have another number of components",
+        where=trajectory.name,
+        expected=f"{dimension} components, as the trajectories before have",
+        got=f"{trajectory.dimension} components",
+        fix="adopt trajectories of two and of three dimensions apart, each kind "
+        "into a folder of its own: -o FOLDER",
+    )
 
 
 def _not_finite(
@@ -186,7 +208,7 @@ def _not_finite(
         raw_position: the same ones as the file has them, for the message.
         where: trajectory and frame.
     """
-    is_finite = np.isfinite(position).all(axis=1)
+    is_finite = _in_float32(position).all(axis=1)
     particle = int(np.argmin(is_finite))
     return DataError(
         "a position is not finite",
@@ -578,20 +600,13 @@ class SplitBuilder:
         if trajectory.dimension == self.dimension:
             return
         if self.entries or bounds is None:
-            source = "the trajectories before have"
-            fix = (
-                "adopt trajectories of two and of three dimensions apart, each kind "
-                "into a folder of its own: -o FOLDER"
-            )
-        else:
-            source = "--bounds has pairs"
-            fix = "give --bounds with a pair for each component of a position"
+            raise _mixed_dimensions(trajectory, self.dimension)
         raise DataError(
             "positions have another number of components",
             where=trajectory.name,
-            expected=f"{self.dimension} components, as {source}",
+            expected=f"{self.dimension} components, as --bounds has pairs",
             got=f"{trajectory.dimension} components",
-            fix=fix,
+            fix="give --bounds with a pair for each component of a position",
         )
 
     def _check_walls(self, trajectory: Trajectory) -> None:

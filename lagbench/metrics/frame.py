@@ -373,16 +373,17 @@ class Scenario:
                 fix="give positions [particle, axis] of all its particles",
             )
 
-        is_finite = np.isfinite(x)
-        if not is_finite.all():
-            count = np.count_nonzero(~is_finite.all(axis=1))
-            raise ChecksFailedError(
-                "positions are not finite",
-                where="position",
-                expected="numbers",
-                got=f"{count} of {len(x)} particles",
-                fix="freeze the rollout at its last finite frame",
-            )
+        for name, points in (("position", x), ("previous", before)):
+            is_finite = np.isfinite(points)
+            if not is_finite.all():
+                count = np.count_nonzero(~is_finite.all(axis=1))
+                raise ChecksFailedError(
+                    "positions are not finite",
+                    where=name,
+                    expected="numbers",
+                    got=f"{count} of {len(points)} particles",
+                    fix="freeze the rollout at its last finite frame",
+                )
 
         box = self.config.box
         return Snapshot(box.wrap(x), box.displacement(before, x), self)

@@ -152,6 +152,9 @@ NAME = re.compile("[a-z][a-z0-9_]{0,63}")
 RESERVED = ("skill",)
 """Names that no metric may have: tables have a row `skill`."""
 
+REAL_KINDS = "biufO"
+"""Kinds of NumPy's types whose values are real numbers, or are converted one by one."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
@@ -302,13 +305,24 @@ class Metric:
         """Return the value per frame from the statistics in ``of``, shape [frame].
 
         Raises:
-            WorkFailedError: it has another shape.
+            WorkFailedError: it has another shape, or its values are no real numbers.
         """
         place = "over all frames"
         try:
-            series = np.asarray(self.series(*statistics), np.float64)
+            series = np.asarray(self.series(*statistics))
+            # NumPy would drop imaginary parts, and read texts and times as numbers.
+            is_real = series.dtype.kind in REAL_KINDS
+            if is_real:
+                series = series.astype(np.float64, copy=False)
         except (Exception, SystemExit) as error:
             self.raise_named(error, place)
+        if not is_real:
+            raise self._failure(
+                "the series of a metric has no real numbers",
+                f"{_line_of_function(self.series)}, {self.name}, {place}",
+                expected="a float per frame",
+                got=series,
+            )
         if series.shape != statistics[0].shape:
             raise self._failure(
                 "the series of a metric has another shape",
@@ -336,7 +350,7 @@ class Metric:
 
         An array of one element is converted.
         """
-        if not isinstance(value, (str, bytes, complex)):
+        if not isinstance(value, (str, bytes, complex, np.complexfloating)):
             # as arrays of other packages raise
             with suppress(TypeError, ValueError, OverflowError, RuntimeError):
                 return float(value)  # type: ignore[arg-type]

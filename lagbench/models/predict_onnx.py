@@ -11,6 +11,7 @@ from lagbench.data.local import SizeLocation, locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.copy import scenario_files
+from lagbench.submission.format import describe_kind, is_name_valid
 from lagbench.submission.writer import (
     PredictionsWriter,
     check_predictions_output,
@@ -75,8 +76,8 @@ def predict_onnx(
 
     Raises:
         UsageError: no such split, size or subset, neither ``split`` nor the file names
-            a split, the file states another split than ``split``, there is such an
-            output, or onnx is not installed.
+            a split, the file states another split than ``split``, no method may have
+            the name of the file, there is such an output, or onnx is not installed.
         UnreadableFileError: the model is refused, or cannot be run.
         DataError: the subset is missing.
         WorkFailedError: the model needs more time or memory than allowed, or another
@@ -86,13 +87,13 @@ def predict_onnx(
     output_path = expand_home(output)
     check_predictions_output(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)
+    label = method or _method_of(model_path)
     any_tier, folder, known = _locate_data_set(
         split, size, declared, model_path, root=root, registry=registry
     )
     tier = any_tier.scored_on(subset)
     paths = scenario_files(tier, folder, (subset,))
     runner = open_onnx(model_path, size=tier, root=folder, declared=declared)
-    label = method or model_path.stem
     meter = Meter(progress)
     meter.begin("predicting", total=len(paths), scenarios=len(paths))
     writer = PredictionsWriter(
@@ -135,6 +136,23 @@ def predict_onnx(
         seconds_per_frame=seconds_per_frame,
         parameters=runner.parameters,
         solver_seconds_per_frame=solver_seconds,
+    )
+
+
+def _method_of(model: Path) -> str:
+    """Return the name of the method that a file is named after.
+
+    Raises:
+        UsageError: no method may have that name.
+    """
+    if is_name_valid(model.stem):
+        return model.stem
+    raise UsageError(
+        "a method cannot have the name of the file",
+        where=f"{model}, --method",
+        expected=describe_kind("method"),
+        got=ascii(model.stem),
+        fix="name the method: --method lines",
     )
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import read_beginning
-from lagbench.data.layout import format_ids
+from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, locate_split, suggest_split_of
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
@@ -317,6 +317,8 @@ def compare(
     expected_split = None
     if split is not None:
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
+    first = _expand_source(first, "A")
+    second = _expand_source(second, "B")
     board_folder, entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)
@@ -409,6 +411,14 @@ def _describe(
         is_against_reference=is_reference,
         metrics=comparisons,
     )
+
+
+def _expand_source(source: str | Path, where: str) -> str | Path:
+    """Return a source, a first part ~ of its path replaced by the home folder."""
+    path = expand_home(source, where)
+    if path == Path(source):
+        return source  # as it is written, since it may be a name
+    return path
 
 
 def _is_bare_name(second: str | Path) -> bool:

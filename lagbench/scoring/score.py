@@ -147,7 +147,7 @@ def score(
     rooted_registry = load_rooted_registry(data_root, registry)
     folder = scores_folder(given_path)
     if output_dir is not None:
-        folder = expand_home(output_dir)
+        folder = expand_home(output_dir, "--output")
 
     result = validated
     if result is None:

@@ -586,11 +586,14 @@ def _check_particle_counts(
 def _hint_for_dims(dims: tuple[str, ...]) -> str:
     if sorted(dims) == sorted(DIMS):
         return "transpose it"
-    if len(dims) == len(DIMS) - 1:
-        return "add the leading dimension 'scenario', also for a single scenario"
     if not any(dims):
         return "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
-    return USE_TEMPLATE
+    missing = [name for name in DIMS if name not in dims]
+    if len(dims) != len(DIMS) - 1 or len(missing) != 1:
+        return USE_TEMPLATE
+    if missing == ["scenario"]:
+        return "add the leading dimension 'scenario', also for a single scenario"
+    return f"add the dimension {missing[0]!r}; the order is {', '.join(DIMS)}"
 
 
 def _length_of(name: str, info: FileInfo) -> int | str:

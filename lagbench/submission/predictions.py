@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lagbench.arguments import check_arguments
 from lagbench.data.checksums import ContentHasher
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
-from lagbench.data.layout import format_ids
+from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.structure import estimate_chunk_cache
 from lagbench.errors import UsageError
 
@@ -183,7 +183,7 @@ def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predi
         UnreadableFileError: missing, not netCDF4, or damaged.
         ChecksFailedError: not laid out as docs/predictions.md says.
     """
-    path = Path(path)
+    path = expand_home(path, "path")
     with ExitStack() as stack:
         file = stack.enter_context(open_hdf5(path, fix=WRITE))
         if info is None or info.length != path.stat().st_size:

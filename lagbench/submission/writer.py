@@ -145,7 +145,7 @@ class PredictionsWriter:
         option: str = "path",
         **labels: Label,
     ) -> None:
-        self.path = Path(path)
+        self.path = expand_home(path, option)
         self._option = option
         _refuse_address(self.path, option)
         check_output_file(self.path, overwrite=True, option=option)
@@ -596,7 +596,7 @@ def write(
         WorkFailedError: the disk is full or not writable.
     """
     writer = PredictionsWriter(
-        expand_home(path, "path"),
+        path,
         split=split,
         size=size,
         method=method,

@@ -673,6 +673,8 @@ def test_weights_that_fail_a_gate_are_marked(tmp_path: Path) -> None:
     failed = read_failed_gates(Folder(tmp_path))
     assert gates_failed_by(with_weights, failed) == ("one_step",)
     assert gates_failed_by(entry, failed) == ()
-    path.write_text("{}")
-    with pytest.raises(UnreadableFileError):
-        read_failed_gates(Folder(tmp_path))
+    text = {**row, "failed": "one_step"}
+    for damaged in ({}, {"weights": {}}, {"weights": [text]}):
+        path.write_text(json.dumps(damaged))
+        with pytest.raises(UnreadableFileError):
+            read_failed_gates(Folder(tmp_path))

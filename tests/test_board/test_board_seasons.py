@@ -257,7 +257,10 @@ def test_what_is_scored_is_not_predicted_again(master: ModelBoard) -> None:
     assert anew.comparison.has_same_bytes
 
 
-@pytest.mark.parametrize("value", ["NaN", '"many"', "-1.0", "null"])
+@pytest.mark.parametrize(
+    "value",
+    ["NaN", '"many"', "-1.0", "null", pytest.param("[" * 100_000, id="nested")],
+)
 def test_a_damaged_file_of_saved_scores_counts_as_none(
     master: ModelBoard, tmp_path: Path, value: str
 ) -> None:

@@ -495,6 +495,22 @@ def test_doctor_names_one_command_for_all_that_is_missing(
         assert doctor.PURPOSES[extra] in result.stdout
 
 
+def test_the_command_of_doctor_enters_a_clone_with_a_blank_in_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The shell is to see one word."""
+    clone = tmp_path / "my 'own' clone"
+    module = clone / "lagbench" / "cli" / "doctor.py"
+    module.parent.mkdir(parents=True)
+    (clone / "constraints.txt").write_text("")
+    monkeypatch.setattr(doctor, "__file__", str(module))
+    enter, _, _ = doctor.install_command("plots").partition(" && ")
+    done = subprocess.run(
+        ["/bin/sh", "-c", f"{enter} && pwd"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"{clone}\n"
+
+
 def test_doctor_knows_the_libraries_of_every_extra() -> None:
     declared = {}
     for requirement in requires("lagbench") or []:

@@ -442,6 +442,44 @@ def test_without_bounds_the_extent_of_all_positions_is_fitted(
     assert_allclose(size.bounds, expected)
 
 
+def test_trajectories_may_lie_in_the_home_folder(
+    tmp_path: Path, adopt_here: Adopt, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_runs(tmp_path / "in", straight_runs(3))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert adopt_here("~/in").scenarios == {"train": 1, "valid": 1, "test": 1}
+    several = [f"~/in/run{number}.npy" for number in range(3)]
+    own_split = adopt_here(several, output=tmp_path / "other")
+    assert own_split.scenarios == {"train": 1, "valid": 1, "test": 1}
+
+
+def test_without_bounds_a_fitted_extent_is_that_of_one_dimension(
+    tmp_path: Path, adopt_here: Adopt
+) -> None:
+    """The trajectory that differs is named, and no option that nobody gave."""
+    runs: list[NDArray[Any]] = list(straight_runs(3))
+    height = np.full((*runs[2].shape[:2], 1), 0.5, np.float32)
+    runs[2] = np.concatenate([runs[2], height], axis=2)
+    paths = save_runs(tmp_path / "in", runs)
+    with pytest.raises(DataError) as caught:
+        adopt_here(paths, rescale=True)
+    assert caught.value.where == str(paths[2])
+    assert "--bounds" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e39])
+def test_without_bounds_a_position_beyond_float32_is_named(
+    tmp_path: Path, adopt_here: Adopt, value: float
+) -> None:
+    """As with bounds: the fitted box would have no side of float32."""
+    runs: list[NDArray[Any]] = [run.astype(np.float64) for run in straight_runs(3)]
+    runs[1][3, 7, 1] = value
+    paths = save_runs(tmp_path / "in", runs)
+    with pytest.raises(DataError) as caught:
+        adopt_here(paths, rescale=True)
+    assert str(caught.value.where) == f"{paths[1]}, frame 3, particle 7"
+
+
 def test_an_npz_file_may_hold_velocities_materials_and_walls(
     tmp_path: Path, runs: Runs, adopt_here: Adopt
 ) -> None:

@@ -196,6 +196,9 @@ def test_what_cannot_be_measured_is_refused() -> None:
     fewer = x[:9]
     with pytest.raises(ChecksFailedError):
         pair_of(x, at_rest, at_rest, predicted_position=y)
+    with pytest.raises(ChecksFailedError) as caught:
+        scenario_of(np.stack([x, x])).snapshot(x, y)
+    assert caught.value.where == "previous"
     with pytest.raises(UsageError):
         pair_of(x, at_rest, at_rest[:9], predicted_position=fewer)
     with pytest.raises(UsageError):

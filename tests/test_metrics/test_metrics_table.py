@@ -714,6 +714,32 @@ def test_a_metric_of_another_shape_is_refused(what: str, function: Any) -> None:
     assert "enstrophy_error" in str(caught.value.where)
 
 
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda values: values + 1j,
+        lambda values: values.astype(str),
+        lambda values: values.astype("timedelta64[s]"),
+    ],
+)
+def test_a_series_without_real_numbers_is_refused(function: Any) -> None:
+    """The imaginary part is not dropped, and no text is read as a number."""
+    bad: Any = replace(OTHERS, series=function)
+    pieces = tally(pairs(), [bad], CONFIG.predicted_frames)
+    with pytest.raises(WorkFailedError) as caught:
+        aggregate([bad], {0: pieces})
+    assert "enstrophy_error" in str(caught.value.where)
+
+
+@pytest.mark.parametrize("what", ["statistic", "over_frames"])
+@pytest.mark.parametrize("value", [1 + 2j, np.complex64(1 + 2j), np.complex128(1)])
+def test_a_complex_number_is_no_value(what: str, value: complex) -> None:
+    bad: Any = replace(OTHERS, **{what: lambda _: value})
+    with pytest.raises(WorkFailedError) as caught:
+        aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
+    assert "enstrophy_error" in str(caught.value.where)
+
+
 @dataclass(frozen=True)
 class FrozenError(Exception):
     """An error that takes no attribute, as those of some packages."""

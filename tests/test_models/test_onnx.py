@@ -617,6 +617,22 @@ def test_predictions_state_the_seed_that_is_given(
     assert "--seed" in weights.output
 
 
+def test_a_file_whose_name_is_no_method_needs_the_option(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """The remedy of the message works."""
+    model = straight_on(tmp_path / "a\u200bb.onnx")
+    predictions = tmp_path / "predictions.nc"
+    words = ["predict", str(model), "--split", SIZE.split, "--size", SIZE.name]
+    words += ["--root", str(generated.root), "--no-bench", "-o", str(predictions)]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code == 2
+    assert "--method" in refused.output
+    assert not predictions.exists()
+    done = CliRunner().invoke(app, [*words, "--method", "lines"])
+    assert done.exit_code == 0, done.output
+
+
 def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
     tmp_path: Path, generated: GenerationResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,16 @@ def publish_seeds(
     return folder
 
 
+def test_scores_may_lie_in_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(tmp_path, [1, 2, 3, 4, 5, 6], method="a")
+    publish(tmp_path, [2, 3, 4, 5, 6, 8], method="b")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    result = compare("~/a", "~/b/scores.json")
+    assert result.verdict == compare(tmp_path / "a", tmp_path / "b").verdict
+
+
 def test_six_wins_of_six_are_significant(tmp_path: Path) -> None:
     """The p-value is 2 / 2^6 = 0.03125."""
     a = publish(tmp_path, [1, 2, 3, 4, 5, 6], method="a")

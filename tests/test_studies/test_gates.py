@@ -257,6 +257,24 @@ def test_damaged_measures_are_no_crash(
     assert str(board / "gates.json") in output.err
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("one_step", "x"), ("settled", []), ("densest_cell", True), ("split", ["cavity"])],
+)
+def test_measures_of_another_type_are_no_crash(
+    board: Path, capsys: pytest.CaptureFixture[str], name: str, value: object
+) -> None:
+    """The row that holds them is named."""
+    entry = yaml.safe_load((board / PATH).read_text())
+    digest = entry["predictions"][0]["weights"]["sha256"]
+    content = json.loads(to_json([replace(GATES, weights_sha256=digest)]))
+    content["weights"][0][name] = value
+    assert recorded(board, content) == 3
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert f"{name} in row 0" in output.err
+
+
 def test_measures_of_an_unknown_split_are_no_crash(
     board: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

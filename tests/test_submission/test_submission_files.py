@@ -186,6 +186,37 @@ def test_predictions_may_be_written_to_the_home_folder(
     assert list(here.iterdir()) == []
 
 
+def test_predictions_may_be_read_from_the_home_folder(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every function of predictions finds the file that another one wrote there."""
+    home = tmp_path / "home"
+    here = tmp_path / "here"
+    for folder in (home, here):
+        folder.mkdir()
+    shutil.copyfile(bench.valid, home / "p.nc")
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("HOME", str(home))
+    result = bench.validate(Path("~/p.nc"))
+    assert result.exit_code == 0
+    assert result.path == home / "p.nc"
+    with (
+        open_predictions("~/p.nc") as predictions,
+        PredictionsWriter(
+            "~/copy.nc",
+            split="cavity",
+            size="tiny",
+            method="dot",
+            root=bench.root,
+            registry=bench.registry,
+        ) as writer,
+    ):
+        for scenario in TESTS:
+            writer.add(scenario, predictions.frames(scenario, GIVEN, HORIZON))
+    assert bench.validate(home / "copy.nc").exit_code == 0
+    assert list(here.iterdir()) == []
+
+
 def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
     bench: Bench, tmp_path: Path
 ) -> None:
