@@ -206,8 +206,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "what the scorer gives",
     ),
     "measured": BoardCheck(
-        "a score of a reference predictor in the package that differs when it is "
-        "measured again",
+        "a score of a reference predictor that lagbench contains, if a new "
+        "measurement gives another value",
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
