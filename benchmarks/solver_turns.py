@@ -1,4 +1,4 @@
-"""The kernels of this tree against those of another commit, in turns of a second.
+"""The kernels of this tree against those of another commit, in short turns.
 
     python benchmarks/solver_turns.py --against main~20 --cases cavity curl-noise-3d
 
