@@ -120,8 +120,14 @@ class ClosedGrid(StaggeredGrid):
     ) -> int:
         """Return how many time steps a duration takes at the least [1].
 
-        A wave of one cell decays by the viscosity and the hyperviscosity together, so
-        their rates are added.
+        The wave that changes its sign from cell to cell decays by the viscosity and the
+        hyperviscosity together, so their rates are added.
+
+        Args:
+            velocity: of the faces.
+            duration: time to advance [s].
+            viscosity: with what the hybrid has learned [length^2/s].
+            wall_velocity: of each wall.
         """
         steps = super().step_count(
             velocity,

@@ -582,9 +582,15 @@ class GraphNetwork(Baseline):
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return the terms of Eq. 5.35 and the operator's own, without weights.
+        """Return the terms of the loss (Eq. 5.35) and the operator's own, unweighted.
 
-        They are means over the steps.
+        They are means over the steps whose error counts. In three dimensions, and with
+        periodic axes, only the terms of particles exist.
+
+        Args:
+            batch: windows of frames.
+            generator: draws noise, and the number of steps before those that count;
+                None for a validation, which has neither.
         """
         if generator is not None:
             batch = augment(

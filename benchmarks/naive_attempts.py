@@ -946,9 +946,10 @@ def cloud_distance_by_material(
     true_cloud: Floats,
     material: Materials,
 ) -> float:
-    """Return the sliced Wasserstein-2 distance of two clouds [length].
+    """Return the distance of two clouds, material by material [length].
 
-    It is taken material by material; the mean is weighted by the share of each.
+    The sliced Wasserstein-2 distances of the materials are averaged, weighted by the
+    shares of particles.
     """
     error = 0.0
     for kind in np.unique(material):

@@ -177,7 +177,9 @@ def share_told_apart(
 
 
 def count_pairs_of_seeds() -> tuple[Counter[str], int]:
-    """Return the pairs of seeds of one method by split, and how many of all differ."""
+    """Return how many pairs of seeds of one method each split has at size mini, and in
+    how many of all pairs the seeds differ.
+    """
     pairs: Counter[str] = Counter()
     differing_count = 0
     for split in count_test_scenarios():

@@ -111,7 +111,7 @@ def substep_count(size: Size, scenario: int) -> int:
 
 def perturbed_substep_count(size: Size, scenario: int) -> int:
     """Return how many substeps a perturbed run takes: it ends with the horizon."""
-    omitted = size.frames_behind(scenario) * size.substeps_per_frame
+    omitted = size.frames_after_horizon(scenario) * size.substeps_per_frame
     return substep_count(size, scenario) - omitted
 
 
@@ -376,7 +376,10 @@ class ScenarioBatch:
         return ratio
 
     def displace(self, offset: Singles) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, axis]."""
+        """Add an offset to the positions [length], which are kept in the box.
+
+        Shape [scenario, particle, axis].
+        """
         self.solver.displace(offset)
         self._displacements.append((self._substep, offset.copy()))
 

@@ -4,9 +4,9 @@ Neither xarray nor pandas is imported, which keeps a worker below 400 MB.
 
 The predictability limit: how far a scenario drifts from a perturbed run of itself. At
 the last frame that a model is given, every coordinate of every particle moves by +2^-20
-or -2^-20 (seeded signs), far below anything that a frame shows. The position RMSE
-between the perturbed run and the truth at each predicted frame is what no model can be
-expected to undercut::
+or -2^-20 (seeded signs; particles stay in the box), far below anything that a frame
+shows. The position RMSE between the perturbed run and the truth at each predicted frame
+is what no model can be expected to undercut::
 
     limit(f) = sqrt(mean over particles and axes of (x_perturbed(f) - x(f))^2)
 
@@ -298,8 +298,9 @@ def measure_predictability(
     input_frames = size.task.input_frames
     frame_counts = []
     for scenario in job.scenarios:
-        frames_ahead = size.frame_count(scenario) - size.frames_behind(scenario)
-        frame_counts.append(frames_ahead)
+        frames_left_out = size.frames_after_horizon(scenario)
+        frame_count = size.frame_count(scenario) - frames_left_out
+        frame_counts.append(frame_count)
     batch = ScenarioBatch(job, report, frames=frame_counts)
     # displacements of the batch [length], shape [scenario, particle, axis]
     scenario_count = len(frame_counts)

@@ -123,8 +123,8 @@ def _refuse_special(target: Path) -> None:
 def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
     """Rename files to places on the same disk, in their order.
 
-    The steps that may fail come first: files are flushed and folders made before the
-    first file is moved.
+    The steps that fail most often come first: files are flushed and folders made before
+    the first file is moved. If a move fails, the moves before it stay.
     """
     for source, target in moves:
         _flush(source)

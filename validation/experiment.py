@@ -290,21 +290,24 @@ def _check_reynolds(
 
 
 def solver_parameters(experiment: Experiment) -> ClosedBoxParameters:
-    """Return the constants of size ``full``, scaled to the experiment's grid."""
+    """Return the constants of size ``full``, with the experiment's particles, grid, dt.
+
+    The walls stay where they are, as nearly as the nodes of the grid allow.
+    """
     full = _full_size(experiment.case)
     if experiment.case is Case.CAVITY:
         parameters = cavity.solver_parameters(full)
     else:
         parameters = curl_noise.solver_parameters(full)
-    # index of the ghost layer that keeps the walls where they are
-    wall = (parameters.wall + 0.5) * experiment.grid / parameters.grid - 0.5
+    # a wall lies half a cell from its layer of ghost nodes
+    ghost_layer = (parameters.wall + 0.5) * experiment.grid / parameters.grid - 0.5
     return dataclasses.replace(
         parameters,
         particles=experiment.particles,
         grid=experiment.grid,
         dt=experiment.dt,
         # Python rounds halves to even, NumPy alike: 4.5 gives 4.
-        wall=round(wall),
+        wall=round(ghost_layer),
     )
 
 

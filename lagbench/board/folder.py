@@ -253,8 +253,10 @@ class Folder:
         return None
 
     def link_in(self, path: Path) -> Path | None:
-        """Return the first part of a relative path that is a symbolic link, else
-        None.
+        """Return the shortest beginning of a path that is a symbolic link, else None.
+
+        Args:
+            path: relative to the board.
         """
         parts_from_top = [*reversed(path.parents), path][1:]
         for part in parts_from_top:

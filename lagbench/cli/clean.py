@@ -42,7 +42,7 @@ def clean_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Remove a data set, or only its temporary files."""
+    """Remove one data set, or only its temporary files."""
     result = clean(
         split, size, root=root, leftovers=leftovers, force=force, dry_run=dry_run
     )

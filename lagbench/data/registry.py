@@ -521,8 +521,8 @@ class Size(BaseModel):
         vectors = self.frame_count(scenario) * self.particle_count(scenario)
         return moving_variables * vectors * 4 * self.dimension
 
-    def frames_behind(self, scenario: int) -> int:
-        """Return how many of a scenario's frames lie behind the horizon of the task."""
+    def frames_after_horizon(self, scenario: int) -> int:
+        """Return how many of a scenario's frames come after the horizon of the task."""
         task_frames = self.task.input_frames + self.task.horizon
         return max(0, self.frame_count(scenario) - task_frames)
 

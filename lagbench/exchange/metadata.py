@@ -92,7 +92,7 @@ MEANINGS: Mapping[Format, Mapping[int, str]] = {
 """What numbers without a material mean."""
 
 PADDING = -1
-"""Number of particles that are not there (lagrangebench-h5)."""
+"""Number of particles that are not there, as LagrangeBench writes it."""
 
 DROP = "drop"
 """Stands for the material of particles that are left out."""
@@ -135,7 +135,7 @@ def find_materials(
 
     Args:
         form: the format.
-        numbers: the number of each particle, or one for all.
+        numbers: the number of each particle; gns-npz may have one for all.
         particle_count: particles of the trajectory.
         user_kinds: number to material, or to "drop", as the user says.
         where: the trajectory, for messages.
@@ -143,6 +143,7 @@ def find_materials(
     Raises:
         UnreadableFileError: no integers, numbers without a material, or no particle is
             left.
+        UsageError: a kind of the user names no material.
     """
     _check_kinds(form, numbers, particle_count, where=where)
     numbers = np.broadcast_to(numbers, (particle_count,))

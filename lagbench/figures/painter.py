@@ -201,7 +201,12 @@ class Painter:
 def _find_inside(
     recording: Recording, middle: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return the pixels within the walls, shape [row, column], first row at the top."""
+    """Return the pixels within the walls, shape [row, column], first row at the top.
+
+    Args:
+        recording: its box has the walls.
+        middle: middles of the pixels along a side of the panel, from 0 to 1.
+    """
     left, right, bottom, top = box_of(recording)
     height = 1.0 - middle
     is_row_inside = (height >= bottom) & (height <= top)

@@ -201,7 +201,7 @@ def box_of(
 
 
 def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats]]:
-    """Yield number and velocity of each wall that slides towards a frame.
+    """Yield number and velocity of each wall that slides in the time before a frame.
 
     Velocities are those along the wall [length/s], shape [axis].
     """

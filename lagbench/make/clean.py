@@ -29,7 +29,7 @@ CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
 class CleanResult:
     """What was, or with ``dry_run`` would be, removed."""
 
-    removed: tuple[Path, ...]  # the files
+    removed: tuple[Path, ...]  # the files, without lagbench's own lock and notes
     bytes: int  # their length together [bytes]
     dry_run: bool  # whether they are still there
 

@@ -236,7 +236,7 @@ def estimate(
     total_frames = frames
     for scenario, count in zip(scenarios, substeps, strict=True):
         if size.subset_of(scenario) == "test":
-            omitted_frames = size.frames_behind(scenario)
+            omitted_frames = size.frames_after_horizon(scenario)
             total_substeps += count - omitted_frames * size.substeps_per_frame
             total_frames += size.frame_count(scenario) - omitted_frames
 
