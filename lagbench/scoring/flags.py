@@ -119,14 +119,17 @@ class Tracer:
 
     def _add_shifted(self, i: int, pair: FramePair) -> None:
         """Compare the frame with earlier ones, of truth and of prediction."""
+        box = pair.scenario.config.box
         true = pair.truth.position
         predicted = pair.prediction.position
         shifted = self._trace.shifted
 
         for back, earlier in enumerate(reversed(self._true), start=1):
-            shifted[-back][i] = average(mean_square(predicted - earlier))
+            way = box.displacement(earlier, predicted)
+            shifted[-back][i] = average(mean_square(way))
         for back, earlier in enumerate(reversed(self._predicted), start=1):
-            shifted[back][i - back] = average(mean_square(earlier - true))
+            way = box.displacement(true, earlier)
+            shifted[back][i - back] = average(mean_square(way))
 
         self._true.append(true)
         self._predicted.append(predicted)

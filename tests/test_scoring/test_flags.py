@@ -6,6 +6,7 @@ import math
 import pickle
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from metric_flows import Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose
 from score_bench import Predict, ScoreBench, half_right, late, right, still, straight
 
+from lagbench.data.box import Box
+from lagbench.data.grid import Grid
 from lagbench.metrics import FramePair, snapshots
 from lagbench.scoring.flags import (
     SHIFTS,
@@ -27,9 +30,9 @@ from lagbench.scoring.flags import (
 HORIZON = 6
 
 
-def trace_of(truth: Floats, prediction: Floats) -> Trace:
+def trace_of(truth: Floats, prediction: Floats, **changes: Any) -> Trace:
     """Return the trace of trajectories of the swirl; six frames are predicted."""
-    scenario = scenario_of(truth)
+    scenario = scenario_of(truth, **changes)
     tracer = Tracer(scenario)
     for pair in pairs_of(scenario, truth, prediction):
         tracer.add(pair)
@@ -103,6 +106,20 @@ def test_trace_finds_the_shift(shift: int) -> None:
     dynamics = analyse_error(trace)
     assert dynamics.shift == shift
     assert dynamics.shift_gain == 0.0
+
+
+@pytest.mark.parametrize("shift", SHIFTS)
+def test_a_shift_is_found_across_periodic_ends(shift: int) -> None:
+    """A stream carries particles across the end of the box in each frame."""
+    torus = Box.from_bounds(((0.0, 1.0), (0.0, 1.0)), periodic=[True, True])
+    stream = 0.2 * np.arange(12)[:, None, None] * np.array([1.0, 0.0])
+    truth = (rollout(frames=12) + stream) % 1.0
+    offset = 0.02  # so that some particles lie on the other side of the end
+    moved = (np.roll(truth, -shift, axis=0) + offset) % 1.0
+    trace = trace_of(truth[:8], moved[:8], grid=Grid(10, box=torus))
+    dynamics = analyse_error(trace)
+    assert dynamics.shift == shift
+    assert dynamics.shift_gain < 0.2
 
 
 def test_particles_out_of_the_box_are_counted() -> None:
