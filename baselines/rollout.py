@@ -52,16 +52,16 @@ class Rollout:
 
 
 def count_predicted(rollout: Rollout, frames: int, *, input_frames: int) -> int:
-    """Return how many frames of a rollout the model predicted; others are frozen.
+    """Return how many frames of a rollout the model computed, before it was frozen.
 
     Args:
         rollout: a rollout from the first frames of its scenario.
-        frames: frames of the rollout.
+        frames: frames of the rollout, without the given ones.
         input_frames: given frames.
     """
     if rollout.diverged_at is None:
         return frames
-    # The model predicted the first frame that is not finite, too.
+    # The model computed the first frozen frame too: it was not finite, or far outside.
     return rollout.diverged_at - input_frames + 1
 
 

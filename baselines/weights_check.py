@@ -84,8 +84,9 @@ def check_settings(request: Sequence[str]) -> dict[str, Any]:
 
     ``effective`` are those that change the model, in one form and order; ``refused`` is
     why the model does not take them, None if it does. Where the weights cannot be read,
-    or their model is not installed, the settings are returned as they are written. It
-    is run in a child process.
+    or their model is not installed, the settings are returned as they are written.
+
+    Weights of strangers are for :func:`check_settings_in_child`.
 
     Args:
         request: path of the weights, then the settings.

@@ -625,7 +625,7 @@ class Predictors:
         return clouds
 
     def with_climatology(self, case: AnalogCase, choice: Choice) -> Clouds:
-        """Our own prediction, drawn towards the mean cloud of train at that frame."""
+        """Our own prediction, drawn towards the clouds of train at that frame."""
         clouds = self.shared(case, choice)
         images = []
         for scenario in long_enough(case.given.size):
@@ -635,14 +635,14 @@ class Predictors:
                 image = State(scenario, mirror, 0)
                 images.append(image)
         for frame in case.frames:
-            climate = self._mean_cloud(case, frame, images)
+            climate = self._pooled_cloud(case, frame, images)
             share = _share_since_flight(case, frame, choice)
             cloud = clouds[frame]
             target = _matched(cloud, climate, case)
             clouds[frame] = (1.0 - share) * cloud + share * target
         return clouds
 
-    def _mean_cloud(
+    def _pooled_cloud(
         self, case: AnalogCase, frame: int, images: Sequence[State]
     ) -> Floats:
         """Return particles spread over the clouds of train at a frame.
@@ -863,7 +863,7 @@ def _attempts_that_come_to_rest(predictors: Predictors) -> tuple[Attempt, ...]:
         ),
         Attempt(
             name="with-climatology",
-            what="ballistic-analog, drawn towards the mean cloud of train",
+            what="ballistic-analog, drawn towards particles of all clouds of train",
             predict=predictors.with_climatology,
             choices=grid(
                 lag=(0, 10),

@@ -1,7 +1,8 @@
 """Particle-grid transfer: quadratic B-splines and exact fixed-point sums.
 
-Shared by both formulations. A particle at x touches the 3 x 3 nodes base + (i, j) with
-the weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
+All kernels use it. In two dimensions a particle at x touches the 3 x 3 nodes
+base + (i, j) with the weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per
+axis
 
     w_0 = (3/2 - f)^2 / 2,    w_1 = 3/4 - (f - 1)^2,    w_2 = (f - 1/2)^2 / 2.
 
@@ -115,9 +116,9 @@ def base_node(rows: Template, s: i32, p: i32) -> Value:
 
 @ti.func
 def node_number(bits: f32, node_count: Template) -> Value:
-    """Return the number of a node, below ``node_count``, from a float with its bits.
+    """Return the number of a node from a float with the bits of that number.
 
-    It is masked, see :func:`masked`.
+    It has to be below ``node_count``: the mask is none of safety, see :func:`masked`.
     """
     number = ti.bit_cast(bits, i32)
     return masked(number, node_count)
@@ -125,12 +126,12 @@ def node_number(bits: f32, node_count: Template) -> Value:
 
 @ti.func
 def masked(number: i32, node_count: Template) -> Value:
-    """Return the number of a node, below ``node_count``, with a mask on its bits.
+    """Return the number of a node with a mask on its bits.
 
-    The mask changes no such number. It tells LLVM that the numbers of the neighbours do
-    not overflow either: their addresses are then one address plus constants. Without it
-    each address is computed anew. In two dimensions P2G is faster without the mask, and
-    G2P with it.
+    The mask changes no number below ``node_count``. It tells LLVM that the numbers of
+    the neighbours do not overflow either: their addresses are then one address plus
+    constants. Without it each address is computed anew. In two dimensions P2G is faster
+    without the mask, and G2P with it.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
     return number & mask

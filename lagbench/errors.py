@@ -479,7 +479,7 @@ def suggest_file(path: Path) -> str | None:
     """Return a hint that names the file of the same folder with the nearest name.
 
     A name with other digits is another scenario or run, so it is not suggested. None
-    where the folder holds no such file.
+    where no name is near, or where the folder holds too many files or is closed.
     """
     names: list[str] = []
     with suppress(OSError, ValueError), os.scandir(path.parent) as entries:

@@ -342,10 +342,13 @@ def _training_row(results: SplitResults, name: str) -> list[str]:
 
 
 def horizon_table(results: SplitResults) -> str:
-    """Return the scores over the horizon: skill, ranking metric, the chosen metrics."""
+    """Return the scores over the horizon: skill, ranking metric, the chosen metrics.
+
+    Methods without a score of the ranking metric have no row.
+    """
     metrics = _shown_metrics(results)
     heads = ["model", "skill", "seeds"]
-    for metric in metrics:  # as in "position_rmse [length], lower"
+    for metric in metrics:  # as in "position_rmse [length], ↓"
         goal = ARROWS[metric.direction]
         if metric.direction is Direction.TARGET:
             goal = f"{goal} {metric.perfect:g}"

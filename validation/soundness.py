@@ -10,7 +10,7 @@ particle or node at any substep.
 Exit code 0: every scenario of a free surface has a Mach number of at most 0.3 for 99.9
 % of its particles and frames, a J of at least 0.9 for 99.9 % of liquid particles and
 frames, and no particle at a numerical bound, and every scenario of a full box has a J
-from 0.85 to 1.15; 1: one has not; 2: bad options; 3: no data.
+from 0.85 to 1.15; 1: one has not; 2: bad options; 4: no data.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def describe_full_box(size: Size, entries: Sequence[FileEntry]) -> str:
     return (
         f"{size.split} {size.name} {size.version}: {sound_count} of {len(entries)} "
         f"scenarios sound; J {jacobian_min:.3f} to {jacobian_max:.3f}; largest Mach "
-        f"{speed / sound_speed:.3f}"
+        f"(of a velocity component) {speed / sound_speed:.3f}"
     )
 
 

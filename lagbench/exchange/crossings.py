@@ -16,14 +16,14 @@ CROSSING = 0.5
 """Step beyond which a particle crossed a periodic boundary, over the box's length."""
 
 CROSSING_MEDIAN = 0.1
-"""Median step of particles that follow a flow, over the box's length, at most."""
+"""The median step of particles that follow a flow is less, over the box's length."""
 
 FEWEST_CROSSINGS = 3
 """Particles that must cross at once before data count as periodic."""
 
 
 class CrossingCheck:
-    """Finds the axes along which a few particles move nearly the length of the box.
+    """Finds the axes along which a few particles move more than half the box.
 
     Most particles hardly move there. A trajectory may cross one boundary long before
     another, so all its frames are looked at before an error names the axes.
@@ -47,7 +47,8 @@ class CrossingCheck:
 
         Args:
             step: displacements since the frame before [length], [particle, axis].
-            lengths: lengths of the box [length], [axis].
+            lengths: lengths of the box, or of the region of all positions [length],
+                [axis]; an axis of length 0 has no crossings.
             frame: number of the frame.
         """
         self._dimension = step.shape[1]

@@ -50,7 +50,7 @@ def attribute_mse(pair: FramePair) -> float:
 class ErrorMean:
     """Mean of a particle error over all particles, or over those of one material."""
 
-    error: Callable[[FramePair], Floats]  # of all particles, shape [particle, 2]
+    error: Callable[[FramePair], Floats]  # of all particles, shape [particle, axis]
     norm: Callable[[Floats], float]  # mean squared or mean absolute error
     material: str | None = None  # name of a material, None for all
 

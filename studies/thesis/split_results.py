@@ -541,9 +541,10 @@ def _prediction_changes(entry: Entry, prediction: Prediction) -> tuple[str, ...]
 
 
 def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
-    """Return what an entry says of a training, with the keys of training.json.
+    """Return what an entry says of a training, as a record like training.json.
 
-    The record is empty unless the training used one of our recipes.
+    ``cpu_seconds`` are those of the entry's budget. The record is empty unless the
+    training used one of our recipes, and the entry states its steps and hours.
     """
     provenance = prediction.provenance or entry.provenance
     budget = prediction.budget
