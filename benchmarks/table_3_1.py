@@ -265,8 +265,8 @@ def markdown(
         "The next table shows how the times grow. Each row compares two quantities. "
         "For example, the row `t/frame against q^2` has the exponent p in "
         "t/frame ~ (q^2)^p. It is the slope of a least-squares line through the "
-        'logarithms of both. The column "thesis, same rows" uses only the rows of the '
-        "thesis that are in the table above.",
+        'logarithms of both. The column "thesis, same rows" uses the rows of the '
+        'thesis that are in the table above, and "thesis, all rows" uses all nine.',
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
