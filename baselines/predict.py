@@ -162,7 +162,7 @@ def predict(
     _check_batch(batch)
     checkpoint_path = expand_home(checkpoint, "checkpoint")
     trained = load(checkpoint_path)
-    output_path = expand_home(output)
+    output_path = expand_home(output, "--output")
     check_outputs(output_path, overwrite=overwrite)
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)

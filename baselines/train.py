@@ -114,7 +114,7 @@ class UnseenForcingWarning(UserWarning):
 
 
 class DamagedLogWarning(UserWarning):
-    """A training is over, and training.json is not its log."""
+    """A training is finished, but training.json is missing, damaged or of another."""
 
 
 def train(
@@ -164,8 +164,8 @@ def train(
         registry: where splits are described; ours when None.
 
     An :class:`UnseenForcingWarning` tells of a force or an obstacle that the model does
-    not see, a :class:`DamagedLogWarning` of a training.json beside a training that was
-    over before.
+    not see. A :class:`DamagedLogWarning` tells that a training is finished, and that
+    its training.json is missing, damaged or the log of another training.
 
     Raises:
         UsageError: unknown baseline, split, size, recipe or key; images that gravity
@@ -272,8 +272,7 @@ def _warn_of_damaged_log(job: TrainingJob) -> None:
         return
     message = (
         f"{folder.log} is missing, damaged, or not the log of the finished training "
-        "beside it; the weights are unharmed: restore the file from a copy, or train "
-        "anew with --fresh"
+        "beside it; restore the file from a copy, or train anew with --fresh"
     )
     warnings.warn(message, DamagedLogWarning, stacklevel=4)
 
@@ -319,7 +318,7 @@ def _open_folder(
         if initial is not None:
             name += "-further"
         output = Path("runs") / recipe.name / f"{name}-{recipe.training.seed}"
-    folder = RunFolder(expand_home(output))
+    folder = RunFolder(expand_home(output, "--output"))
     check_writable(folder.path, option="--output")
     if initial is not None and folder.holds(initial.path):
         raise UsageError(

@@ -133,7 +133,7 @@ class TrainingLoop:
         self._interrupts = Interrupts()
         self._uses_bfloat16 = uses_bfloat16(job)
         self._is_over = False
-        # best weights so far that are not written yet
+        # weights of the start, not written while an earlier training lies in the folder
         self._start_weights: Checkpoint | None = None
         self._tensorboard: SummaryWriter | None = None
 
@@ -173,8 +173,8 @@ class TrainingLoop:
         model.train()
         if self.validation is not None and self._starts_from_weights():
             self._validate(self.validation)
-            # No training could go on from weights without a checkpoint. Weights of
-            # others replace no earlier training.
+            # No training could go on from weights without a checkpoint. The weights
+            # of --start alone do not replace an earlier training.
             if not self.job.folder.has_earlier_files:
                 self._store()
 

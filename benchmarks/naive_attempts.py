@@ -634,6 +634,8 @@ class Predictors:
             for mirror in range(len(self.library.mirrors)):
                 image = State(scenario, mirror, 0)
                 images.append(image)
+        if not images:
+            return clouds
         for frame in case.frames:
             climate = self._pooled_cloud(case, frame, images)
             share = _share_since_flight(case, frame, choice)

@@ -227,9 +227,9 @@ size mini in leaderboard/scores. (Score files of entries that are not
 [active](glossary.md) count too.)
 
 The measurement needs two methods whose means differ by less than a factor of two. At
-least one of these methods must have several seeds. A split without such a
-pair of methods has no row. A row is inaccurate if its split has only one such pair,
-and only one method of the pair has several seeds.
+least one of these methods must have several seeds. A split without such a pair of
+methods has no row. A row is inaccurate if its split has only one such pair, and only
+one method of the pair has several seeds.
 
 **Result.** The last three columns show the share of {draws} draws in which the test
 finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or

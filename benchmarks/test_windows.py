@@ -7,8 +7,8 @@ The readers do what geoelements/gns (NPZ, everything in memory) and LagrangeBenc
 one group per trajectory, windows read when asked for) do for a window of 6 + 1 frames;
 all draw windows at random. Files are made without simulating, in seconds: each scenario
 is a rotation at its own speed. Ours is timed over whole pools of its sampler,
-decompression included, in one process. Memory is that of two
-fresh processes: one reads 7 scenarios, the other 12.
+decompression included, in one process. Memory is that of two fresh processes: one reads
+7 scenarios, the other 12.
 """
 
 from __future__ import annotations

@@ -120,10 +120,12 @@ def check_constants(
             _check_value(field, values, size)
         elif field.default is MISSING:
             raise _missing_parameter(field.name, kind, size)
-    has_fringe = bool(values.get("fringe_rate", 0.0))
-    fringe_length = values.get("fringe_length", 0.0)
-    if has_fringe and not _POSITIVE.holds(fringe_length):
-        raise _impossible_value("fringe_length", fringe_length, str(_POSITIVE), size)
+    if values.get("fringe_rate", 0.0):
+        if "fringe_length" not in values:
+            raise _missing_parameter("fringe_length", kind, size)
+        length = values["fringe_length"]
+        if not _POSITIVE.holds(length):
+            raise _impossible_value("fringe_length", length, str(_POSITIVE), size)
 
 
 def place_of(size: Size) -> str:

@@ -118,7 +118,8 @@ def base_node(rows: Template, s: i32, p: i32) -> Value:
 def node_number(bits: f32, node_count: Template) -> Value:
     """Return the number of a node from a float with the bits of that number.
 
-    It has to be below ``node_count``: the mask is none of safety, see :func:`masked`.
+    The number must be below ``node_count``. The mask does not check this, see
+    :func:`masked`.
     """
     number = ti.bit_cast(bits, i32)
     return masked(number, node_count)
@@ -130,8 +131,8 @@ def masked(number: i32, node_count: Template) -> Value:
 
     The mask changes no number below ``node_count``. It tells LLVM that the numbers of
     the neighbours do not overflow either: their addresses are then one address plus
-    constants. Without it each address is computed anew. In two dimensions P2G is faster
-    without the mask, and G2P with it.
+    constants. Without it each address is computed anew. In two dimensions P2G has no
+    mask: on processors without AVX it is slower with one.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
     return number & mask

@@ -188,7 +188,7 @@ def _without_verdict(
     return (
         f"On {results.where} there is no verdict. There every classical solver costs"
         f" more than the best model ({label(model)}). The error of this model is"
-        f" {number(against.value)} of the error of the cheapest solver"
+        f" {number(against.value)} times the error of the cheapest solver"
         f" ({label(against.reference)}), with a 95 % interval from {number(low)} to"
         f" {number(high)}."
     )

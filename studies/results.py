@@ -95,8 +95,8 @@ HOW_TO_READ = """\
 - **Tables of scores** contain models and reference predictors. A cell has the mean over
   the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
   several seeds, the number after ± is the standard deviation over the seeds. For such a
-  model the leaderboard resamples the seeds too, so the intervals on
-  the leaderboard are wider than those on this page.
+  model the leaderboard resamples the seeds too, so the intervals on the leaderboard are
+  wider than those on this page.
   "1440 undefined" means that the metric is undefined in 1440 frames. The tables of
   `fluid` and `multimaterial` leave out the metrics of the vorticity. The column
   `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these

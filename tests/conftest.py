@@ -66,6 +66,10 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
+# Tests import studies, validation and benchmarks from the clone, and lagbench as it is
+# installed.
+sys.path.append(str(Path(__file__).parents[1]))
+
 SPLIT = "curl-noise"
 SIZE = "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""

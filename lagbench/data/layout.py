@@ -265,21 +265,21 @@ def expand_path(path: str | Path, where: str) -> Path:
         ) from error
 
 
-def expand_home(output: str | Path, where: str = "--output") -> Path:
+def expand_home(path: str | Path, where: str) -> Path:
     """Return the path of a file, a first part ~ replaced by the home folder.
 
     Other paths stay as they are, also names that begin with ~.
 
     Args:
-        output: the path that a user gave.
+        path: the path that a user gave.
         where: the option or argument that held it, for the message.
 
     Raises:
         UsageError: the user of ``~user`` has no home folder.
     """
-    if Path(output).parts[:1] == ("~",):
-        return expand_path(output, where)
-    return Path(output)
+    if Path(path).parts[:1] == ("~",):
+        return expand_path(path, where)
+    return Path(path)
 
 
 def no_home_error(where: str) -> UsageError:

@@ -152,8 +152,8 @@ NAME = re.compile("[a-z][a-z0-9_]{0,63}")
 RESERVED = ("skill",)
 """Names that no metric may have: tables have a row `skill`."""
 
-REAL_KINDS = "biufO"
-"""Kinds of NumPy's types whose values are real numbers, or are converted one by one."""
+REAL_KINDS = "biuf"
+"""Kinds of NumPy's types whose values are real numbers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,20 +309,18 @@ class Metric:
         """
         place = "over all frames"
         try:
-            series = np.asarray(self.series(*statistics))
-            # NumPy would drop imaginary parts, and read texts and times as numbers.
-            is_real = series.dtype.kind in REAL_KINDS
-            if is_real:
-                series = series.astype(np.float64, copy=False)
+            given = np.asarray(self.series(*statistics))
         except (Exception, SystemExit) as error:
             self.raise_named(error, place)
-        if not is_real:
+        try:
+            series = _as_floats(given)
+        except (TypeError, ValueError, OverflowError):
             raise self._failure(
                 "the series of a metric has no real numbers",
                 f"{_line_of_function(self.series)}, {self.name}, {place}",
                 expected="a float per frame",
-                got=series,
-            )
+                got=given,
+            ) from None
         if series.shape != statistics[0].shape:
             raise self._failure(
                 "the series of a metric has another shape",
@@ -350,10 +348,9 @@ class Metric:
 
         An array of one element is converted.
         """
-        if not isinstance(value, (str, bytes, complex, np.complexfloating)):
-            # as arrays of other packages raise
-            with suppress(TypeError, ValueError, OverflowError, RuntimeError):
-                return float(value)  # type: ignore[arg-type]
+        # as arrays of other packages raise
+        with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+            return _as_float(value)
         raise self._failure(
             "a metric gave no number",
             f"{_line_of_function(function)}, {self.name}, {place}",
@@ -437,6 +434,35 @@ class Metric:
         if self.direction is Direction.HIGHER:
             return -value
         return value
+
+
+def _as_floats(values: np.ndarray[Any, Any]) -> Floats:
+    """Return real numbers as floats.
+
+    NumPy would drop imaginary parts, and read texts and times as numbers.
+
+    Raises:
+        TypeError: a value is complex, a text, a time or another object.
+    """
+    if values.dtype == object:  # as fractions
+        numbers = [_as_float(value) for value in values.ravel()]
+        return np.array(numbers).reshape(values.shape)
+    if values.dtype.kind not in REAL_KINDS:
+        raise TypeError(f"{values.dtype} has no real numbers")
+    return np.asarray(values, np.float64)
+
+
+def _as_float(value: object) -> float:
+    """Return a real number as a float; an array of one element is converted.
+
+    Raises:
+        TypeError: it is complex, a text, a time or another object.
+    """
+    if isinstance(value, str | bytes | complex):
+        raise TypeError(f"{type(value).__name__} is no real number")
+    if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
+        return float(_as_floats(np.asarray(value)))
+    return float(value)  # type: ignore[arg-type]
 
 
 def _line_of_function(function: object) -> str:

@@ -84,7 +84,7 @@ def predict_onnx(
             prediction writes the same output.
     """
     model_path = expand_home(model, "model")
-    output_path = expand_home(output)
+    output_path = expand_home(output, "--output")
     check_predictions_output(output_path, overwrite=overwrite)
     declared = check_onnx(model_path)
     label = method or _method_of(model_path)

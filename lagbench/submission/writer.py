@@ -733,7 +733,7 @@ def template(
     """
     any_size, folder, splits = locate(split, size, root=root, registry=registry)
     entry = any_size.scored_on(subset)
-    output_path = expand_home(output)
+    output_path = expand_home(output, "--output")
     check_predictions_output(output_path, overwrite=overwrite)
     update_working_copy(entry, folder, entry.subsets[subset])
     truth = Truth(entry, folder)

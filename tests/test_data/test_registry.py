@@ -520,13 +520,18 @@ def test_a_rate_of_zero_stands_for_no_fringe(
     check_symmetry("square", size, find_forcing=tuple)
 
 
-@pytest.mark.parametrize("length", [None, 0.0])
+@pytest.mark.parametrize(
+    ("length", "parts"),
+    [
+        (None, ("parameter fringe_length", "declare fringe_length")),
+        (0.0, ("parameter fringe_length", "a finite number, > 0", "0.0")),
+    ],
+)
 def test_a_fringe_with_a_rate_needs_a_length(
-    tmp_path: Path, length: float | None
+    tmp_path: Path, length: float | None, parts: tuple[str, ...]
 ) -> None:
     path = edited(tmp_path, with_fringe(length, 20.0))
     size = load(path).size("poiseuille", "tiny")
-    parts = ("parameter fringe_length", "a finite number, > 0", "0.0")
     refused(path, parts, partial(solver_constants, size))
 
 

@@ -720,6 +720,8 @@ def test_a_metric_of_another_shape_is_refused(what: str, function: Any) -> None:
         lambda values: values + 1j,
         lambda values: values.astype(str),
         lambda values: values.astype("timedelta64[s]"),
+        lambda values: (values + 1j).astype(object),
+        lambda values: values.astype(str).astype(object),
     ],
 )
 def test_a_series_without_real_numbers_is_refused(function: Any) -> None:
@@ -732,8 +734,11 @@ def test_a_series_without_real_numbers_is_refused(function: Any) -> None:
 
 
 @pytest.mark.parametrize("what", ["statistic", "over_frames"])
-@pytest.mark.parametrize("value", [1 + 2j, np.complex64(1 + 2j), np.complex128(1)])
-def test_a_complex_number_is_no_value(what: str, value: complex) -> None:
+@pytest.mark.parametrize(
+    "value",
+    [1 + 2j, np.complex64(1 + 2j), np.array(1 + 0j), np.array("7"), "7", b"7"],
+)
+def test_what_is_no_real_number_is_no_value(what: str, value: object) -> None:
     bad: Any = replace(OTHERS, **{what: lambda _: value})
     with pytest.raises(WorkFailedError) as caught:
         aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})

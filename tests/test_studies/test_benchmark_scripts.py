@@ -17,7 +17,13 @@ import pytest
 from numpy.testing import assert_allclose
 from score_bench import ScoreBench, still
 
-from benchmarks import by_materials, free_flight, inference_cost, table_3_1
+from benchmarks import (
+    by_materials,
+    free_flight,
+    inference_cost,
+    naive_attempts,
+    table_3_1,
+)
 from benchmarks.naive_attempts import (
     AnalogCase,
     Kinds,
@@ -204,13 +210,23 @@ class OneScenario(Library):
         return States((State(0, 0, 1),), feature[None])
 
 
-@pytest.mark.parametrize("name", ["windows", "from_the_start"])
-def test_the_only_scenario_of_train_is_predicted_by_free_flight(name: str) -> None:
+@pytest.mark.parametrize("name", ["windows", "from_the_start", "with_climatology"])
+def test_the_only_scenario_of_train_is_predicted_by_free_flight(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It may not be looked at, and there is no other one."""
+    monkeypatch.setattr(naive_attempts, "long_enough", lambda _: [0])
     case = falling_case(without=0)
     predictors = Predictors(OneScenario(case.given.size, Path()))
     # analogs would take over at the first frame
-    choice = {"window": 5, "lag": -case.flight, "velocity_weight": 20.0, "analogs": 2}
+    choice = {
+        "window": 5,
+        "lag": -case.flight,
+        "velocity_weight": 20.0,
+        "analogs": 2,
+        "most": 0.5,
+        "time": 50,
+    }
     predict = getattr(predictors, name)
     assert_falling(case, predict(case, choice))
 

@@ -193,7 +193,7 @@ def test_a_model_cheaper_than_every_solver_may_stand_behind_them() -> None:
     solver_error = results.methods["projection"].scores[results.ranking].mean
     ratio = model_error / solver_error
     assert ratio > 1.0
-    sentence = f"{ratio:.3g} of the error of the cheapest solver (projection)"
+    sentence = f"{ratio:.3g} times the error of the cheapest solver (projection)"
     assert sentence in verdict
 
 
