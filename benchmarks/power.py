@@ -231,9 +231,9 @@ least one of these methods must have several seeds. A split without such a pair 
 methods has no row. A row is inaccurate if its split has only one such pair, and only
 one method of the pair has several seeds.
 
-**Result.** The last three columns show the share of {draws} draws in which the test
-finds a difference at the level of 5 %. One of the two methods is better by 5, 10 or
-20 %, as the head of the column states. Each method has {seeds} seeds.
+**Result.** In the last three columns one of the two methods is better by 5, 10 or 20 %,
+as the head of the column states. A cell shows the share of {draws} draws in which the
+test finds this difference, at the significance level 0.05. Each method has {seeds} seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
@@ -266,9 +266,9 @@ The rows *middling* and *large* are equal. All standard deviations of *large* ar
 those of *middling*, so all differences are twice as large. The test does not depend on
 the scale of the differences.
 
-The leaderboard has {pair_count} pairs of two seeds of the same method at size mini:
-{pairs_by_split}. The test finds a difference, at 5 %, in
-{differing_count} of these pairs.
+The score files of size mini have {pair_count} pairs of two seeds of the same method
+(also those of entries that are not active): {pairs_by_split}.
+The test finds a difference, at 5 %, in {differing_count} of these pairs.
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))

@@ -212,8 +212,8 @@ lagbench submit predictions.nc --from meta.yaml
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
 figures of the thesis at a size, and trains the models that they need. With the option
 `--split` it trains all models of the thesis for this split, and NeuralMPM. If you
-interrupt the command, the same command continues. `lagbench submit` makes entries from
-the predictions of the trained models.
+interrupt the command, run it again: it continues where it stopped. `lagbench submit`
+makes entries from the predictions of the trained models.
 
 This page shows only results that have an entry. `python -m studies.results` can also
 show the results of two files that are not in the repository: `mlp_studies.json` and
