@@ -233,7 +233,8 @@ one method of the pair has several seeds.
 
 **Result.** In the last three columns one of the two methods is better by 5, 10 or 20 %,
 as the head of the column states. A cell shows the share of {draws} draws in which the
-test finds this difference, at the significance level 0.05. Each method has {seeds} seeds.
+test finds this difference, at the significance level 0.05. Each method has {seeds}
+seeds.
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
