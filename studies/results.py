@@ -99,8 +99,8 @@ HOW_TO_READ = """\
   wider than those on this page.
   "1440 undefined" means that the metric is undefined in 1440 frames. The tables of
   `fluid` and `multimaterial` leave out the metrics of the vorticity. The column
-  `seeds` states how many seeds a model has. In the tables of costs `seeds` lists these
-  seeds.
+  `seeds` states how many seeds a model has; for a reference predictor it states the
+  kind. In the tables of costs `seeds` lists the seeds.
 - **Tests** are two-sided. If both models have one seed, the test is the exact
   sign-flip test over scenarios. Otherwise it is a t-test, whose variance has two
   parts, scenarios and seeds ([scoring](scoring.md#comparing-two-methods)). Two models

@@ -148,7 +148,7 @@ COMMANDS = (
     CommandEntry(
         name="clean",
         target="clean:clean_command",
-        summary="Remove a data set, or only its temporary files.",
+        summary="Remove one data set, or only its temporary files.",
         example="clean --split cavity --size tiny --dry-run",
     ),
 )

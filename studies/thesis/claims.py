@@ -103,8 +103,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does NeuralMPM with shape matching gain by one more grid, of 60 cells, for shape "
-    "and for density?": Claim(
+    "Does NeuralMPM with shape matching gain by one more grid, with 60 cells along "
+    "each axis, for the shape matching and for the density?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),
