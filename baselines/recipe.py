@@ -36,6 +36,7 @@ from pydantic import (
 )
 
 from lagbench.data.field_errors import describe_expectation
+from lagbench.data.layout import expand_home
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
@@ -358,7 +359,7 @@ def recipe_for(
     """
     path = entry.recipes
     if variant is not None and variant.endswith((".yaml", ".yml")):
-        path = Path(variant)
+        path = expand_home(variant, "--recipe")
         variant = None
     file = _RecipeFile(format=1)
     if path:

@@ -551,9 +551,15 @@ def _interruption_message(command: str | None) -> str:
     words = [command or ""]
     if command in GROUPS:
         words.extend(sys.argv[2:3])
-    if " ".join(words) not in RESUMABLE_COMMANDS:
+    is_resumable = " ".join(words) in RESUMABLE_COMMANDS
+    if not is_resumable or "--no-record" in sys.argv:
         return f"lagbench: interrupted; {same_command} begins anew"
-    for option in ("--force", "--again", "--fresh"):
+    if command == "train" and "--fresh" in sys.argv:
+        return (
+            f"lagbench: interrupted; {same_command}, without --fresh, goes on with the "
+            "training that its folder holds"
+        )
+    for option in ("--force", "--again"):
         if option in sys.argv:
             same_command += f", without {option},"
     return f"lagbench: interrupted; {same_command} goes on where it stopped"

@@ -333,7 +333,7 @@ def import_split(
             got="axes",
             fix="leave it out; adopt takes it",
         )
-    folder = Path(source)
+    folder = expand_home(source, "source")
     if not folder.is_dir():
         raise UnreadableFileError(
             "there is no such folder",

@@ -309,7 +309,7 @@ class Metric:
         """
         place = "over all frames"
         try:
-            given = np.asarray(self.series(*statistics))
+            given = np.asanyarray(self.series(*statistics))
         except (Exception, SystemExit) as error:
             self.raise_named(error, place)
         try:
@@ -437,9 +437,9 @@ class Metric:
 
 
 def _as_floats(values: np.ndarray[Any, Any]) -> Floats:
-    """Return real numbers as floats.
+    """Return real numbers as floats, and NaN for masked ones.
 
-    NumPy would drop imaginary parts, and read texts and times as numbers.
+    NumPy would drop imaginary parts and masks, and read texts and times as numbers.
 
     Raises:
         TypeError: a value is complex, a text, a time or another object.
@@ -449,6 +449,8 @@ def _as_floats(values: np.ndarray[Any, Any]) -> Floats:
         return np.array(numbers).reshape(values.shape)
     if values.dtype.kind not in REAL_KINDS:
         raise TypeError(f"{values.dtype} has no real numbers")
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
     return np.asarray(values, np.float64)
 
 
@@ -457,11 +459,12 @@ def _as_float(value: object) -> float:
 
     Raises:
         TypeError: it is complex, a text, a time or another object.
+        ValueError: it is an array of several elements, or of none.
     """
     if isinstance(value, str | bytes | complex):
         raise TypeError(f"{type(value).__name__} is no real number")
     if isinstance(value, np.ndarray | np.generic) and value.dtype != object:
-        return float(_as_floats(np.asarray(value)))
+        return _as_floats(np.asanyarray(value)).item()
     return float(value)  # type: ignore[arg-type]
 
 

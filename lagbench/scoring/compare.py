@@ -319,6 +319,8 @@ def compare(
         expected_split, root, _ = locate_split(split, root=root, registry=registry)
     first = _expand_source(first, "A")
     second = _expand_source(second, "B")
+    if board is not None:
+        board = expand_home(board, "board")
     board_folder, entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)

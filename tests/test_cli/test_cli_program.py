@@ -185,6 +185,7 @@ def test_an_interruption_says_to_leave_out_what_deletes_the_work(
     ("line", "advice"),
     [
         ("leaderboard reproduce --all", "goes on where it stopped"),
+        ("leaderboard reproduce --all --no-record", "begins anew"),
         ("leaderboard check", "begins anew"),
         ("score predictions.nc", "begins anew"),
         ("predict weights.pt", "begins anew"),

@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -743,6 +744,29 @@ def test_what_is_no_real_number_is_no_value(what: str, value: object) -> None:
     with pytest.raises(WorkFailedError) as caught:
         aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
     assert "enstrophy_error" in str(caught.value.where)
+
+
+@pytest.mark.parametrize(
+    ("what", "function"),
+    [
+        ("statistic", lambda _: np.ma.masked),
+        ("over_frames", lambda _: np.ma.masked),
+        ("series", lambda values: np.ma.masked_all(len(values))),
+    ],
+)
+def test_a_masked_number_is_undefined(what: str, function: Any) -> None:
+    """What lies under a mask is arbitrary; it never counts, least of all as 0."""
+    masked: Any = replace(OTHERS, **{what: function})
+    pieces = tally(pairs(), [masked], CONFIG.predicted_frames)
+    score = aggregate([masked], {0: pieces})[masked.name]
+    assert np.isnan(score.mean)
+
+
+@pytest.mark.parametrize("value", [np.array([2.5]), np.float32(2.5), Fraction(5, 2)])
+def test_one_number_in_another_form_is_converted(value: Any) -> None:
+    one: Any = replace(OTHERS, over_frames=lambda _: value)
+    pieces = tally(pairs(), [one], CONFIG.predicted_frames)
+    assert aggregate([one], {0: pieces})[one.name].mean == 2.5
 
 
 @dataclass(frozen=True)
