@@ -51,6 +51,8 @@ class Publication:
         self.stored_entries: dict[int, FileEntry] = {}
         # SHA-256 of the objects in the store, by path
         self._object_hashes: dict[str, str] = {}
+        # scenarios that another writer has added to the store's manifest meanwhile
+        self._foreign_scenarios: set[int] = set()
         for entry in self._list_right_entries(self._published):
             has_possible_length = entry.bytes <= size.longest_file(entry.scenario)
             if has_possible_length and lengths.get(entry.path) == entry.bytes:
@@ -133,14 +135,17 @@ class Publication:
         """Put a manifest with the entries that another writer has added meanwhile."""
         if manifest == self._published and not anew:
             return
-        known_scenarios = set()
-        for source in (self._published, self._latest, manifest):
+        # What this writer has published and then taken out must not come back.
+        published_scenarios = {entry.scenario for entry in self._published.files}
+        known_scenarios = published_scenarios - self._foreign_scenarios
+        for source in (self._latest, manifest):
             known_scenarios |= {entry.scenario for entry in source.files}
         stored_manifest = self._read_manifest()
         added_entries = []
         for entry in self._list_right_entries(stored_manifest):
             if entry.scenario not in known_scenarios:
                 added_entries.append(entry)
+                self._foreign_scenarios.add(entry.scenario)
         joined = join_manifests(self._size, manifest, stored_manifest, added_entries)
         text = joined.model_dump_json(indent=1) + "\n"
         self._objects.write(MANIFEST_NAME, text.encode())

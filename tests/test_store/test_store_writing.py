@@ -231,7 +231,9 @@ def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seconds", [publication.MANIFEST_SECONDS, 0.0])
 def test_two_writers_do_no_harm(
+    seconds: float,
     url: str,
     run: Run,
     simulated_here: Fill,
@@ -240,8 +242,9 @@ def test_two_writers_do_no_harm(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two machines write different scenarios at once: the last manifest names what both
-    have put.
+    have put, also if a manifest follows each file.
     """
+    monkeypatch.setattr(publication, "MANIFEST_SECONDS", seconds)
     simulated_here(url)
     put_first = Objects.put
 
