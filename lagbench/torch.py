@@ -397,7 +397,7 @@ def check_history(history: int | None, given_frames: int, *, where: str) -> int:
             where=where,
             expected=f"history from 1 to {given_frames}",
             got=history,
-            fix="leave history out, or give fewer frames",
+            fix=f"leave history out, or give a number from 1 to {given_frames}",
         )
     return history
 

@@ -1188,7 +1188,7 @@ def build(
         documentation: address of the documentation's site; empty where it has none.
 
     Raises:
-        ChecksFailedError: with ``check``, a file is stale.
+        ChecksFailedError: with ``check``, a file is stale; else see :func:`collect`.
         UsageError, UnreadableFileError, DataError: see :func:`collect`.
     """
     folder = Folder(board)

@@ -917,7 +917,7 @@ def _load_entry(
         scoring: options with which predictions are scored.
 
     Raises:
-        UsageError: neither an entry nor a reference has the name.
+        UsageError: no entry has the name, or it has the file of the first method.
     """
     place = (one.identity["split"], one.identity["size"], name)
     if place not in entries:

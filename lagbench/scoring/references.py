@@ -2,8 +2,8 @@
 
 :func:`measure` produces the shipped ones
 (``python -m lagbench.scoring.measure_references``), and they are checked against it.
-Each measured scenario is saved under the root folder, so that an interrupted
-measurement continues where it stopped.
+With ``resume`` each measured scenario is saved under the root folder, so that an
+interrupted measurement continues where it stopped.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def remeasure(
 class ReferenceJob:
     """Input of a worker that measures the references on one scenario."""
 
-    task: ScoredTask  # the test subset
+    task: ScoredTask  # the subset that is scored
     scenario: int  # id of the scenario
     references: tuple[str, ...]  # their names
     metrics: tuple[str, ...]  # names of the metrics

@@ -248,13 +248,13 @@ def _percent_encode(url: str) -> str:
 
 
 def _check_host(host: str | None) -> None:
-    """Refuse a number that stands for an IP address in another spelling.
+    """Refuse a host that ends with a number and is no plain IPv4 address.
 
     ``0x7f.1`` and ``2130706433`` are this machine to a resolver, and no host to a
     reader.
 
     Raises:
-        ValueError: there is no host, or it is such a number.
+        ValueError: there is no host, or it is such a host.
     """
     if not host:
         raise ValueError("it names no host")
@@ -265,7 +265,7 @@ def _check_host(host: str | None) -> None:
         ipaddress.IPv4Address(host)
     except ValueError:
         raise ValueError(
-            "its host is a number, but no address as in 192.0.2.1"
+            "its host ends with a number, but is no address as in 192.0.2.1"
         ) from None
 
 

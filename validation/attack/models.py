@@ -171,7 +171,8 @@ def wrong_result(path: Path, rng: np.random.Generator) -> None:
 
 
 def greedy(path: Path, rng: np.random.Generator) -> None:
-    """Need more memory or time than there is."""
+    """Let the model multiply square matrices, for more time or memory than it has."""
+    # a matrix of side 3,000 takes too long, one of side 10^6 has 4 TB
     side = (3_000, 10**6)[rng.integers(2)]
     shape = numpy_helper.from_array(np.array([side, side], np.int64), "shape")
     model = _load(path)
