@@ -64,8 +64,8 @@ trainings. (The thesis is D. Dharma, PhD thesis, University of Leeds, 2025.)
 The first table has the best learned model and the best hybrid of each data set. (Some
 data sets have no hybrid. Data sets of size tiny have no model at all, so they are not
 on this page.) Then follow the claims, the trainings, and one chapter for each data set.
-A chapter has all models. The chapters of cavity, fluid and multimaterial also have the
-numbers of the thesis beside ours."""
+A chapter has all models with an active entry on its data set. The chapters of cavity,
+fluid and multimaterial also have the numbers of the thesis beside ours."""
 
 SUMMARY_NOTE = """\
 Each row compares the best learned model, or the best hybrid, of a data set with the

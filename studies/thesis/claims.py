@@ -86,9 +86,9 @@ _CLAIMS = {
     ),
     "Does NeuralMPM learn better from its own rollouts than from more unrolled "
     "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
-    "Is one velocity grid for all materials better for NeuralMPM than one grid per "
-    "material, if the model with one grid per material has at least as many training "
-    "steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
+    "Is NeuralMPM better with one velocity grid for all materials than with one grid "
+    "per material? (The model with one grid per material has at least as many training "
+    "steps as the other.)": Claim("neuralmpm", ("neuralmpm-unmixed",)),
     "Does NeuralMPM gain by three changes together: momentum is conserved, a call "
     "predicts fewer frames, and more of the windows are from the first frames?": Claim(
         "neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")
@@ -103,8 +103,8 @@ _CLAIMS = {
     ),
     "Does NeuralMPM with shape matching gain by starting from the weights of "
     "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
-    "Does NeuralMPM with shape matching gain by one more grid, with 60 cells along "
-    "each axis, for the shape matching and for the density?": Claim(
+    "Does NeuralMPM with shape matching gain if the shape matching and the density use "
+    "an additional grid of 60 cells along each axis?": Claim(
         "neuralmpm-projected-finer",
         ("neuralmpm-projected-started", "neuralmpm-projected"),
     ),
