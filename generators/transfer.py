@@ -131,8 +131,9 @@ def masked(number: i32, node_count: Template) -> Value:
 
     The mask changes no number below ``node_count``. It tells LLVM that the numbers of
     the neighbours do not overflow either: their addresses are then one address plus
-    constants. Without it each address is computed anew. In two dimensions P2G has no
-    mask: on processors without AVX it is slower with one.
+    constants. Without it each address is computed anew. P2G of closed boxes and free
+    surfaces in two dimensions has no mask: on processors without AVX it is slower with
+    one.
     """
     mask = ti.static((1 << node_count.bit_length()) - 1)
     return number & mask

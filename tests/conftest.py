@@ -196,6 +196,22 @@ def running() -> Iterator[Browser]:
         yield started
 
 
+@pytest.fixture
+def home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A home folder of the user; the working folder is another one.
+
+    Nothing appears in the working folder, least of all a folder named ~.
+    """
+    folder = tmp_path / "home"
+    working_folder = tmp_path / "here"
+    folder.mkdir()
+    working_folder.mkdir()
+    monkeypatch.chdir(working_folder)
+    monkeypatch.setenv("HOME", str(folder))
+    yield folder
+    assert list(working_folder.iterdir()) == []
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(home: Path) -> Iterator[None]:
     """Keep out of the user's cache."""

@@ -5,6 +5,7 @@ refused.
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -270,17 +271,12 @@ def test_trainings_and_predictions_may_lie_in_the_home_folder(
     stored: Callable[..., Path],
     generated: GenerationResult,
     unmeasured: Registry,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    home_folder: Path,
 ) -> None:
-    """As other files that functions of the package write; no folder named ~ appears."""
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    start = stored()
-    result = run("any", *STILL, start=f"~/{start.name}", output="~/trained")
-    assert result.weights == tmp_path / "trained" / "weights.pt"
+    """As other files that functions of the package write."""
+    shutil.copy(stored(), home_folder / "start.pt")
+    result = run("any", *STILL, start="~/start.pt", output="~/trained")
+    assert result.weights == home_folder / "trained" / "weights.pt"
     prediction = predict(
         "~/trained/weights.pt",
         "~/made.nc",
@@ -288,9 +284,8 @@ def test_trainings_and_predictions_may_lie_in_the_home_folder(
         registry=unmeasured,
         threads=1,
     )
-    assert prediction.path == tmp_path / "made.nc"
+    assert prediction.path == home_folder / "made.nc"
     assert prediction.path.is_file()
-    assert list(here.iterdir()) == []
 
 
 def test_the_record_counts_the_hours_before_the_start(

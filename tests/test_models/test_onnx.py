@@ -634,23 +634,17 @@ def test_a_file_whose_name_is_no_method_needs_the_option(
 
 
 def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
-    tmp_path: Path, generated: GenerationResult, monkeypatch: pytest.MonkeyPatch
+    home_folder: Path, generated: GenerationResult
 ) -> None:
     """In Python and on the command line, also of weights."""
-    home = tmp_path / "home"
-    here = tmp_path / "here"
-    for folder in (home, here):
-        folder.mkdir()
-    straight_on(home / "lines.onnx")
-    monkeypatch.chdir(here)
-    monkeypatch.setenv("HOME", str(home))
+    straight_on(home_folder / "lines.onnx")
     options: dict[str, Any] = {
         "split": SIZE.split,
         "size": SIZE.name,
         "root": generated.root,
     }
     result = predict_onnx("~/lines.onnx", "~/predictions.nc", **options)
-    assert result.path == home / "predictions.nc"
+    assert result.path == home_folder / "predictions.nc"
     assert result.path.is_file()
     with pytest.raises(UsageError) as caught:
         predict_onnx("~/lines.onnx", "~/predictions.nc", **options)
@@ -660,11 +654,10 @@ def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
     words += ["--root", str(generated.root), "--no-bench"]
     command = CliRunner().invoke(app, [*words, "--output=~/command.nc"])
     assert command.exit_code == 0, command.output
-    assert (home / "command.nc").is_file()
+    assert (home_folder / "command.nc").is_file()
     weights = CliRunner().invoke(app, ["predict", "~/weights.pt"])
     assert weights.exit_code == 3
-    assert str(home / "weights.pt") in weights.output
-    assert list(here.iterdir()) == []
+    assert str(home_folder / "weights.pt") in weights.output
 
 
 def test_a_model_may_be_exported_to_the_home_folder(

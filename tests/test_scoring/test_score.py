@@ -254,24 +254,16 @@ def test_workers_write_the_same_bytes(
 
 
 def test_predictions_and_scores_may_lie_in_the_home_folder(
-    bench: ScoreBench,
-    predictions: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    bench: ScoreBench, predictions: Path, home_folder: Path
 ) -> None:
-    """By default scores lie beside the predictions; no folder named ~ appears."""
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    shutil.copy(predictions, tmp_path / "mine.nc")
-    places = {None: tmp_path / "mine", "~/scores": tmp_path / "scores"}
+    """By default scores lie beside the predictions."""
+    shutil.copy(predictions, home_folder / "mine.nc")
+    places = {None: home_folder / "mine", "~/scores": home_folder / "scores"}
     for output_dir, folder in places.items():
         card = scoring.score(
             "~/mine.nc", root=bench.root, registry=bench.registry, output_dir=output_dir
         )
         assert [path.parent for path in card.files] == [folder, folder]
-    assert list(here.iterdir()) == []
 
 
 def test_the_order_of_scenarios_does_not_change_the_bytes(

@@ -154,21 +154,15 @@ def test_the_template_is_the_last_given_frame_repeated(
 
 
 def test_predictions_may_be_written_to_the_home_folder(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: Bench, home_folder: Path
 ) -> None:
-    """As pictures and exports; no folder named ~ appears."""
-    home = tmp_path / "home"
-    here = tmp_path / "here"
-    for folder in (home, here):
-        folder.mkdir()
-    monkeypatch.chdir(here)
-    monkeypatch.setenv("HOME", str(home))
+    """As pictures and exports."""
     location: dict[str, Any] = {
         "root": bench.root,
         "registry": bench.registry,
     }
     result = template("cavity", "tiny", output="~/t.nc", **location)
-    assert result.path == home / "t.nc"
+    assert result.path == home_folder / "t.nc"
     assert bench.validate(result.path).exit_code == 0
     assert validate("~/t.nc", isolated=False, **location).valid
     with pytest.raises(UsageError) as caught:
@@ -181,25 +175,18 @@ def test_predictions_may_be_written_to_the_home_folder(
     written = write(
         "~/w.nc", positions, split="cavity", size="tiny", method="dot", **location
     )
-    assert written == home / "w.nc"
+    assert written == home_folder / "w.nc"
     assert bench.validate(written).exit_code == 0
-    assert list(here.iterdir()) == []
 
 
 def test_predictions_may_be_read_from_the_home_folder(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: Bench, home_folder: Path
 ) -> None:
     """Every function of predictions finds the file that another one wrote there."""
-    home = tmp_path / "home"
-    here = tmp_path / "here"
-    for folder in (home, here):
-        folder.mkdir()
-    shutil.copyfile(bench.valid, home / "p.nc")
-    monkeypatch.chdir(here)
-    monkeypatch.setenv("HOME", str(home))
+    shutil.copyfile(bench.valid, home_folder / "p.nc")
     result = bench.validate(Path("~/p.nc"))
     assert result.exit_code == 0
-    assert result.path == home / "p.nc"
+    assert result.path == home_folder / "p.nc"
     with (
         open_predictions("~/p.nc") as predictions,
         PredictionsWriter(
@@ -213,8 +200,7 @@ def test_predictions_may_be_read_from_the_home_folder(
     ):
         for scenario in TESTS:
             writer.add(scenario, predictions.frames(scenario, GIVEN, HORIZON))
-    assert bench.validate(home / "copy.nc").exit_code == 0
-    assert list(here.iterdir()) == []
+    assert bench.validate(home_folder / "copy.nc").exit_code == 0
 
 
 def test_a_template_names_a_misspelt_split_before_the_file_that_exists(
