@@ -44,7 +44,7 @@ from lagbench.data.box import Box
 from lagbench.data.registry import Size
 from lagbench.data.registry import load as load_registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.metrics.frame import sliced_wasserstein2
 from lagbench.references.coarse_solver import SOLVED, CoarseRollout, coarser
 from lagbench.references.predictor import Given
 

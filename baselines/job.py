@@ -16,7 +16,7 @@ from torch import Tensor
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Registry
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
-from lagbench.work.progress import Meter
+from lagbench.work.run import Meter
 
 from .baseline import Baseline, DatasetInfo, count_parameters
 from .checkpoint import Checkpoint

@@ -27,7 +27,7 @@ from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.models.output_lock import hold_output
 from lagbench.submission.writer import PredictionsWriter, check_predictions_output
 from lagbench.tensors import Batch
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .augmentation import check_symmetry
 from .baseline import Baseline, DatasetInfo, count_parameters, rescale

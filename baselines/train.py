@@ -21,15 +21,14 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Sampler
 
 from lagbench.atomic import check_writable
-from lagbench.data.contents import check_contents
 from lagbench.data.layout import expand_home
-from lagbench.data.local import locate
+from lagbench.data.local import check_contents, locate
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
 from lagbench.tensors import Batch, TensorWindow, collate
 from lagbench.torch import WindowDataset, WindowSampler
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters

@@ -57,9 +57,9 @@ from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION, Preview
 from lagbench.scoring.score_file_checks import read_score_file, reported_frames
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import FRAMES, PARTICLES, SUBMISSION, Preview
 from lagbench.scoring.skill import compute_skill
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict

@@ -40,8 +40,8 @@ from lagbench.data.scenario import read_scenario
 from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.figures.tables import markdown
 from lagbench.metrics.aggregate import score
+from lagbench.metrics.frame import sliced_wasserstein2
 from lagbench.metrics.table import METRICS
-from lagbench.metrics.transport import sliced_wasserstein2
 from lagbench.references.analog_barycentre import MATCHED_TOGETHER
 from lagbench.references.assignment import MOST_TOGETHER, assign_particles
 from lagbench.references.ballistic_analog import frames_of_flight

@@ -44,8 +44,7 @@ from lagbench.submission import ValidationResult
 from lagbench.submission.format import FileInfo
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
-from lagbench.work.progress import Meter
-from lagbench.work.run import ONE_THREAD
+from lagbench.work.run import ONE_THREAD, Meter
 
 if TYPE_CHECKING:
     from model_board import ModelBoard

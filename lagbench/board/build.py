@@ -42,12 +42,12 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
 from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.boards import advise_board_check
+from lagbench.scoring.scenario import Preview, spaced
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
     read_score_file,
     reported_frames,
 )
-from lagbench.scoring.score_layout import Preview, spaced
 from lagbench.scoring.skill import (
     AgainstClassical,
     Skill,

@@ -21,7 +21,7 @@ from lagbench.scoring.references import remeasure
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file_checks import find_unreadable
 from lagbench.submission.issues import ValidationIssue
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 from .base import check_base
 from .build import build

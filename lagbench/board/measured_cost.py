@@ -23,7 +23,7 @@ from lagbench.references.predictor import Given, Kind, ReferencePredictor, given
 from lagbench.references.table import references_of
 from lagbench.scoring.task import ScoredTask
 from lagbench.work.machine import processor_name
-from lagbench.work.progress import Meter
+from lagbench.work.run import Meter
 
 from .entry import Entry, MeasuredCost
 from .verified import today

@@ -22,7 +22,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
 from lagbench.figures.html import MISSING, text, words
 from lagbench.figures.solid import View
-from lagbench.scoring.score_layout import spaced
+from lagbench.scoring.scenario import spaced
 
 from .columns import describe_check, format_ranks
 from .encoding import ArrayStore, Reference

@@ -23,9 +23,9 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring.boards import SUBMISSIONS
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.other_files import MODEL_ENDINGS
 
 from .draft import Draft, PredictionsFile, require_valid

@@ -28,9 +28,9 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import REFERENCES as KNOWN
 from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.scenario import SUBMISSION, Preview
 from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import SUBMISSION, Preview
 
 from .entry import OUTSIDE, DataSet, EntryFlag, ScoredFile, Summary
 from .fields import LONGEST_TEXT

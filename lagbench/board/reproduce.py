@@ -31,11 +31,10 @@ from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
 from lagbench.models.onnx_model import open_onnx
-from lagbench.scoring.scenario import measure_rows
+from lagbench.scoring.scenario import SUBMISSION, measure_rows
 from lagbench.scoring.score_file_checks import read_score_file
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.task import ScoredTask, load_scored_task
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .entry import (
     Entry,

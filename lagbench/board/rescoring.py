@@ -20,9 +20,9 @@ from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.package_metrics import FAILED_METRIC
+from lagbench.scoring.scenario import FILM_RANGE, LAST_STEP, SUBMISSION
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import FILM_RANGE, LAST_STEP, SUBMISSION
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 

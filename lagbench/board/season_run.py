@@ -31,11 +31,10 @@ from lagbench.references.shipped import shipped
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.boards import advise_board_check, board_option
 from lagbench.scoring.references import check_train
-from lagbench.scoring.scenario import measure_rows, predict_reference
+from lagbench.scoring.scenario import SUBMISSION, measure_rows, predict_reference
 from lagbench.scoring.score_file_checks import read_score_file
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.task import ScoredTask, load_scored_task
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .entry import Entry
 from .entry_file import read_entry, require_unchanged_model, yaml_bytes

@@ -20,7 +20,7 @@ from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageEr
 from lagbench.metrics.aggregate import score
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.task import ScoredTask, load_scored_task
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .entry import Entry, Prediction
 from .folder import Folder

@@ -14,15 +14,15 @@ from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import UsageError, UsageErrorCollector, WorkFailedError
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import score
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.checks import outside_share
 from lagbench.submission.format import WRITE
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.other_files import refuse_other_files
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 from .describe import draft_entry
 from .draft import Draft, PredictionsFile

@@ -33,12 +33,11 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import VerificationResult, verify
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 from .model_options import TRAINING_LIBRARIES, require_libraries
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
-from .output import format_seconds, print_result, print_table
-from .progress import progress_bar
+from .output import format_seconds, print_result, print_table, progress_bar
 from .solver_bench import SolverBench, bench_in_own_process
 from .stderr import print_on_stderr
 

@@ -17,8 +17,7 @@ from .options import (
     accept_split,
     option,
 )
-from .output import format_bytes, print_result
-from .progress import progress_bar
+from .output import format_bytes, print_result, progress_bar
 
 
 @accept_split

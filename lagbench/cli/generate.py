@@ -30,8 +30,13 @@ from .options import (
     choose_split,
     option,
 )
-from .output import format_bytes, format_seconds, print_note, print_result
-from .progress import progress_bar
+from .output import (
+    format_bytes,
+    format_seconds,
+    print_note,
+    print_result,
+    progress_bar,
+)
 
 
 def generate_command(
@@ -131,14 +136,14 @@ class GenerationTarget:
 
     split: str
     size: str | None
-    root: Path | None
+    root: str | Path | None
     registry: Registry | None
 
 
 def _season_targets(
     name: str,
     board: Path | None,
-    root: Path | None,
+    root: str | Path | None,
     split: str | None,
     size: str | None,
 ) -> list[GenerationTarget]:
@@ -184,7 +189,7 @@ def _season_targets(
     return targets
 
 
-def _describe_default_size(split: str, root: Path | None) -> str:
+def _describe_default_size(split: str, root: str | Path | None) -> str:
     """Return which size is taken where none is named, why, and which others there are.
 
     Raises:

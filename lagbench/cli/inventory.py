@@ -90,7 +90,7 @@ def list_command(
     print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
 
 
-def _list_split(split: str, *, root: Path | None, as_json: bool) -> None:
+def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
     """Show the sizes of one split and the references that were measured on them."""
     # the table of all splits needs no references, which take longer to load
     from .reference_scores import measured_references, print_references

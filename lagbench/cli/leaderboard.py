@@ -27,7 +27,7 @@ from lagbench.board.show import (
     tables,
     to_plain,
 )
-from lagbench.data.local import locate_new
+from lagbench.data.local import locate_new, resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import (
     DataError,
@@ -53,16 +53,16 @@ from .options import (
     accept_split,
     choose_split,
     option,
-    parse_root,
 )
 from .output import (
     format_bytes,
+    note_at_start,
     print_json,
     print_line,
     print_result,
     print_tables,
+    progress_bar,
 )
-from .progress import note_at_start, progress_bar
 from .solver_bench import try_bench
 from .stderr import print_on_stderr
 
@@ -114,12 +114,11 @@ RecordFlag = Annotated[
     option("--record", "With --predictions: add confirmed entries to verified.yaml."),
 ]
 MeasuredRootOption = Annotated[
-    Path | None,
+    str | None,
     option(
         "--root FOLDER",
         "Folder of all data sets. Without --predictions, the shipped scores of "
         "reference predictors are measured again on these data.",
-        parser=parse_root,
     ),
 ]
 MeasuredSplitOption = Annotated[
@@ -166,7 +165,7 @@ def check_command(
     for path in predictions or ():
         check_regular(path)
     sizes: Sequence[Size] = ()
-    if root and not predictions:
+    if root is not None and not predictions:
         sizes = _sizes_to_measure(root, split, size)
     with progress_bar(quiet=quiet or as_json) as progress:
         result = check_board(
@@ -188,13 +187,13 @@ def check_command(
     raise typer.Exit(result.exit_code)
 
 
-def _sizes_to_measure(root: Path, split: str | None, size: str | None) -> list[Size]:
+def _sizes_to_measure(root: str, split: str | None, size: str | None) -> list[Size]:
     """Return the sizes whose test scenarios lie under a root folder.
 
     Raises:
         DataError: there are none.
     """
-    sizes = sizes_with_test_files(root, split=split, name=size)
+    sizes = sizes_with_test_files(resolve_root(root), split=split, name=size)
     if not sizes:
         raise DataError(
             "no test scenarios are there",

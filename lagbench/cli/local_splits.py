@@ -18,8 +18,7 @@ from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
 from .options import JsonFlag, QuietFlag, option
-from .output import print_result, print_warning
-from .progress import progress_bar
+from .output import print_result, print_warning, progress_bar
 
 OutputOption = Annotated[
     Path,

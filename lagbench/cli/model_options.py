@@ -52,7 +52,7 @@ def require_libraries(names: tuple[str, ...]) -> None:
         )
 
 
-def data_option(split: str, root: Path | None) -> str:
+def data_option(split: str, root: str | Path | None) -> str:
     """Return the option with which the next command finds the data.
 
     It is " --root FOLDER" where the user named a root, and " --split FOLDER/" of a

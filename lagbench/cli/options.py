@@ -20,19 +20,6 @@ from .typed_settings import (
 )
 
 
-def parse_root(text: str) -> Path:
-    """Return a root folder; an empty text would mean the current folder as a path."""
-    if not text.strip():
-        raise UsageError(
-            "the root is empty",
-            where="--root",
-            expected="a folder, or s3://bucket/prefix",
-            got="an empty text",
-            fix="name a folder, or leave the option out",
-        )
-    return Path(text)
-
-
 def option(names_and_value: str, help_text: str, **settings: Any) -> Any:  # noqa: ANN401
     """Return an option that is written as its help shows it, as in ``-o FILE``.
 
@@ -73,13 +60,13 @@ ScenariosOption = Annotated[
     str | None,
     option("--scenarios IDS", "Scenarios, as in 0,3-5; all by default."),
 ]
+# Texts: as a path, an empty text would be the current folder, and a URL would lose a /.
 RootOption = Annotated[
-    Path | None,
+    str | None,
     option(
         "--root FOLDER",
         "Folder of all data sets, or s3://bucket/prefix. By default LAGBENCH_ROOT, or "
         "else the folder for user data.",
-        parser=parse_root,
     ),
 ]
 WorkersOption = Annotated[

@@ -28,8 +28,7 @@ from .options import (
     ScoredSubsetOption,
     option,
 )
-from .output import print_result
-from .progress import progress_bar
+from .output import print_result, progress_bar
 from .solver_bench import SolverBench, try_bench
 
 LARGEST_SEED = 2**31 - 1
@@ -219,7 +218,7 @@ def _predict_onnx(
     subset: str,
     method: str | None,
     seed: int,
-    root: Path | None,
+    root: str | Path | None,
     time_solver: _SolverClock | None,
     quiet: bool,
 ) -> OnnxPredictionResult:
@@ -343,7 +342,7 @@ def _describe_clock(result: PredictionResult) -> str:
     return f"processor time of {threads}; {wall}"
 
 
-def _next_command(path: Path, split: str | None, root: Path | None) -> str:
+def _next_command(path: Path, split: str | None, root: str | Path | None) -> str:
     """Return the line that says how to score the predictions."""
     options = ""
     if split is not None and split not in load().splits:

@@ -30,8 +30,7 @@ from .options import (
     WorkersOption,
     option,
 )
-from .output import print_errors, print_json, print_line, print_tables
-from .progress import progress_bar
+from .output import print_errors, print_json, print_line, print_tables, progress_bar
 from .validate import ExpectedSplitOption
 
 
@@ -82,9 +81,10 @@ def score_command(
     check_extras(extra_names)
     _check_file_count(predictions, report)
     folders = _score_folders(predictions, output)
+    data_root: str | Path | None = root
     if split is not None:
-        root = locate_split(split, root=root).root
-    validations = _validate_together(predictions, root)
+        data_root = locate_split(split, root=root).root
+    validations = _validate_together(predictions, data_root)
     if report is not None:
         check_folder(report)
 
@@ -94,7 +94,7 @@ def score_command(
             card = score(
                 path,
                 split=split,
-                root=root,
+                root=data_root,
                 output_dir=folder,
                 workers=workers,
                 scheduler=scheduler,
@@ -110,7 +110,7 @@ def score_command(
         # The report comes before the first printed word: a reader such as head may
         # close the pipe.
         if report is not None:
-            page = write_report(report, cards, predictions, root=root)
+            page = write_report(report, cards, predictions, root=data_root)
     finally:
         if as_json:
             _print_cards_as_json(cards)
@@ -195,7 +195,7 @@ def _score_folders(
 
 
 def _validate_together(
-    predictions: Sequence[Path], root: Path | None
+    predictions: Sequence[Path], root: str | Path | None
 ) -> Sequence[ValidationResult | None]:
     """Return the validation of each of several files, before the first is scored.
 

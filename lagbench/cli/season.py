@@ -42,8 +42,14 @@ from .options import (
     RootOption,
     option,
 )
-from .output import print_json, print_line, print_result, print_tables
-from .progress import note_at_start, progress_bar
+from .output import (
+    note_at_start,
+    print_json,
+    print_line,
+    print_result,
+    print_tables,
+    progress_bar,
+)
 
 SeasonArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="Name of the season.")

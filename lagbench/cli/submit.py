@@ -23,8 +23,7 @@ from .options import (
     WorkersOption,
     option,
 )
-from .output import print_errors, print_result, print_warning
-from .progress import progress_bar
+from .output import print_errors, print_result, print_warning, progress_bar
 
 
 def submit_command(

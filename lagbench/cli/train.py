@@ -34,8 +34,7 @@ from .options import (
     accept_split,
     option,
 )
-from .output import format_seconds, print_result, print_warning
-from .progress import progress_bar
+from .output import format_seconds, print_result, print_warning, progress_bar
 from .typed_settings import advise_on_baselines
 
 if TYPE_CHECKING:
@@ -167,7 +166,7 @@ def _warn_of_scorability(
     split: str,
     size: str | None,
     *,
-    root: Path | None,
+    root: str | Path | None,
     baseline: str,
     recipe: str | None,
     changes: tuple[str, ...],

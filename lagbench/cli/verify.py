@@ -18,8 +18,7 @@ from .options import (
     accept_split,
     option,
 )
-from .output import print_json, print_line, print_table, print_warning
-from .progress import progress_bar
+from .output import print_json, print_line, print_table, print_warning, progress_bar
 
 
 @accept_split

@@ -384,9 +384,9 @@ def generation_command(path: Path) -> str | None:
     return f"lagbench generate {names} --root {root}"
 
 
-def quote_root(root: Path) -> str:
+def quote_root(root: str | Path) -> str:
     """Return a root as an option's value for a shell: its URL, or its absolute path."""
-    url = url_of(root)
+    url = url_of(Path(root))
     if url is not None:
         return shlex.quote(hide_user(url))
     return shlex.quote(os.path.abspath(root))

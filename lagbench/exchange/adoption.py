@@ -24,7 +24,7 @@ from lagbench.errors import (
     format_count,
 )
 from lagbench.metrics.significance import FEWEST_SCENARIOS
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 from . import gns_npz
 from .array_files import Row, list_trajectories, open_trajectory, sort_naturally

@@ -52,7 +52,7 @@ from lagbench.store.objects import (
     check_address,
 )
 from lagbench.store.publication import Publication, publish
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 HINT = "try again; if it stays so, name another store: --from"
 

@@ -28,7 +28,7 @@ from lagbench.errors import DataError, UsageError
 from lagbench.generators.constants import solver_constants
 from lagbench.make.inventory import has_all_statistics
 from lagbench.store.copy import scenario_files
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from . import gns_npz
 from .metadata import (

@@ -56,7 +56,7 @@ from lagbench.errors import (
 from lagbench.metrics.coverage import CELLS, Cloud, fitting_cells
 from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.work.machine import describe_machine
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .crossings import CrossingCheck
 from .periods import PeriodCheck, check_overlap

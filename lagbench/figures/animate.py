@@ -19,7 +19,7 @@ from rich.progress import track
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, format_count, suggest_name
-from lagbench.work.progress import watched
+from lagbench.work.run import watched
 
 from .canvas import DPI, figure, pixels_of, renamed, shrink
 from .colours import INK, MUTED

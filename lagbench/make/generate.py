@@ -54,8 +54,7 @@ from lagbench.store.publication import Publication, check_address, publish
 from lagbench.work.cluster import Cluster, await_file
 from lagbench.work.machine import describe_machine, promises_bits, worker_count
 from lagbench.work.pool import Event, Pool, Report, WorkItem
-from lagbench.work.progress import Meter, Progress
-from lagbench.work.run import ONE_THREAD, read_many
+from lagbench.work.run import ONE_THREAD, Meter, Progress, read_many
 
 from .cards import card_texts, write_cards
 from .inventory import (

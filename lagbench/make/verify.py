@@ -33,7 +33,7 @@ from lagbench.generators.split import Device
 from lagbench.store.copy import list_unstored, update_working_copy
 from lagbench.work.machine import worker_count
 from lagbench.work.pool import Pool, WorkItem
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .inventory import (
     DataSetState,

@@ -9,12 +9,12 @@ import math
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.errors import require
 
-from .frame import FramePair, sorted_projections
+from .frame import FramePair, projection_distance
 from .metric import Direction, at_slow_frames, metric, metrics_of
 
 CLOUD_FRAMES = 10
@@ -35,25 +35,6 @@ MOST_EXPONENT = 700.0
 _error = partial(metric, unit="length", direction=Direction.LOWER)
 
 
-def sliced_wasserstein2(x: ArrayLike, y: ArrayLike) -> float:
-    """Return ``sqrt(mean_ki(((x.d_k)_(i) - (y.d_k)_(i))^2))`` [length].
-
-    Of two clouds of as many particles [length], shape [particle, axis]; the projections
-    on each direction d_k are sorted. The directions are fixed: nothing is drawn. A
-    shift by s gives ``|s| / sqrt(2)``, in three dimensions ``|s| / sqrt(3)`` to 1 %.
-    """
-    return _distance(sorted_projections(x), sorted_projections(y))
-
-
-def _distance(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
-    """Return the root mean square of the differences of sorted projections [length]."""
-    squares = []
-    for a, b in zip(x, y, strict=True):
-        difference = np.subtract(a, b, dtype=np.float64)
-        squares.append(float(np.mean(difference**2)))
-    return math.sqrt(math.fsum(squares) / len(squares))
-
-
 def sinkhorn_divergence(
     x: NDArray[np.float64], y: NDArray[np.float64], box: Box = UNIT_SQUARE
 ) -> float:
@@ -63,7 +44,7 @@ def sinkhorn_divergence(
     LagrangeBench's default, the library OTT, gives values that differ by 11 to 15 %.
     The regularisation blurs over sqrt(0.1), a third of the box, so the result shows
     little but shifts of the whole cloud. Three n x n matrices make it slow and large
-    (8192 particles: minutes and gigabytes). Prefer :func:`sliced_wasserstein2`. Along
+    (8192 particles: minutes and gigabytes); ``sliced_wasserstein2`` is neither. Along
     periodic axes of the box distances are those to the nearest image. NaN where a
     position is not finite.
     """
@@ -126,7 +107,7 @@ def cloud_distance(pair: FramePair) -> float:
     predicted = pair.prediction.material_projections
     weighted = []
     for name, particles in pair.scenario.members.items():
-        distance = _distance(true[name], predicted[name])
+        distance = projection_distance(true[name], predicted[name])
         weighted.append(len(particles) * distance)
     return math.fsum(weighted) / len(pair.scenario.material)
 
@@ -149,7 +130,7 @@ def at_slow_frames_of_clouds(pair: FramePair) -> bool:
 )
 def sliced_w2(pair: FramePair) -> float:
     """Sliced Wasserstein-2 distance of the particle clouds, 64 directions."""
-    return _distance(pair.truth.projections, pair.prediction.projections)
+    return projection_distance(pair.truth.projections, pair.prediction.projections)
 
 
 @_error(

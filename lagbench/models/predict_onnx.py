@@ -17,7 +17,7 @@ from lagbench.submission.writer import (
     check_predictions_output,
 )
 from lagbench.work.machine import processor_name
-from lagbench.work.progress import Meter, Progress
+from lagbench.work.run import Meter, Progress
 
 from .onnx_model import LEAST_SECONDS, DeclaredModel, check_onnx, open_onnx
 from .output_lock import hold_output

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from lagbench.data.box import UNIT_SQUARE, Box
 
-from .predictor import Floats
+Floats = NDArray[np.float64]
+
 
 MOST_TOGETHER = 4096
 """Particles among which the best assignment is sought: its time grows with the cube."""

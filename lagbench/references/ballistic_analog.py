@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
-from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.metrics.frame import sliced_wasserstein2
 
 from .assignment import MOST_TOGETHER, assign_particles
 from .extrapolation import ballistic_positions

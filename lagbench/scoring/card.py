@@ -26,7 +26,8 @@ from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
-from .score_layout import FORMAT, IDENTITY, SUBMISSION, Preview
+from .published_scores import FORMAT, IDENTITY
+from .scenario import SUBMISSION, Preview
 from .skill import AgainstClassical, Skill
 
 if TYPE_CHECKING:

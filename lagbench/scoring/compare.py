@@ -51,6 +51,7 @@ from .boards import (
 )
 from .card import JSON_NAME, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
+from .scenario import SUBMISSION
 from .score import score
 from .score_file import NETCDF_NAME
 from .score_file_checks import (
@@ -58,7 +59,6 @@ from .score_file_checks import (
     find_unreadable,
     read_published_scores,
 )
-from .score_layout import SUBMISSION
 
 if TYPE_CHECKING:
     import pandas as pd

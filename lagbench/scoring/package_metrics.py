@@ -7,8 +7,7 @@ ends the scoring.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 from lagbench.errors import (
     LagbenchError,
@@ -49,30 +48,28 @@ class PackageMetricError(WorkFailedError):
         return rebuild, ()
 
 
-@contextmanager
-def package_metric_errors() -> Iterator[None]:
-    """Name the metric of another package that raises an error, and its line.
+def raise_package_metric_error(error: Exception) -> None:
+    """Name the metric of another package that raised an error, and its line.
+
+    Nothing happens where the error is not that of such a metric.
 
     Raises:
-        PackageMetricError: such a metric failed. Errors of ours go on as they are.
+        PackageMetricError: the error is that of such a metric.
     """
-    try:
-        yield
-    except Exception as error:
-        name = getattr(error, "metric_name", None)
-        if name is None or name in METRICS:
-            raise
-        notes = ", ".join(getattr(error, "__notes__", ()))
-        # a metric that a user hands over is in no package
-        module = getattr(error, "metric_module", None)
-        modules = () if module is None else (module,)
-        places = [
-            find_place_in_extension(error, *modules),
-            getattr(error, "where", None),
-            notes or None,
-        ]
-        where = ", ".join(place for place in places if place)
-        raise PackageMetricError(name, where=where, got=_describe(error)) from error
+    name = getattr(error, "metric_name", None)
+    if name is None or name in METRICS:
+        return
+    notes = ", ".join(getattr(error, "__notes__", ()))
+    # a metric that a user hands over is in no package
+    module = getattr(error, "metric_module", None)
+    modules = () if module is None else (module,)
+    places = [
+        find_place_in_extension(error, *modules),
+        getattr(error, "where", None),
+        notes or None,
+    ]
+    where = ", ".join(place for place in places if place)
+    raise PackageMetricError(name, where=where, got=_describe(error)) from error
 
 
 def _describe(error: Exception) -> str:

@@ -14,13 +14,18 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from lagbench.data.field_errors import describe_expectation, is_own_sentence
-from lagbench.errors import check_regular
+from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
-from lagbench.submission.format import require_name
+from lagbench.submission.format import MAX_NAME, require_name
 
-from .score_layout import FORMAT, IDENTITY, unreadable_scores
+FORMAT = 1
+"""Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
+
+IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
+"""Fields that identify the predicted data set and the method."""
+
 
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
@@ -161,4 +166,15 @@ def _make_score(metric: Metric, ids: list[int], content: _ScoreContent) -> Score
         per_frame=np.empty((len(ids), 0)),
         values=np.array(values, np.float64),
         undefined=tuple(content.undefined),
+    )
+
+
+def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
+    """Return the error for a file that is no scores.json or scores.nc."""
+    return UnreadableFileError(
+        f"not a scores{path.suffix} of lagbench",
+        where=str(path),
+        expected="what `lagbench score` writes beside the predictions",
+        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
+        fix="score the predictions again: lagbench score predictions.nc",
     )

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.contents import check_contents
 from lagbench.data.layout import has_file
+from lagbench.data.local import check_contents
 from lagbench.data.registry import Registry, Size, load
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
@@ -28,8 +28,7 @@ from lagbench.references.shipped import ReferenceScores, correlation_of, shipped
 from lagbench.references.table import REFERENCES, references_of
 from lagbench.store.copy import update_working_copy
 from lagbench.work.pool import Report
-from lagbench.work.progress import Meter, Progress
-from lagbench.work.run import run_all
+from lagbench.work.run import Meter, Progress, run_all
 
 from .scenario import measure_rows, predict_reference
 from .task import ScoredTask, load_scored_task

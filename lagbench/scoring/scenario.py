@@ -12,6 +12,7 @@ from collections.abc import Generator, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,15 +35,54 @@ from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
-from .package_metrics import package_metric_errors
-from .score_layout import FRAMES, PARTICLES, SUBMISSION, Preview, spaced
+from .package_metrics import PackageMetricError, raise_package_metric_error
 from .task import ScoredTask
+
+SUBMISSION = "submission"
+"""Row of the submission; reference predictors have rows of their names."""
+
+LAST_STEP = 65534
+"""Greatest packed value of a preview."""
+
+FILL_STEP = 65535
+"""Packed value that marks a missing one."""
+
+FILM_RANGE = (-0.5, 1.5)
+"""Positions in the preview are clipped to this range [length]."""
+
+FRAMES = 45
+"""Frames of the particle film, evenly spaced over the horizon."""
+
+PARTICLES = 200
+"""Particles of the film, evenly spaced over the particle numbers."""
 
 POSITION_LIMIT = 1e6
 """Positions in the film are clipped to this [length]."""
 
 VORTICITY_LIMIT = 1e30
 """Vorticity in the maps is clipped to this [1/frame]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Pictures of one scenario; index 0 of ``side`` is the truth, 1 the prediction."""
+
+    scenario: int  # id of the scenario
+    map_frames: tuple[int, ...]  # frames of interest and the last one
+    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y
+    # node]
+    vorticity: NDArray[np.float32]
+    # shares of 64 bins over the truth's range of omega, NaN where there is none [1],
+    # shape [side, map frame, bin]
+    histogram: NDArray[np.float32]
+    histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
+    film_frames: tuple[int, ...]
+    particles: tuple[int, ...]  # numbers of the particles in the film
+    material: NDArray[np.int8]  # their materials, shape [film particle]
+    # their positions [length], shape [side, film frame, film particle, axis]
+    film: NDArray[np.float32]
+    # centre and radius of a fixed obstacle [length], shape [axis + 1]; None without one
+    obstacle: NDArray[np.float32] | None = None
 
 
 class PreviewRecorder:
@@ -115,6 +155,24 @@ class PreviewRecorder:
             preview.histogram_range[i] = (np.min(truth), np.max(truth))
 
 
+def spaced(length: int, count: int) -> list[int]:
+    """Return at most so many evenly spaced indices, first and last included.
+
+    >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
+    ([0, 3, 6, 9], [0, 1, 2], [6])
+    """
+    if length <= count:
+        return list(range(length))
+    last = length - 1
+    if count == 1:
+        return [last]
+    indices = []
+    for number in range(count):
+        index = number * last // (count - 1)
+        indices.append(index)
+    return indices
+
+
 def _clip_vorticity(vorticity: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(vorticity, -VORTICITY_LIMIT, VORTICITY_LIMIT)
 
@@ -154,7 +212,6 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     recorder = None
     try:
         with (
-            package_metric_errors(),
             job.task.opened(number) as truth,
             open_predictions(job.predictions, info=job.info) as predictions,
             ExitStack() as open_rows,
@@ -182,14 +239,24 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 report=report,
             )
     except Exception as error:
-        # beside the text of a package's metric or of our own code
-        error.add_note(f"scenario {number}")
-        raise
+        _raise_with_scenario(error, number)
 
     preview = None
     if recorder is not None:
         preview = recorder.preview
     return ScenarioScores(number, tallies, trace, preview)
+
+
+def _raise_with_scenario(error: Exception, scenario: int) -> NoReturn:
+    """Raise an error of the scoring again, with the scenario in its notes."""
+    note = f"scenario {scenario}"
+    try:
+        raise_package_metric_error(error)
+    except PackageMetricError as named_error:
+        named_error.add_note(note)
+        raise
+    error.add_note(note)
+    raise error
 
 
 def _predicted_frames(

@@ -43,8 +43,7 @@ from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import require_split, validate
 from lagbench.work.machine import available_cores, worker_count
-from lagbench.work.progress import Meter, Progress
-from lagbench.work.run import run_all
+from lagbench.work.run import Meter, Progress, run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, judge_copying, judge_physics, judge_predictability
@@ -53,15 +52,14 @@ from .package_metrics import (
     describe_failure,
     drop_metric,
     own_metric_error,
-    package_metric_errors,
+    raise_package_metric_error,
 )
-from .published_scores import read_scores
+from .published_scores import IDENTITY, read_scores
 from .references import check_train, measurable
-from .scenario import ScenarioJob, ScenarioScores, score_scenario
+from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics
-from .score_layout import IDENTITY, SUBMISSION
 from .skill import (
     compare_with_solvers,
     compute_skill,
@@ -341,9 +339,12 @@ def _aggregate(
         for outcome in outcomes:
             tallies[row][outcome.scenario] = outcome.tallies[row]
     scores: dict[str, Mapping[str, Score]] = {}
-    with package_metric_errors():
+    try:
         for row, row_tallies in tallies.items():
             scores[row] = aggregate(metrics, row_tallies)
+    except Exception as error:
+        raise_package_metric_error(error)
+        raise
     return tallies, scores
 
 

@@ -29,8 +29,8 @@ from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
-from .package_metrics import PackageMetricError, package_metric_errors
-from .score_layout import FORMAT, IDENTITY, unreadable_scores
+from .package_metrics import PackageMetricError, raise_package_metric_error
+from .published_scores import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
 NETCDF_NAME = "scores.nc"
@@ -84,13 +84,27 @@ class SubmissionStatistics:
                 metrics[name] = table[name]
         while True:
             try:
-                with package_metric_errors():
-                    return aggregate(metrics.values(), self.tallies)
+                return _aggregate_named(metrics.values(), self.tallies)
             except PackageMetricError as error:
                 message = f"{error.what}; it is left out: {error.where}: {error.got}"
                 warnings.warn(message, PluginWarning, stacklevel=3)
                 # metrics that follow from it need the stored statistics only
                 del metrics[error.metric]
+
+
+def _aggregate_named(
+    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
+) -> dict[str, Score]:
+    """Return scores by the name of the metric.
+
+    Raises:
+        PackageMetricError: a metric of another package failed.
+    """
+    try:
+        return aggregate(metrics, tallies)
+    except Exception as error:
+        raise_package_metric_error(error)
+        raise
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:

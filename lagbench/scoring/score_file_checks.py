@@ -30,16 +30,9 @@ from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import run_in_child
 
-from .published_scores import PublishedScores
+from .published_scores import PublishedScores, unreadable_scores
+from .scenario import FILM_RANGE, FRAMES, PARTICLES, SUBMISSION, Preview
 from .score_file import SubmissionStatistics, statistics_in
-from .score_layout import (
-    FILM_RANGE,
-    FRAMES,
-    PARTICLES,
-    SUBMISSION,
-    Preview,
-    unreadable_scores,
-)
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
 # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB

@@ -13,15 +13,8 @@ from lagbench.atomic import atomic_path, explain_write_error
 from lagbench.data.variables import open_netcdf
 
 from .card import ScoreCard
-from .score_layout import (
-    FILL_STEP,
-    FILM_RANGE,
-    FORMAT,
-    IDENTITY,
-    LAST_STEP,
-    SUBMISSION,
-    Preview,
-)
+from .published_scores import FORMAT, IDENTITY
+from .scenario import FILL_STEP, FILM_RANGE, LAST_STEP, SUBMISSION, Preview
 
 INDEX = 4096
 """Size of the index of chunks in HDF5; smaller variables are not compressed [bytes]."""

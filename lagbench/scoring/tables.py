@@ -16,7 +16,7 @@ from lagbench.submission.issues import quote
 from .card import BRIEF_ROWS, ScoreCard
 from .compare import ComparisonResult, MetricComparison
 from .flags import Flag
-from .score_layout import SUBMISSION
+from .scenario import SUBMISSION
 
 SHOWN_AT_FRAMES = (
     "vorticity_mse",

@@ -33,7 +33,7 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
-from lagbench.work.progress import Meter
+from lagbench.work.run import Meter
 
 from .copy import parse_manifest, refuse_foreign_hashes, update_working_copy
 from .fetch import (

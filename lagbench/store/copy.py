@@ -44,7 +44,7 @@ from lagbench.errors import (
     suggest_name,
 )
 from lagbench.work.machine import may_differ
-from lagbench.work.progress import watched
+from lagbench.work.run import watched
 
 from .fetch import FetchRequest, fetch_scenarios, fetch_text
 from .objects import (

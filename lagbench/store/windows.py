@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.data.box import parse_obstacle
-from lagbench.data.contents import check_contents
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import has_file, major_of
-from lagbench.data.local import locate, suggest_repair
+from lagbench.data.local import check_contents, locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import (
     damage_error,

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.box import Box
-from lagbench.data.contents import check_contents
 from lagbench.data.layout import format_ids, has_file
-from lagbench.data.local import suggest_repair
+from lagbench.data.local import check_contents, suggest_repair
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError

@@ -22,7 +22,7 @@ import h5py
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.layout import ClosedFolderError, expand_home
+from lagbench.data.layout import ClosedFolderError, expand_home, url_of
 from lagbench.data.local import (
     load_rooted_registry,
     locate_split,
@@ -181,14 +181,13 @@ def _validate_file(
     file = expand_home(path, "path").absolute()
     splits = load_rooted_registry(folder, registry)
     try:
-        refuse_other_files(file)
         check_file(file, fix=WRITE)
         with _open_caller(file, isolated=isolated) as caller:
             size, answer = _examine(
                 caller, file, folder, splits, require_truth=require_truth
             )
     except UnreadableFileError as error:
-        return _unreadable(file, error)
+        return _unreadable(file, _name_other_file(file, error))
 
     result = _parse_result(file, answer)
     if size is None or "discontinuous_start" in result.skipped:
@@ -198,6 +197,20 @@ def _validate_file(
     except DataError as error:
         return _without_truth(result, error)
     return result
+
+
+def _name_other_file(path: Path, error: UnreadableFileError) -> UnreadableFileError:
+    """Return the error that names a model or a folder; for other files, the given one.
+
+    Args:
+        path: what a user gave in place of predictions.
+        error: why it cannot be read.
+    """
+    try:
+        refuse_other_files(path)
+    except UnreadableFileError as refusal:
+        return refusal
+    return error
 
 
 Caller = Callable[[Callable[[Request], Answer], Request], Answer]
@@ -251,7 +264,8 @@ def _examine(
     size, lookup_error = _find_size(names, registry)
     size_json = None
     if size is not None:
-        update_working_copy(size, root, size.scored_scenarios)
+        if url_of(root) is not None:  # a store, of which the root is a working copy
+            update_working_copy(size, root, size.scored_scenarios)
         size_json = size.model_dump_json()
     request = {
         "path": str(path),

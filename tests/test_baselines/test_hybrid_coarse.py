@@ -32,7 +32,7 @@ from lagbench.generators.constants import solver_constants
 from lagbench.generators.soundness import sound_speeds
 from lagbench.generators.split import Material
 from lagbench.make.generate import GenerationResult
-from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.metrics.frame import sliced_wasserstein2
 from lagbench.references import coarse_solver
 from lagbench.references.predictor import given_in
 

@@ -49,7 +49,7 @@ from lagbench.errors import (
 )
 from lagbench.make.generate import GenerationResult
 from lagbench.submission import validate as examine
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 Predict = Callable[..., PredictionResult]
 

@@ -34,7 +34,7 @@ from lagbench.errors import (
 )
 from lagbench.make.generate import GenerationResult
 from lagbench.submission.budget import Budget, track_of
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 Run = Callable[..., TrainingResult]
 Changes = dict[str, Any] | None

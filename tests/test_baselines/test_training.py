@@ -43,7 +43,7 @@ from lagbench.errors import (
 )
 from lagbench.make.generate import GenerationResult
 from lagbench.torch import WindowDataset, WindowSampler
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 Run = Callable[..., TrainingResult]
 

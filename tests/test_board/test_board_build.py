@@ -56,9 +56,9 @@ from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.predictor import Kind
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import ScoreCard, digits
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.score_file_checks import read_score_file
-from lagbench.scoring.score_layout import SUBMISSION
 
 COMMITTED = Path(__file__).parents[2] / "leaderboard"
 

@@ -33,7 +33,7 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.scoring.task import load_scored_task
-from lagbench.work.progress import Meter
+from lagbench.work.run import Meter
 
 
 @pytest.fixture

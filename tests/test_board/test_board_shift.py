@@ -28,9 +28,9 @@ from lagbench.figures.report.report import write_report
 from lagbench.make.generate import GenerationResult
 from lagbench.models.predict_onnx import predict_onnx
 from lagbench.references.shipped import shipped
-from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 pytestmark = pytest.mark.slow
 """Their leaderboard takes ten seconds to make."""

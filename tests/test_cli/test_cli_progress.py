@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from lagbench.cli.progress import progress_bar
-from lagbench.work.progress import Progress, watched
+from lagbench.cli.output import progress_bar
+from lagbench.work.run import Progress, watched
 
 
 def training_progress(step: int) -> Progress:

@@ -50,7 +50,7 @@ from lagbench.exchange.trajectory import (
     estimate_spacing,
 )
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 BASIC: dict[str, Any] = {
     "radius": 0.1,

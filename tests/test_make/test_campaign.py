@@ -23,7 +23,7 @@ from lagbench.generators.record import measured_values
 from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 Copy = Callable[[], Path]
 

@@ -38,7 +38,7 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.work import cluster
 from lagbench.work.cluster import Client, FolderMark, mark_folder
 from lagbench.work.pool import WorkItem
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 distributed = pytest.importorskip(
     "distributed", reason="the extra 'cluster' is not installed"

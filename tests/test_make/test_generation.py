@@ -39,7 +39,7 @@ from lagbench.generators.simulate import active_frames, draw_perturbation
 from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import estimate, select
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 
 def folder_of(root: Path) -> Path:

@@ -17,8 +17,7 @@ from lagbench.metrics import METRICS, FramePair, Scenario, TaskConfig
 from lagbench.metrics.bodies import fit_rotation, rigid_residual, rotate_in_plane
 from lagbench.metrics.conservation import angular_momentum
 from lagbench.metrics.distributions import energy_spectrum
-from lagbench.metrics.frame import Bonds, directions
-from lagbench.metrics.transport import sliced_wasserstein2
+from lagbench.metrics.frame import Bonds, directions, sliced_wasserstein2
 
 Floats = NDArray[np.float64]
 

@@ -32,9 +32,9 @@ from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.metrics import METRICS, aggregate, select, tally
 from lagbench.metrics import measure as measure_all
 from lagbench.metrics.bodies import rigid_residual
-from lagbench.metrics.frame import Bonds
+from lagbench.metrics.frame import Bonds, sliced_wasserstein2
 from lagbench.metrics.pointwise import HORIZONS, attribute_mse
-from lagbench.metrics.transport import sinkhorn_divergence, sliced_wasserstein2
+from lagbench.metrics.transport import sinkhorn_divergence
 
 
 def test_errors_of_two_particles_by_hand() -> None:

@@ -73,7 +73,7 @@ from lagbench.references.train_library import (
     state_library,
 )
 from lagbench.scoring.references import measurable
-from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.skill import best_reference
 
 Floats = NDArray[np.float64]

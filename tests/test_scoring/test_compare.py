@@ -24,7 +24,7 @@ from lagbench.figures.tables import Table
 from lagbench.metrics import differ
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.compare import compare
-from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.tables import (
     card_tables,
     comparison_lines,

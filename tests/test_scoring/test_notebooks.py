@@ -20,7 +20,7 @@ from score_bench import ScoreBench, half_right
 import lagbench
 from lagbench.data import registry
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.scenario import SUBMISSION
 
 PACKAGE = Path(lagbench.__file__).parent
 

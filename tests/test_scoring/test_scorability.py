@@ -20,9 +20,9 @@ from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.metrics.coverage import Cloud, covered_nodes
 from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.scorability import check_scorability
 from lagbench.scoring.score import score
-from lagbench.scoring.score_layout import SUBMISSION
 
 INPUT_FRAMES = 2
 FRAMES = 5

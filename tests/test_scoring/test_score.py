@@ -29,14 +29,14 @@ from lagbench.metrics import Direction, FramePair, Metric
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.published_scores import read_scores
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score import scores_folder
 from lagbench.scoring.score_file_checks import read_published_scores
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.tables import flag_lines
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
 from lagbench.submission.predictions import Predictions
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 
 @pytest.fixture(scope="module")

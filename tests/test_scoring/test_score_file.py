@@ -23,9 +23,9 @@ from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import histograms
 from lagbench.scoring.card import ScoreCard, digits
 from lagbench.scoring.published_scores import read_scores
+from lagbench.scoring.scenario import FRAMES, PARTICLES, SUBMISSION
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.score_file_writer import write_statistics
-from lagbench.scoring.score_layout import FRAMES, PARTICLES, SUBMISSION
 
 MAX_BYTES = 300_000
 SCENARIOS = range(54, 60)

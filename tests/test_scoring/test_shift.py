@@ -17,11 +17,11 @@ from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.references.shipped import shipped, shipped_path
 from lagbench.scoring.published_scores import read_scores
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file_checks import (
     read_published_scores,
     read_score_file,
 )
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.submission.truth import Truth
 from lagbench.submission.writer import PredictionsWriter
 

@@ -37,8 +37,8 @@ from lagbench.scoring.references import (
     saved_folder,
     sizes_with_test_files,
 )
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.score_layout import SUBMISSION
 from lagbench.scoring.skill import (
     best_reference,
     compare_with_solvers,

@@ -24,7 +24,7 @@ from lagbench.exchange.downloading import DownloadResult
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import archive, fetch, objects
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 DATA = f"{SPLIT}/{SIZE}/v2"
 

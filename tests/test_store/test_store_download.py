@@ -27,7 +27,7 @@ from lagbench.exchange import adopt, download
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import fetch, objects
-from lagbench.work.progress import Progress
+from lagbench.work.run import Progress
 
 FIRST = "train/0000.nc"
 LIST = "manifest.json"

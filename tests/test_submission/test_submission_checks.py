@@ -30,7 +30,7 @@ from submission_data import (
     truth,
 )
 
-from lagbench.data import contents as module
+from lagbench.data import local as module
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
 from lagbench.errors import (

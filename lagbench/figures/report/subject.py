@@ -21,7 +21,7 @@ from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
 from lagbench.scoring.card import ScoreCard, number_methods
-from lagbench.scoring.score_layout import SUBMISSION
+from lagbench.scoring.scenario import SUBMISSION
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import Predictions, open_predictions
 
