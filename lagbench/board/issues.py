@@ -37,15 +37,13 @@ CHECKS: Mapping[str, BoardCheck] = {
         "write it with `lagbench submit`",
     ),
     "schema": BoardCheck(
-        "a missing or unknown key, a value that does not fit, or a web address "
-        "without a host name",
+        "a missing key, an unknown key, or a value that does not fit",
         "the entry does not fit",
         "what leaderboard/schema.json says",
         "docs/submitting.md describes the keys",
     ),
     "split": BoardCheck(
-        "an entry for a split or size that neither lagbench nor an installed package "
-        "has",
+        "an entry for an unknown split or size",
         "no such split and size",
         "a split and size that `lagbench list` shows",
         "name another",
@@ -69,23 +67,21 @@ CHECKS: Mapping[str, BoardCheck] = {
         "date: the day of the submission",
     ),
     "name": BoardCheck(
-        "two active entries with names that look alike, or an entry named like a "
+        "two active entries with similar names, or an entry with the name of a "
         "reference predictor",
         "two names look alike",
         "a name of its own",
         "choose another name, or say what differs, as in 'GNS, six terms'",
     ),
     "lifecycle": BoardCheck(
-        "a superseded entry whose successor is missing; a chain of successors that "
-        "comes back to the entry",
+        "a superseded entry whose successor is missing or leads back to the entry",
         "the entry is superseded by an entry that is not there",
         "another entry there, active in the end",
         "name an entry that is there and replaces it, or set status: withdrawn",
     ),
     "predictions": BoardCheck(
-        "a file of predictions that the entry names, but that is missing, has "
-        "another length or is no netCDF file; the check covers only files inside "
-        "the folder",
+        "a file of predictions that is missing, or is not the one that the entry "
+        "describes",
         "the predictions do not lie where the entry says",
         "a file of that length",
         "correct path and bytes, or remove path",
@@ -112,21 +108,18 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scores that a prediction can have",
     ),
     "score": BoardCheck(
-        "a score in the entry that disagrees with its score files; a diverged rollout "
-        "in the entry that contradicts the score files",
+        "a score in the entry that disagrees with its score files",
         "the score block is not what the score files give",
         "what the score files give",
     ),
     "budget": BoardCheck(
-        "a budget or track in the entry that disagrees with the budgets of its "
-        "predictions; a budget that contradicts itself",
+        "a budget or track that disagrees with the predictions or contradicts itself",
         "the budget is not what those of the predictions give",
         "no track, since the predictions have no budgets",
     ),
     "training": BoardCheck(
-        "a training on windows of `test` or `shift`; a `kind: classical` with "
-        "predictions of a trained model; an entry whose own weights were trained "
-        "on another data set or size (only shared weights may be of another size)",
+        "a training on `test`, on `shift` or on another data set; a trained model "
+        "of the kind `classical`",
         "the entry states a training that cannot be",
         "a training on other subsets; kind: learned or hybrid where something is "
         "learned",
@@ -134,12 +127,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "scenarios",
     ),
     "weights": BoardCheck(
-        "weights that are missing, edited or in a wrong place; weights that no "
-        "entry names; two active entries with the same weights, size and options of "
-        "the prediction; options of a prediction that the model does not have; "
-        "shared weights that differ from those of the entry in `shared_with`; more "
-        "than 100 MB of weights, or a file of more than 40 MB; a training log that "
-        "is too long or broken",
+        "weights that are missing, edited, too large or unused; two active entries "
+        "with the same weights and options",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "
@@ -159,22 +148,19 @@ CHECKS: Mapping[str, BoardCheck] = {
         "add its entry, or remove it",
     ),
     "reference": BoardCheck(
-        "a score file of a reference predictor that is unknown, cannot be read, or is "
-        "of another data set",
+        "a score file of a reference predictor that is unknown or cannot be read",
         "no reference predictor of the scorer",
         "scores of a reference predictor that `lagbench submit` wrote",
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
-        "a line of verified.yaml that does not fit its entry, its records, the data "
-        "set or the leaderboard, or with a date in the future",
+        "a line of verified.yaml that does not fit its entry or its records",
         "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
     "shift": BoardCheck(
-        "a line of shift.yaml about an entry that does not exist, or whose models, "
-        "data or scenarios are not those of the entry any more",
+        "a line of shift.yaml that does not fit its entry",
         "shift.yaml has scores that belong to no entry",
         "scores of the entry's own models on the present data",
         "remove the line, and score anew: lagbench leaderboard shift ENTRY",
@@ -186,16 +172,14 @@ CHECKS: Mapping[str, BoardCheck] = {
         "restore the file, or write it anew: python -m studies.gates",
     ),
     "season": BoardCheck(
-        "a file of a season that cannot be read; seeds, scenarios or models that "
-        "differ from those that the season recorded; public scores that disagree "
-        "with the score files",
+        "a file of a season that was edited, cannot be read, or disagrees with the "
+        "score files",
         "a season is not the one that was closed",
         "what `lagbench season close` and `lagbench season run` wrote",
         "restore the files of the commit that closed the season",
     ),
     "base": BoardCheck(
-        "a change to an entry that was there before: edited, removed, superseded or "
-        "withdrawn",
+        "a change to an existing entry, or to a file of the maintainers",
         "the change alters what was there before",
         "the same as before",
         "leave it as it was; if it is yours, say so: --own METHOD",
@@ -206,8 +190,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "what the scorer gives",
     ),
     "measured": BoardCheck(
-        "a score of a reference predictor that lagbench contains, if a new "
-        "measurement gives another value",
+        "a shipped score of a reference predictor that differs from a new measurement",
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "

@@ -75,13 +75,13 @@ def energy_ratio(predicted: Floats, true: Floats) -> Floats:
 
 @metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention(pair: FramePair) -> float:
-    """Kinetic energy of the prediction, divided by that of the last given frame."""
+    """Kinetic energy of the prediction / kinetic energy in the last given frame."""
     return _retained_share(pair.prediction)
 
 
 @metric(unit="1", source="Fig. 5.19", least=0.0)
 def energy_retention_true(pair: FramePair) -> float:
-    """Kinetic energy of the truth, divided by that of the last given frame."""
+    """Kinetic energy of the truth / kinetic energy in the last given frame."""
     return _retained_share(pair.truth)
 
 
