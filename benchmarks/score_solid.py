@@ -22,7 +22,7 @@ import lagbench
 from lagbench.data.local import locate
 from lagbench.exchange import adopt
 from lagbench.metrics.table import select
-from lagbench.scoring.scenario import ScenarioJob, score_scenario
+from lagbench.scoring.score import ScenarioJob, score_scenario
 from lagbench.scoring.task import load_scored_task
 from lagbench.submission.predictions import open_predictions
 

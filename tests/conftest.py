@@ -38,7 +38,7 @@ from lagbench.make import cards
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scorer
-from lagbench.scoring.scenario import ScenarioScores
+from lagbench.scoring.score import ScenarioScores
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
 from lagbench.submission.format import FileInfo

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.scoring.scenario import ScenarioJob, ScenarioScores, score_scenario
+from lagbench.scoring.score import ScenarioJob, ScenarioScores, score_scenario
 from lagbench.work.pool import Report
 
 

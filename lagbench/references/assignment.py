@@ -9,7 +9,6 @@ from lagbench.data.box import UNIT_SQUARE, Box
 
 Floats = NDArray[np.float64]
 
-
 MOST_TOGETHER = 4096
 """Particles among which the best assignment is sought: its time grows with the cube."""
 

@@ -1,4 +1,4 @@
-"""Score one scenario of a submission against the truth: the unit of parallel work.
+"""Measure predictions of one scenario against the truth, frame by frame.
 
 The truth's snapshots and fields are formed once for the submission and the references
 beside it; memory is that of a few frames, whatever the horizon. The few pictures of a
@@ -7,36 +7,25 @@ submission that a board page shows are taken while it is scored.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Tally, measure, round_statistics
 from lagbench.metrics.distributions import BINS, histograms
-from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
+from lagbench.metrics.frame import FramePair, Scenario, Snapshot
 from lagbench.metrics.metric import Metric
-from lagbench.metrics.table import select
 from lagbench.references.predictor import (
     Given,
     Prediction,
     ReferencePredictor,
-    given_in,
 )
-from lagbench.references.table import REFERENCES
 from lagbench.store.copy import update_working_copy
-from lagbench.submission.format import FileInfo
-from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
 from .flags import Trace, Tracer
-from .package_metrics import PackageMetricError, raise_package_metric_error
-from .task import ScoredTask
 
 SUBMISSION = "submission"
 """Row of the submission; reference predictors have rows of their names."""
@@ -175,96 +164,6 @@ def spaced(length: int, count: int) -> list[int]:
 
 def _clip_vorticity(vorticity: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(vorticity, -VORTICITY_LIMIT, VORTICITY_LIMIT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenarioJob:
-    """Input of a worker that scores one scenario."""
-
-    task: ScoredTask  # the test subset
-    scenario: int  # id of the scenario
-    predictions: Path  # a predictions.nc that has been validated
-    info: FileInfo  # content of its headers
-    # names of the metrics, and metrics of the user that are not installed
-    metrics: tuple[str | Metric, ...]
-    references: tuple[str, ...] = ()  # names of the references to measure beside it
-    has_preview: bool = False  # whether to take the preview
-
-
-@dataclass(frozen=True, eq=False)
-class ScenarioScores:
-    """Result of a worker that scores one scenario."""
-
-    scenario: int  # id of the scenario
-    tallies: Mapping[str, Tally]  # statistics by row
-    trace: Trace  # of the submission's error
-    preview: Preview | None  # pictures, if they were asked for
-
-
-# the search through installed packages takes as long as some frames
-_select = functools.cache(select)
-
-
-def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
-    """Score one scenario of a submission and of the references beside it."""
-    number = job.scenario
-    metrics = _select(job.metrics)
-    recorder = None
-    try:
-        with (
-            job.task.opened(number) as truth,
-            open_predictions(job.predictions, info=job.info) as predictions,
-            ExitStack() as open_rows,
-        ):
-            scenario = truth.scenario
-            frames = _predicted_frames(predictions, number)
-            rows = {SUBMISSION: snapshots(scenario, frames)}
-            for name in job.references:
-                given = given_in(truth.file, job.task.size, job.task.truth.root)
-                prediction = predict_reference(REFERENCES[name], given)
-                # where a metric fails, the traceback would keep the files open
-                if isinstance(prediction, Generator):
-                    open_rows.callback(prediction.close)
-                rows[name] = snapshots(scenario, prediction)
-
-            if job.has_preview:
-                obstacle = truth.obstacle
-                recorder = PreviewRecorder(number, scenario, obstacle=obstacle)
-            tallies, trace = measure_rows(
-                scenario,
-                truth.snapshots(),
-                rows,
-                metrics=metrics,
-                recorder=recorder,
-                report=report,
-            )
-    except Exception as error:
-        _raise_with_scenario(error, number)
-
-    preview = None
-    if recorder is not None:
-        preview = recorder.preview
-    return ScenarioScores(number, tallies, trace, preview)
-
-
-def _raise_with_scenario(error: Exception, scenario: int) -> NoReturn:
-    """Raise an error of the scoring again, with the scenario in its notes."""
-    note = f"scenario {scenario}"
-    try:
-        raise_package_metric_error(error)
-    except PackageMetricError as named_error:
-        named_error.add_note(note)
-        raise
-    error.add_note(note)
-    raise error
-
-
-def _predicted_frames(
-    predictions: Predictions, scenario: int
-) -> Iterator[NDArray[np.floating]]:
-    """Yield the predicted positions of one frame after the other."""
-    for _, block in predictions.blocks(scenario):
-        yield from block
 
 
 def predict_reference(reference: ReferencePredictor, given: Given) -> Prediction:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_writable
@@ -26,6 +29,7 @@ from lagbench.errors import (
     suggest_name,
 )
 from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.frame import snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (
     METRICS,
@@ -36,17 +40,19 @@ from lagbench.metrics.table import (
     select,
 )
 from lagbench.references import extrapolation
+from lagbench.references.predictor import given_in
 from lagbench.references.shipped import ReferenceScores, shipped
-from lagbench.references.table import CLASSICAL, NAIVE
+from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
-from lagbench.submission.predictions import open_predictions
+from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.submission.validation import require_split, validate
 from lagbench.work.machine import available_cores, worker_count
+from lagbench.work.pool import Report
 from lagbench.work.run import Meter, Progress, run_all
 
 from .card import JSON_NAME, ScoreCard, format_scores
-from .flags import Flag, judge_copying, judge_physics, judge_predictability
+from .flags import Flag, Trace, judge_copying, judge_physics, judge_predictability
 from .package_metrics import (
     PackageMetricError,
     describe_failure,
@@ -56,7 +62,13 @@ from .package_metrics import (
 )
 from .published_scores import IDENTITY, read_scores
 from .references import check_train, measurable
-from .scenario import SUBMISSION, ScenarioJob, ScenarioScores, score_scenario
+from .scenario import (
+    SUBMISSION,
+    Preview,
+    PreviewRecorder,
+    measure_rows,
+    predict_reference,
+)
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME
 from .score_file_writer import write_statistics
@@ -484,6 +496,102 @@ def check_extras(extras: Collection[str]) -> None:
             )
         for module in sorted(modules[extra]):
             check_installed(module, extra=extra)
+
+
+# --- one scenario, the unit of parallel work ------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioJob:
+    """Input of a worker that scores one scenario."""
+
+    task: ScoredTask  # the test subset
+    scenario: int  # id of the scenario
+    predictions: Path  # a predictions.nc that has been validated
+    info: FileInfo  # content of its headers
+    # names of the metrics, and metrics of the user that are not installed
+    metrics: tuple[str | Metric, ...]
+    references: tuple[str, ...] = ()  # names of the references to measure beside it
+    has_preview: bool = False  # whether to take the preview
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioScores:
+    """Result of a worker that scores one scenario."""
+
+    scenario: int  # id of the scenario
+    tallies: Mapping[str, Tally]  # statistics by row
+    trace: Trace  # of the submission's error
+    preview: Preview | None  # pictures, if they were asked for
+
+
+# the search through installed packages takes as long as some frames
+_select = functools.cache(select)
+
+
+def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
+    """Score one scenario of a submission and of the references beside it."""
+    number = job.scenario
+    metrics = _select(job.metrics)
+    recorder = None
+    try:
+        with (
+            job.task.opened(number) as truth,
+            open_predictions(job.predictions, info=job.info) as predictions,
+            ExitStack() as open_rows,
+        ):
+            scenario = truth.scenario
+            frames = _predicted_frames(predictions, number)
+            rows = {SUBMISSION: snapshots(scenario, frames)}
+            for name in job.references:
+                given = given_in(truth.file, job.task.size, job.task.truth.root)
+                prediction = predict_reference(REFERENCES[name], given)
+                # where a metric fails, the traceback would keep the files open
+                if isinstance(prediction, Generator):
+                    open_rows.callback(prediction.close)
+                rows[name] = snapshots(scenario, prediction)
+
+            if job.has_preview:
+                obstacle = truth.obstacle
+                recorder = PreviewRecorder(number, scenario, obstacle=obstacle)
+            tallies, trace = measure_rows(
+                scenario,
+                truth.snapshots(),
+                rows,
+                metrics=metrics,
+                recorder=recorder,
+                report=report,
+            )
+    except Exception as error:
+        _raise_with_scenario(error, number)
+
+    preview = None
+    if recorder is not None:
+        preview = recorder.preview
+    return ScenarioScores(number, tallies, trace, preview)
+
+
+def _raise_with_scenario(error: Exception, scenario: int) -> NoReturn:
+    """Raise an error of the scoring again, with the scenario in its notes."""
+    note = f"scenario {scenario}"
+    try:
+        raise_package_metric_error(error)
+    except PackageMetricError as named_error:
+        named_error.add_note(note)
+        raise
+    error.add_note(note)
+    raise error
+
+
+def _predicted_frames(
+    predictions: Predictions, scenario: int
+) -> Iterator[NDArray[np.floating]]:
+    """Yield the predicted positions of one frame after the other."""
+    for _, block in predictions.blocks(scenario):
+        yield from block
+
+
+# --- all scenarios --------------------------------------------------------------------
 
 
 def score_scenarios(

@@ -28,7 +28,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
-from lagbench.scoring.scenario import ScenarioJob, ScenarioScores
+from lagbench.scoring.score import ScenarioJob, ScenarioScores
 from lagbench.work import run
 from lagbench.work.cluster import LOGGERS, Cluster
 from lagbench.work.pool import Report
