@@ -127,9 +127,8 @@ no metrics of the vorticity.
 score files and the records of the trainings. Do not edit the page."""
 
 CLAIMS_NOTE = """\
-The thesis claims that some models are better than others. The table
-shows whether these claims are true on our data. Each row asks one question. The answers
-use the ranking metric.
+The second table asks one question per row. Most questions test a claim of the thesis on
+our data. The answers use the ranking metric:
 
 | answer | meaning |
 | --- | --- |
@@ -147,19 +146,20 @@ replace the plain ones in the first two questions.
 
 Do not compare the errors of the thesis with ours directly. The thesis trained on its
 own data, at the size `full`, for hours on GPUs. Each of its values comes from one
-scenario.
+scenario."""
 
-A table for each question follows:
+COMPARISONS_NOTE = """\
+The next tables have the comparisons behind the answers:
 
 - `first` and `second` are the two models. The first number of `means` and of `seeds`
   belongs to the first model.
 - The means use the seeds that both models have. Without common seeds they use all.
-- `lead` is positive if the first model is better. It is the difference of the means.
+- `lead` is the difference of the means. It is positive if the first model is better.
 - `won` counts the scenarios in which the first model is better.
 - `p (Holm)` is corrected for the number of models in the comparison. If both models
   have one seed, it comes from the sign-flip test. Otherwise it comes from a t-test over
   scenarios and seeds ([tests](scoring.md#comparing-two-methods)).
-- Some tables have rows for a second metric. The answers above do not use them."""
+- Some tables have rows for a second metric. The answers do not use them."""
 
 LEADING_NOTE = """\
 In these metrics the mean of a reference predictor is better than the mean of every
@@ -197,9 +197,9 @@ These models need more than the option `--baseline`. Each line has the options o
 `lagbench train`, or the command:"""
 
 MISSING_NOTE = """\
-These models have no usable entry, so this page does not show them. A command in a line
-trains the models of that line for which lagbench has a recipe. Semicolons separate the
-names of the models."""
+These models have no active entry, so this page does not show them. If a line has a
+command, the command trains the models of this line for which lagbench has a recipe.
+Semicolons separate the names of the models."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -261,6 +261,7 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
         }
     yield CLAIMS_NOTE
     yield claims_overview(rows_by_claim, [results.where for results in learned])
+    yield COMPARISONS_NOTE
 
     unanswered_count = 0
     for claim, rows_by_place in rows_by_claim.items():
