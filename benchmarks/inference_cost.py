@@ -188,17 +188,15 @@ def main() -> int:
     caption = (
         "## Time of a predicted frame for more and more particles\n\n"
         "The table shows the processor time [ms] of one predicted frame on one core. "
-        f"It is the time of a rollout of {FRAMES} frames, divided by {FRAMES}. The "
-        "models are a graph network (`gns`), a network with all particles of a frame "
-        "as one input (`mlp`), and `neuralmpm`. They are untrained, because the "
-        "weights do not change the time. "
+        f"It is the mean over a rollout of {FRAMES} frames. The models are a graph "
+        "network (`gns`), a network with all particles of a frame as one input "
+        "(`mlp`), and `neuralmpm`. They are untrained, because the weights do not "
+        "change the time. "
         f"Their options come from the recipes for {SPLIT} {SIZE}.\n\n"
-        f"The box holds {PARTICLES:,} q^2 particles: q multiplies the number of "
-        "particles along each axis. The number of cells of `neuralmpm` along each axis "
-        "is multiplied by q, and the connectivity radius of `gns` is divided by q. So "
-        "a particle has as many neighbours as at q = 1. A power of the number of "
-        "particles was fitted to the times of each model. The last row shows its "
-        "exponent; 1 means that the time grows linearly."
+        f"The box holds {PARTICLES:,} q^2 particles. The grid of `neuralmpm` has q "
+        "times as many cells along each axis. The connectivity radius of `gns` is "
+        "divided by q, so a particle keeps its number of neighbours. The last row has "
+        "the exponent p of a fit: time ~ (number of particles)^p."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)

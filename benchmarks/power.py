@@ -193,12 +193,11 @@ def count_pairs_of_seeds() -> tuple[Counter[str], int]:
 PAGE = """\
 # Power: which differences can the test find?
 
-After this page you know how small a difference the test can find.
 `lagbench compare` and the leaderboard use the statistical test
-`lagbench.metrics.differ`. This page answers two questions about the test:
+`lagbench.metrics.differ`. After this page you know:
 
-- How often does the test find a difference that exists?
-- How often does the test find a difference between seeds of the same method?
+- how small a difference the test can find;
+- how often it finds a difference between two trainings of the same method.
 
 This command writes the page:
 
@@ -208,68 +207,54 @@ python benchmarks/power.py --write
 
 ## Differences that the test finds
 
-**Model.** We draw random scores of two methods. In scenario i, with seed s, a method
-has the score m (1 + b_i + c_s + e_si). Here m is the mean of the method. The other
-three terms are random:
-
-- b_i belongs to the method in this scenario (column "method in scenario").
-- c_s belongs to the seed (column "seed").
-- e_si is the rest (column "rest").
-
-A scenario may be harder for both methods. The model leaves this out, because it nearly
-cancels in the difference of the methods.
-
-The table shows the standard deviations of b_i, c_s and e_si.
-
-**Rows.** The first three rows use assumed standard deviations. The other rows have the
-names of splits. They use standard deviations that we measured from the score files of
-size mini in leaderboard/scores. (Score files of entries that are not
-[active](glossary.md) count too.)
-
-The measurement needs two methods whose means differ by less than a factor of two. At
-least one of these methods must have several seeds. A split without such a pair of
-methods has no row. A row is inaccurate if its split has only one such pair, and only
-one method of the pair has several seeds.
-
-**Result.** In the last three columns one of the two methods is better by 5, 10 or 20 %,
-as the head of the column states. A cell shows the share of {draws} draws in which the
-test finds this difference, at the significance level 0.05. Each method has {seeds}
-seeds.
+We drew random scores of two methods, {draws} times. Each method had {seeds} seeds. One
+method was better by 5, 10 or 20 %. The last three columns show the share of the draws
+in which the test found this difference at the level of 5 %:
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
 {rows}
 
-A difference may be small compared with the scatter between seeds. More seeds help to
-find such a difference. More scenarios do not help. A leaderboard that ranks by such
-small differences ranks by chance.
+**Scatter.** A score varies around the mean of its method. The columns *seed*, *rest*
+and *method in scenario* show three standard deviations, relative to the mean:
+
+- *seed*: all scores of a seed are higher or lower;
+- *method in scenario*: all seeds of a method are worse or better in one scenario;
+- *rest*: one seed varies in one scenario.
+
+With seed s in scenario i, a method of mean m has the score m (1 + b_i + c_s + e_si).
+Here b_i belongs to the method in the scenario, c_s to the seed, and e_si is the rest. A
+scenario may be harder for both methods. We left this out, because it nearly cancels.
+
+**Rows.** The first three rows use assumed values. The other rows use values from the
+score files of size mini. These values are rough, because a split may have only one
+suitable pair of methods. In a suitable pair the means differ by less than a factor of
+two, and one method has several seeds. A split without such a pair has no row.
+
+More scenarios do not remove the scatter between seeds. Train more seeds if two methods
+differ by less than this scatter.
 
 ## Differences between equal methods
 
-In this table both sides are seeds of the same method. If both sides have several seeds,
-the test should find a difference in at most 5 % of the draws. A share of 5 % has a
-statistical error of 1.4 percentage points (95 % interval).
-
-With one seed on each side the test is the
-[sign-flip test](scoring.md#comparing-two-methods) over scenarios. The two seeds are two
-sets of weights. One of them may really be better than the other, and then the
-test is right to find a difference between them. But this difference is no difference
-between methods. The column "1 seed each" shows how often the test finds it. Therefore
-the leaderboard speaks of "these weights", not of methods, if one side has only one
-seed. It does so even if the other side has several seeds, because the scatter between
-the seeds of the first side is still unknown.
+In this table both sides have seeds of the same method. With several seeds on each side
+the test should find a difference in at most 5 % of the draws. The statistical error of
+such a share is 1.4 percentage points (95 % interval).
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|
 {false_rows}
 
-The rows *middling* and *large* are equal. All standard deviations of *large* are twice
-those of *middling*, so all differences are twice as large. The test does not depend on
-the scale of the differences.
+With one seed on each side, the test compares two sets of weights
+([sign-flip test](scoring.md#comparing-two-methods)). One set may really be better than
+the other set, but the method is the same. So the leaderboard speaks of "these weights"
+if one side has only one seed.
 
-The score files of size mini have {pair_count} pairs of two seeds of the same method
-(also those of entries that are not active): {pairs_by_split}.
-The test finds a difference, at 5 %, in {differing_count} of these pairs.
+The rows *middling* and *large* are equal, because the test does not depend on the scale
+of the scatter.
+
+The score files of size mini have {pair_count} pairs of two seeds of the same method:
+{pairs_by_split}. The test finds a difference in {differing_count} of these pairs. The
+entries of some of these score files are not [active](glossary.md).
 """
 
 SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))

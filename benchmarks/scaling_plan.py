@@ -337,9 +337,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
     perturbed_runs = (
-        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all). "
-        f"A perturbed run ends with the horizon, here at frame {HORIZON_END} as in "
-        "fluid full"
+        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all), "
+        f"up to frame {HORIZON_END}"
     )
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
@@ -353,10 +352,10 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"The following plan uses the times of q = {measured_q}. It is for "
-        f"{SCENARIOS:,} scenarios. Each has {n:,} "
-        f"particles, {frames} frames of {row.substeps} substeps, and a grid of "
-        f"{row.grid} x {row.grid} cells:",
+        f"The plan uses the times of q = {measured_q}. It is for {SCENARIOS:,} "
+        f"scenarios. A scenario has {n:,} particles, {frames} frames of {row.substeps} "
+        f"substeps, and a grid of {row.grid} x {row.grid} cells. The perturbed runs "
+        "end with the horizon, as in fluid full:",
         "",
         "| part | size or time |",
         "|---|--:|",
@@ -410,27 +409,22 @@ def main() -> int:
     lines = [
         "# Costs of large scenarios",
         "",
-        "q names a row of Table 3.1 of the [thesis](../glossary.md). The row gives the "
-        "number of particles, the grid and the substeps. The first table shows "
-        "processor times for one particle: for drawing the initial state, for one "
-        "substep, and for three kinds of work on a frame. *Writing a frame* includes "
-        "hashing and compressing it. *Hashing a written frame* is the work of "
-        "`lagbench verify`: it reads the frame from the file and hashes it again. "
-        "*Statistics of a frame* is the work for the means and standard deviations "
-        "over train. The last column of the table is the number of bytes of one "
-        "particle in one frame of the file.",
+        "q names a row of Table 3.1 of the [thesis](../glossary.md). The row states "
+        "the particles, the grid and the substeps.",
+        "",
+        "The first table shows processor times for one particle, and its bytes in the "
+        "file. *Writing a frame* includes hashing and compressing. *Hashing a written "
+        "frame* is the work of `lagbench verify`. *Statistics of a frame* is the work "
+        "for the means and standard deviations over train.",
         "",
         *parts_table(measured),
         "",
-        "A *whole generation* makes one scenario of train, one scenario of test, and "
-        "the [perturbed run](../glossary.md) of the test scenario. In this measurement "
-        "the horizon ends with the scenario, so all three runs have the same number of "
-        "frames. The column *sum of the parts* "
-        "is computed from the first table. It is the time of three initial states, of "
-        "three runs of the solver, and of two written files. (The perturbed run is not "
-        "written.) A whole generation takes longer: it also imports and "
-        "compiles, and it writes the manifest and draws the pictures. The *client* is "
-        "the process that you start; it starts the workers.",
+        "The next table shows a *whole generation*. It makes one scenario of train, "
+        "one scenario of test, and the [perturbed run](../glossary.md) of the test "
+        "scenario. The *sum of the parts* comes from the first table. A whole "
+        "generation takes longer, because it also imports, compiles, writes the "
+        "manifest and draws the pictures. The *client* is the process that you start. "
+        "The client starts the workers.",
         "",
         *whole_table(measured),
         "",

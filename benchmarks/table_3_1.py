@@ -210,29 +210,22 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     clock = "as wall-clock time in milliseconds"
     if device == Device.CPU:
         clock = "as processor time in milliseconds"
-    consequence = "On a CPU they differ little, often by less than the noise."
+    consequence = "On a CPU this is often less than the noise."
     if device == Device.CUDA:
-        consequence = (
-            "On a GPU a copy takes long. So where a frame has many substeps, t/frame "
-            "is much less than t/substep times the number of substeps."
-        )
+        consequence = "On a GPU this matters, because a copy takes long."
     return [
         "## Table 3.1: time of the solver for more and more particles",
         "",
-        f"The table compares two solvers: ours, run {ours}, and that of the thesis, "
-        "run on the GPU of its author. (`lagbench cite cavity` names the thesis.) The "
-        "particles, the grid and the substeps per frame of each row are those of Table "
-        "3.1 of the thesis. The thesis calls q the quality factor: the number of "
-        "particles grows roughly as q^2.",
+        f"The table compares our solver, run {ours}, with the solver of the thesis. "
+        "The solver of the thesis ran on the GPU of its author. (`lagbench cite "
+        "cavity` names the thesis.) The rows have the particles, the grid and the "
+        "substeps of Table 3.1 of the thesis.",
         "",
-        f"Each of our times is the shortest of {repeats} runs, {clock}. fps is the "
-        "number of frames per second. t/frame is the time of a run with all substeps "
-        f"of a frame. t/substep is the time of a run of {FIXED} substeps, divided by "
-        f"{FIXED}. Each run ends with one copy of all positions. So our t/substep "
-        f"contains 1/{FIXED} of the time of a copy. Take a frame of {2 * FIXED} "
-        f"substeps. The product {2 * FIXED} x t/substep contains the time of two "
-        "copies, but t/frame contains the time of only one. So the product and t/frame "
-        f"differ. {consequence}",
+        f"Our times are the shortest of {repeats} runs, {clock}. t/frame is the time "
+        "of all substeps of a frame. fps is the number of frames per second. "
+        f"t/substep is the time of {FIXED} substeps, divided by {FIXED}. Both times "
+        "include one copy of all positions. So the copy adds more to t/substep "
+        f"if a frame has more than {FIXED} substeps. {consequence}",
         "",
     ]
 
@@ -262,11 +255,10 @@ def markdown(
         )
     lines += [
         "",
-        "The next table shows how the times grow. Each row compares two quantities. "
-        "For example, the row `t/frame against q^2` has the exponent p in "
-        "t/frame ~ (q^2)^p. It is the slope of a least-squares line through the "
-        'logarithms of both. The column "thesis, same rows" uses the rows of the '
-        'thesis that are in the table above, and "thesis, all rows" uses all nine.',
+        "The next table shows how the times grow. The row `t/frame against q^2` has "
+        "the exponent p in t/frame ~ (q^2)^p, from a least-squares fit. The last two "
+        "columns show the exponents of the thesis, first for the rows above, then for "
+        "all nine rows.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
+from lagbench.board.entry import MeasuredCost
 from lagbench.board.overview import LearningVerdict, verdict_of_interval
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
@@ -15,9 +16,9 @@ from lagbench.scoring.skill import AgainstClassical
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
-from .thesis.claims import Claim, ComparedModels, answer
+from .thesis.claims import Claim, ComparedModels, answer, leading_references
 from .thesis.formatting import interval, number
-from .thesis.published import MEASURES, OPERATORS, TABLE_4_8, TABLE_5_4
+from .thesis.published import MEASURES, OPERATORS, TABLE_5_4
 from .thesis.roster import label
 from .thesis.split_results import (
     Method,
@@ -101,19 +102,19 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     sentences = []
     if pays:
         sentences.append(
-            f"Learning pays on {_join(pays)}. On these data sets no single classical"
-            " solver of lagbench is both as cheap per frame and as accurate as the"
-            " best learned or hybrid model."
+            f"Learning pays on {_join(pays)}. There the best learned or hybrid model is"
+            " more accurate than every classical solver that costs no more per frame."
         )
         sentences += slower_than_simulator(time_ratios)
     if open_sets:
         sentences.append(
-            f"On {_join(open_sets)} the interval contains 1: the question is open."
+            f"On {_join(open_sets)} the question is open. There the interval contains"
+            " 1."
         )
     if without_interval:
         sentences.append(
-            f"On {_join(without_interval)} there are too few scenarios for an interval:"
-            " the question is open."
+            f"On {_join(without_interval)} the question is open. There are too few"
+            " scenarios for an interval there."
         )
     if does_not_pay:
         sentences.append(
@@ -220,9 +221,20 @@ def _name_score_and_cost(results: SplitResults, name: str | None, beside: str) -
     seconds = _seconds_in_run(results, name, beside)
     if seconds is None:
         return text
+    return f"{text} ({format_time(seconds)})"
+
+
+def format_time(seconds: float | None) -> str:
+    """Return a time with its unit, a dash where there is none.
+
+    >>> format_time(0.0123), format_time(2.5), format_time(None)
+    ('12.3 ms', '2.5 s', '-')
+    """
+    if seconds is None:
+        return "-"
     if seconds >= 1.0:
-        return f"{text} ({number(seconds)} s)"
-    return f"{text} ({number(1000.0 * seconds)} ms)"
+        return f"{number(seconds)} s"
+    return f"{number(1000.0 * seconds)} ms"
 
 
 def _seconds_in_run(results: SplitResults, name: str, model: str) -> float | None:
@@ -278,8 +290,6 @@ def training_table(all_results: Sequence[SplitResults]) -> str:
         "model",
         "steps x windows",
         "epochs",
-        "CPU hours per seed",
-        "skill",
         "validated",
         "validation at 1/4",
         "validation at 1/2",
@@ -333,21 +343,69 @@ def _training_row(results: SplitResults, name: str) -> list[str]:
         label(name),
         format_budget(record),
         number(epochs),
-        number(method.hours_per_seed),
-        number(results.skill(name)),
         validated_metric,
         *map(number, least_values),
         gain,
     ]
 
 
-def horizon_table(results: SplitResults) -> str:
-    """Return the scores over the horizon: skill, ranking metric, the chosen metrics.
+def ranking_table(results: SplitResults) -> str:
+    """Return the ranking: score, skill, time of a frame, ratio to a solver of its cost.
 
     Methods without a score of the ranking metric have no row.
     """
-    metrics = _shown_metrics(results)
-    heads = ["model", "skill", "seeds"]
+    run = run_of(results)
+    heads = (
+        "model",
+        "kind",
+        "seeds",
+        f"{results.ranking} (95 %)",
+        "skill",
+        "time of a frame",
+        "against_classical",
+    )
+    rows = []
+    for name in results.order():
+        method = results.methods[name]
+        is_model = method.kind in (Kind.LEARNED, Kind.HYBRID)
+        seconds = None if run is None else _seconds_of_run(method, run)
+        against = "-"
+        if is_model and seconds is not None:
+            against = _format_against(results, name)
+        rows.append(
+            (
+                label(name),
+                str(method.kind),
+                str(len(method.trainings)) if is_model else "-",
+                _score_cell(method, results.ranking),
+                number(results.skill(name)),
+                format_time(seconds),
+                against,
+            )
+        )
+    return markdown(heads, rows)
+
+
+def run_of(results: SplitResults) -> MeasuredCost | None:
+    """Return the run that measured the best model of known cost; None without one."""
+    for name in results.order(results.models):
+        measured = results.methods[name].measured
+        if measured is not None:
+            return measured
+    return None
+
+
+def _seconds_of_run(method: Method, run: MeasuredCost) -> float | None:
+    """Return the time of a frame of a method in a run [s]; None if it took no part."""
+    if method.measured is not None and method.measured.is_of_same_run(run):
+        return method.measured.seconds_per_frame
+    return run.classical.get(method.name, run.naive.get(method.name))
+
+
+def metrics_table(results: SplitResults) -> str:
+    """Return the means of the chosen metrics that do not rank, in the same order."""
+    metrics = shown_metrics(results)[1:]
+    heads = ["model"]
     for metric in metrics:  # as in "position_rmse [length], ↓"
         goal = ARROWS[metric.direction]
         if metric.direction is Direction.TARGET:
@@ -357,13 +415,12 @@ def horizon_table(results: SplitResults) -> str:
     rows = []
     for name in results.order():
         method = results.methods[name]
-        cells = [_score_cell(method, metric.name) for metric in metrics]
-        skill = number(results.skill(name))
-        rows.append([label(name), skill, _seeds_cell(method), *cells])
+        cells = [_mean_cell(method, metric.name) for metric in metrics]
+        rows.append([label(name), *cells])
     return markdown(heads, rows)
 
 
-def _shown_metrics(results: SplitResults) -> list[Metric]:
+def shown_metrics(results: SplitResults) -> list[Metric]:
     """Return the ranking metric and the chosen ones that were scored."""
     scored: dict[str, Metric] = {}
     for method in results.methods.values():
@@ -372,7 +429,7 @@ def _shown_metrics(results: SplitResults) -> list[Metric]:
 
     # vorticity says little where the material does not fill the box
     hidden_families: tuple[str, ...] = ()
-    if results.size.split in TABLE_4_8:
+    if results.ranking == "cloud_distance":
         hidden_families = ("vorticity", "distributions")
 
     metrics = []
@@ -385,60 +442,69 @@ def _shown_metrics(results: SplitResults) -> list[Metric]:
     return metrics
 
 
-def _seeds_cell(method: Method) -> str:
-    """Return the number of seeds, or the kind of a reference predictor."""
-    if method.kind is Kind.NAIVE:
-        return "naive baseline"
-    if method.kind is Kind.CLASSICAL:
-        return "classical solver"
-    return str(len(method.trainings))
-
-
 def _score_cell(method: Method, metric: str) -> str:
-    """Return mean, interval, deviation over seeds and number of undefined values."""
-    if metric not in method.scores:
-        return "-"
+    """Return mean, interval and deviation over seeds; a star marks undefined values."""
     score = method.scores[metric]
     cell = interval(score.mean, score.interval)
     if len(method.trainings) > 1:
         cell += f" ± {number(method.spread(metric), 2)}"
-    undefined_count = sum(score.undefined)
-    if undefined_count:
-        cell += f", {undefined_count} undefined"
+    if any(score.undefined):
+        cell += "*"
     return cell
 
 
-def vorticity_table(results: SplitResults) -> str:
-    """Return Tables 5.4 and 5.5 and the correlations of Fig. 5.13.
+def _mean_cell(method: Method, metric: str) -> str:
+    """Return the mean; a star marks one that leaves out undefined values."""
+    if metric not in method.scores:
+        return "-"
+    score = method.scores[metric]
+    cell = number(score.mean)
+    if cell != "-" and any(score.undefined):
+        cell += "*"
+    return cell
 
-    A cell has our mean and T0 in brackets. On the cavity the thesis's number follows.
+
+def leading_table(all_results: Sequence[SplitResults]) -> str:
+    """Return by data set the metrics in which a reference predictor leads.
+
+    Only metrics that stand in the tables of the data set count.
     """
+    metrics_by_place: dict[str, list[str]] = {}
+    for results in all_results:
+        shown = {metric.name for metric in shown_metrics(results)}
+        for where, metric, *_ in leading_references([results]).rows:
+            if metric in shown:
+                metrics_by_place.setdefault(where, []).append(metric)
+    rows = []
+    for where, metrics in metrics_by_place.items():
+        rows.append((where, ", ".join(metrics)))
+    if not rows:
+        return ""
+    return markdown(("data set", "metrics in which a reference predictor leads"), rows)
+
+
+def vorticity_table(results: SplitResults) -> str:
+    """Return Table 5.4 of the thesis with our mean and T0; "" without its models."""
     frame = key_frame(results.size)
     first_scenario = scenario_of(results.size, 0)
-    has_thesis = results.size.split == "cavity"
     heads = ["model"]
     for measure in MEASURES:
-        heads.append(measure.upper())
-        if has_thesis:
-            heads.append(f"{measure.upper()}, thesis")
+        heads += [measure.upper(), f"{measure.upper()}, thesis"]
 
-    stand_ins = {results.stand_in(name): name for name in OPERATORS}
     rows = []
-    for name in dict.fromkeys((*stand_ins, *results.models)):
-        if name not in results.models:
+    for name in OPERATORS:
+        method = results.models.get(results.stand_in(name))
+        if method is None:
             continue
-        method = results.models[name]
-        row = [label(name)]
+        row = [label(method.name)]
         for measure in MEASURES:
             metric = f"vorticity_{measure}"
             mean_value = method.at(metric, frame)
             first_value = method.at(metric, frame, first_scenario)
             row.append(f"{number(mean_value)} ({number(first_value)})")
-            if has_thesis:
-                published = TABLE_5_4.get(stand_ins.get(name, name), {})
-                row.append(number(published.get(measure), 4))
+            row.append(number(TABLE_5_4[name][measure], 4))
         rows.append(row)
-    return markdown(heads, rows)
+    return markdown(heads, rows) if rows else ""
 
 
 def order_agreement(results: SplitResults) -> str | None:
@@ -476,7 +542,7 @@ def kendall_tau(first: Sequence[float], second: Sequence[float]) -> float:
 
 
 def cost_table(results: SplitResults) -> str:
-    """Return recipe, parameters, training hours and seconds per frame of each model."""
+    """Return recipe, parameters, seeds and training hours of each model."""
     heads = (
         "model",
         "recipe",
@@ -485,12 +551,10 @@ def cost_table(results: SplitResults) -> str:
         "seeds",
         "CPU hours per seed",
         "trained on",
-        "s/frame",
-        "solver s/frame",
-        "speed-up",
     )
     rows = []
-    for name, method in results.models.items():
+    for name in results.order(results.models):
+        method = results.methods[name]
         recipes = [training.record.get("recipe", {}) for training in method.trainings]
         recipe_names = [recipe.get("name", "-") for recipe in recipes]
         changes = [_changes(training) for training in method.trainings]
@@ -511,7 +575,6 @@ def cost_table(results: SplitResults) -> str:
                 ", ".join(seeds),
                 number(method.hours_per_seed),
                 " / ".join(dict.fromkeys(machines)),
-                *_frame_costs(method),
             ]
         )
     return markdown(heads, rows)
@@ -534,14 +597,3 @@ def _changes(training: ScoredTraining) -> str:
         changes += describe_changes(recipe)
     changes += training.predicted_with
     return "; ".join(changes) or "none"
-
-
-def _frame_costs(method: Method) -> Iterator[str]:
-    """Yield seconds per frame of the model and of the solver, and the speed-up."""
-    cost = method.cost
-    if cost is None:
-        yield from (number(None), number(None), number(None))
-        return
-    yield number(cost.seconds_per_frame)
-    yield number(cost.solver_seconds_per_frame)
-    yield number(cost.speed_up)

@@ -23,18 +23,21 @@ from lagbench.errors import LagbenchError
 from .result_tables import (
     claims_overview,
     cost_table,
-    horizon_table,
+    format_time,
+    leading_table,
+    metrics_table,
     order_agreement,
+    ranking_table,
+    run_of,
     summary_table,
     training_table,
     verdict_on_learning,
     vorticity_table,
 )
 from .thesis.cases import key_frame
-from .thesis.claims import CLAIMS, claim_rows, comparison_table, leading_references
+from .thesis.claims import CLAIMS, claim_rows, comparison_table
 from .thesis.items import table_markdown
 from .thesis.plan import TABLES, read_study_results, study_name, study_rows
-from .thesis.published import TABLE_4_8
 from .thesis.roster import (
     EXPECTED,
     NEWER_SPLITS,
@@ -50,153 +53,129 @@ from .thesis.split_results import (
     SplitResults,
     read_json,
 )
-from .thesis.tables import rollout_table, studies_beside_thesis
+from .thesis.tables import studies_beside_thesis
 from .thesis.var_protocol import FILE_NAME as PROTOCOL_FILE
 from .thesis.var_protocol import beside_thesis
 
 INTRODUCTION = """\
 # Results
 
-On this page you can look up three things: how well the reference models predict each
-data set, which claims of the thesis are true on our data, and the cost of the
-trainings. (The thesis is D. Dharma, PhD thesis, University of Leeds, 2025.)
+On this page you can look up for each data set:
 
-The first table has the best learned model and the best hybrid of each data set. (Some
-data sets have no hybrid. Data sets of size tiny have no model at all, so they are not
-on this page.) Then follow the claims, the trainings, and one chapter for each data set.
-A chapter has all models with an active entry on its data set. The chapters of cavity,
-fluid and multimaterial also have the numbers of the thesis beside ours."""
+- which model is the most accurate;
+- how accurate predictors without training are;
+- whether a model is better than a classical solver that costs no more;
+- which recipe trained a model, and how long the training took.
+
+This table has the best learned model and the best hybrid of each data set. The
+[verdict](#verdict) follows. Then each data set has a chapter with all models that have
+an [active entry](glossary.md). At the end stand the [claims](#claims) of the thesis."""
 
 SUMMARY_NOTE = """\
-Each row compares the best learned model, or the best hybrid, of a data set with the
-best predictors that are not trained. A hybrid is a solver with a learned part. A lower
-score is better.
+- Scores are errors, so lower is better.
+- A *naive* predictor learns nothing and integrates no equations. A *classical* solver
+  integrates the equations. Both are [reference predictors](references.md): nobody
+  trains them.
+- A *learned* model contains no solver. A *hybrid* is a classical solver with a learned
+  part. Some data sets have no hybrid.
+- The time in brackets is the processor time of one frame on one core. It is the mean
+  over the first ten frames. All times of a data set come from one run on one machine.
+  Times of two data sets may come from two machines.
+- `skill` is 1 - (score of the model) / (score of the best naive predictor). A model
+  with skill 1 is perfect. A model with skill 0 is as good as that predictor.
+- `against_classical` is (score of the model) / (score of a classical solver). The
+  solver is the best one that costs no more per frame than the model. The brackets
+  contain the 95 % interval. The name of the solver follows.
+- If every solver costs more than the model, the ratio uses the cheapest solver. Then
+  the cell says "which costs more".
+- *Learning pays* on a data set if the whole interval of its best model, learned or
+  hybrid, is below 1."""
 
-- The time in brackets after a score is the processor time of one frame on one core. All
-  times of a row come from one run on one machine (`leaderboard/verified.yaml`), and
-  `against_classical` uses them. Other rows may come from other machines.
-- `skill` is 1 - (score of the model) / (score of the best naive baseline).
-- `against_classical` is (score of the model) / (score of the best classical solver that
-  costs no more per frame than the model). If every classical solver costs more, the
-  ratio uses the cheapest one, and the cell says so. The brackets contain the 95 %
-  interval. The name of the solver follows. A dash means that the cost of the model was
-  not measured beside the solvers.
-- [Learning pays](glossary.md) on a data set if the whole interval of its best model,
-  learned or hybrid, is below 1."""
+VERDICT = "## Verdict"
 
 HOW_TO_READ = """\
-## How to read this page
+## How to read the chapters
 
-- **Reference predictors** are not trained. A naive baseline learns nothing and
-  integrates no equations. A classical solver integrates the equations
-  ([references](references.md)).
-- **Skill** is 1 - (score of the model) / (score of the best naive baseline). Skill 1 is
-  perfect. Skill 0 is as good as this baseline. Below 0 the model is worse.
-- **Tables of scores** contain models and reference predictors. A cell has the mean over
-  the test scenarios, with a 95 % bootstrap interval over scenarios. If a model has
-  several seeds, the number after ± is the standard deviation over the seeds. For such a
-  model the leaderboard resamples the seeds too, so the intervals on the leaderboard are
-  wider than those on this page.
-  "1440 undefined" means that the metric is undefined in 1440 frames. The tables of
-  `fluid` and `multimaterial` leave out the metrics of the vorticity. The column
-  `seeds` states how many seeds a model has; for a reference predictor it states the
-  kind. In the tables of costs `seeds` lists the seeds.
-- **Tests** are two-sided. If both models have one seed, the test is the exact
-  sign-flip test over scenarios. Otherwise it is a t-test, whose variance has two
-  parts, scenarios and seeds ([scoring](scoring.md#comparing-two-methods)). Two models
-  may use the same weights, for example with and without mirror averaging. Then they are
-  compared seed by seed. The p-values are corrected for
-  the number of models in the comparison (Holm). With fewer than six scenarios there is
-  no test.
-- **The thesis** trained on its own data, at the size called `full` here, for hours on
-  GPUs. Each value in its tables comes from one scenario. So compare its numbers with
-  ours only roughly. On the splits of the thesis, size `mini` has about a quarter of the
-  particles and half the cells along an axis (on cavity 36 % and 60 %). So at `mini`
-  compare only the order of the models.
-- **Metrics** are defined in [scoring](scoring.md). In the column heads ↓ means that
-  lower is better, ↑ that higher is better, and ◎ that the value after the sign is best.
-- **readme-network** is the small network of the program in the README. It has no
-  `training.json`, so the columns of its training have a dash. Its entry states one
-  epoch and 0.05 processor hours.
-- **Comparisons** have two models, *first* and *second*. `where` is the data set. The
-  first number of `means` and of `seeds` belongs to the first model, the second number
-  to the second model. `lead` is the difference of the means in the units of the
-  metric. It is positive if the first model is better. `won` is the number of scenarios
-  in which the first model is better. The last column states whether the first model is
-  better or worse. *Open* means that the test finds no difference.
+Each chapter has three tables. Only cavity mini has a fourth one, Table 5.4 of the
+[thesis](glossary.md).
 
-`python -m studies.results -o docs/results.md` writes this page from the entries and
-score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
+**Ranking.** The best method comes first.
+
+- The score is the mean over the test scenarios. The brackets contain its 95 % interval
+  (bootstrap over scenarios).
+- If a model has several seeds, the number after ± is the standard deviation over the
+  seeds. The leaderboard resamples the seeds too, so its intervals are wider.
+- A dash means that there is no value.
+- `readme-network` is the network of the program in the README.
+- The times and `against_classical` mean the same as in the first table.
+
+**Other metrics.** The table has means over scenarios and frames. [Scoring](scoring.md)
+defines the metrics. In the heads ↓ means that lower is better, and ↑ that higher is
+better. After ◎ stands the best value. A star marks a metric that is undefined in some
+frames. The mean leaves these frames out. On [free surfaces](glossary.md) the table has
+no metrics of the vorticity.
+
+**Trainings.**
+
+- `changed` lists the options that differ from the recipe. If seeds differ in a value,
+  slashes separate the values.
+- Hours are processor hours, without hours on a GPU and without validations. Only the
+  hours of the first seed of NeuralMPM on cavity mini include validations.
+- If a training started from other weights, its hours include the earlier trainings.
+
+`python -m studies.results -o docs/results.md` writes this page from the entries, the
+score files and the records of the trainings. Do not edit the page."""
 
 CLAIMS_NOTE = """\
-The table has one question per row, and one answer per data set. It has the data sets of
-the thesis: `cavity`, `curl-noise`, `fluid` and `multimaterial`. Tables, figures and
-sections in the questions are those of the thesis. The answers use the ranking metric
-over the horizon. Tables under some questions also compare another metric of the thesis.
-The answers do not use it. These words have a fixed meaning in the answers:
+The second table asks one question per row. Most questions test a claim of the thesis on
+our data. The answers use the ranking metric:
 
-- "Yes" and "better" mean significantly better at 5 %. "No" and "worse" mean
-  significantly worse. "Open" means that the test finds no difference.
-- "Ahead of 3 of 5" means that the mean is better than the means of three of five
-  models. "Better than 2, worse than 1" counts the significant differences.
-- "3 of 5 compared" means that two of the five other models have no active entry that
-  passes all [gates](baselines.md#gates).
-- "These weights" means that a model has fewer than three trainings. Then the answer is
-  about these weights, not about the methods. For a fit without random numbers one
-  training is enough.
-- A dash means that an entry is missing.
+| answer | meaning |
+| --- | --- |
+| yes, better | significantly better at 5 % |
+| no, worse | significantly worse at 5 % |
+| open | the test finds no difference |
+| better than 4, worse than 0, open: 1 | the numbers of other models with this result |
+| 3 of 5 compared | two of the five other models have no usable entry |
+| these weights | a model has fewer than three trainings; other seeds may differ |
+| - | an entry is missing |
 
-The answers compare two models over the seeds that both have. If there are no such
-seeds, or if one of the models draws no random numbers, the answers use all seeds of
-both. They leave out models that fail a [gate](baselines.md#gates), and superseded and
-withdrawn entries.
+A usable entry is active and passes all [gates](baselines.md#gates). Graph networks are
+named after their [operator](glossary.md). Models with ", pushforward" in their names
+replace the plain ones in the first two questions.
 
-Graph networks differ in their *operator*, and are named after it
-([glossary](glossary.md)). A graph network may have a second entry, with ", pushforward"
-at the end of its name. In two questions the second entry takes the place of the first:
-which operator is the most accurate, and whether NeuralMPM is better than every graph
-network. The question about the best naive baseline counts the two entries as two
-models."""
+Do not compare the errors of the thesis with ours directly. The thesis trained on its
+own data, at the size `full`, for hours on GPUs. Each of its values comes from one
+scenario."""
 
-MISSING_NOTE = """\
-These models are missing on this page. Semicolons separate their names. Some lines have
-a command. It trains the models of its line, except those for which lagbench has no
-recipe on this data set. Then `lagbench submit` makes the entries."""
+COMPARISONS_NOTE = """\
+The next tables have the comparisons behind the answers:
 
-UNANSWERED_NOTE = """\
-### Questions without an answer
+- `first` and `second` are the two models. The first number of `means` and of `seeds`
+  belongs to the first model.
+- The means use the seeds that both models have. Without common seeds they use all.
+- `lead` is the difference of the means. It is positive if the first model is better.
+- `won` counts the scenarios in which the first model is better.
+- `p (Holm)` is corrected for the number of models in the comparison. If both models
+  have one seed, it comes from the sign-flip test. Otherwise it comes from a t-test over
+  scenarios and seeds ([tests](scoring.md#comparing-two-methods)).
+- Some tables have rows for a second metric. The answers do not use them."""
 
-Each of these questions compares a model with one or two others. A question has an
-answer on a data set if the model and at least one of the others have an active entry
-there that fails no [gate](baselines.md#gates). No data set of the thesis has such
-entries, so these questions have no answer:"""
+LEADING_NOTE = """\
+In these metrics the mean of a reference predictor is better than the mean of every
+model. The chapters have the values."""
 
 TRAINING_NOTE = """\
-A training takes steps, and each step uses some windows. An epoch is one pass over all
-windows of train. VAR and the hybrids are fitted instead, without steps. The three
-columns *validation at* belong to the first seed. They state the lowest validation error
-that it reached within the first quarter, the first half and all of the steps.
-`validated` is the metric of this error. (`rmse` is the position error. Only our oldest
-trainings have it.) The last column shows how much the error decreased in the second
-half of the steps. If it decreased by more than 2 %, the training has not converged.
-Hours do not include hours on a GPU or validations. There is one exception: the hours of
-the first seed of NeuralMPM on cavity mini include validations. If a training started
-from the weights of earlier trainings, its steps, epochs and hours include the earlier
-trainings."""
+The columns *validation at* show the lowest validation error so far: after a quarter of
+the steps, after half of them, and at the end. They belong to the first seed.
+`validated` is the metric of this error (`rmse` is the position error).
 
-COST_NOTE = """\
-**Cost.** `changed` lists the options of the training or of the prediction that differ
-from the recipe. `none` means that no option differs. If the seeds of a model have
-different values, slashes separate the different values. A value that several seeds
-share stands only once. If there is no record of the training, `recipe` and `changed`
-come from the entry. The speed-up is the time of our solver for a frame, on one core,
-divided by the time of the model on the same machine. The times are those of the entry,
-mostly means over whole rollouts. The first table of this page has means over the first
-ten frames, which were measured in another run. So the two can differ. `trained on` is
-the machine on which the training ended. `s/frame` is the time on one core of a CPU. A
-dash means that there is no record of the value. Hours do not include hours on a GPU or
-validations. There is one exception: the hours of the first seed of NeuralMPM on cavity
-mini include validations."""
+The last column shows how much the error decreased in the second half. A training with a
+decrease of more than 2 % has not converged.
+
+An epoch is one pass over all windows of train. VAR and the hybrids are fitted, without
+steps. If a training started from other weights, the steps of the earlier trainings
+count too."""
 
 COMMANDS = """\
 ## How to make these results again
@@ -210,23 +189,17 @@ lagbench submit predictions.nc --from meta.yaml
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
-figures of the thesis at a size, and trains the models that they need. With the option
-`--split` it trains all models of the thesis for this split, and NeuralMPM. If you
-interrupt the command, run it again: it continues where it stopped. `lagbench submit`
-makes entries from the predictions of the trained models.
+figures of the thesis, and trains the models that they need. `--split` limits the
+command to one split. If you interrupt the command, run it again: it continues where it
+stopped.
 
-This page shows only results that have an entry. `python -m studies.results` can also
-show the results of two files that are not in the repository: `mlp_studies.json` and
-`var_protocol.json`. Its options `--studies` and `--runs` each name a folder. In both
-folders the files lie in the subfolder `<split>/<size>/`. If both folders have the same
-file, the one in the folder of `--studies` counts. `python -m studies.thesis` writes
-`mlp_studies.json` into the folder of runs. The other file is the output of
-`python -m studies.thesis.var_protocol --size mini --json`. Save it as
-`fluid/mini/var_protocol.json` in one of the two folders.
+These models need more than the option `--baseline`. Each line has the options of
+`lagbench train`, or the command:"""
 
-Some models of `python -m studies.thesis` need more than the option `--baseline`. Each
-line has the name of such a model, and the options of `lagbench train` (or the command)
-that make it:"""
+MISSING_NOTE = """\
+These models have no active entry, so this page does not show them. If a line has a
+command, the command trains the models of this line for which lagbench has a recipe.
+Semicolons separate the names of the models."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -247,12 +220,12 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     summarised = [*learned, *newer_learned]
     if summarised:
         parts += [summary_table(summarised), SUMMARY_NOTE]
-        parts.append(verdict_on_learning(summarised))
+        parts += [VERDICT, verdict_on_learning(summarised)]
     parts.append(HOW_TO_READ)
-    parts += _claims(learned)
-    parts += _references_and_training(summarised)
     for results in [*scored, *newer_learned]:
         parts += _chapter(results)
+    parts += _claims(learned)
+    parts += _references_and_training(summarised)
 
     protocols = list(_protocols(sources, sizes))
     if protocols:
@@ -288,31 +261,32 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
         }
     yield CLAIMS_NOTE
     yield claims_overview(rows_by_claim, [results.where for results in learned])
+    yield COMPARISONS_NOTE
 
-    unanswered = []
+    unanswered_count = 0
     for claim, rows_by_place in rows_by_claim.items():
         all_rows = [row for rows in rows_by_place.values() for row in rows]
         if all_rows:
             yield f"### {claim.question}"
             yield table_markdown(comparison_table(all_rows))
         else:
-            unanswered.append(f"- {claim.question}")
-    if unanswered:
-        yield UNANSWERED_NOTE
-        yield "\n".join(unanswered)
+            unanswered_count += 1
+    if unanswered_count:
+        yield (
+            f"{unanswered_count} more questions in `studies/thesis/claims.py` have no "
+            "answer: no data set has usable entries of the models that they compare."
+        )
 
 
 def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
     """Yield where references beat models, and how errors still fall at the end."""
     if not learned:
         return
-    leading = leading_references(learned)
-    if leading.rows:
-        yield (
-            "## In which metrics has a reference predictor a better mean than every "
-            "model?"
-        )
-        yield table_markdown(leading)
+    leading = leading_table(learned)
+    if leading:
+        yield "## In which metrics does a reference predictor lead?"
+        yield LEADING_NOTE
+        yield leading
 
     yield "## How much does the error decrease with the training?"
     yield TRAINING_NOTE
@@ -320,54 +294,53 @@ def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
 
 
 def _chapter(results: SplitResults) -> Iterator[str]:
-    """Yield the scores on one split and size: horizon, thesis, costs."""
+    """Yield the results on one split and size: ranking, thesis, metrics, trainings."""
     size = results.size
     task = size.task
     test_count = len(size.subsets["test"])
     train_count = len(size.subsets["train"])
     yield f"## {results.where}"
-    yield (
-        f"{size.particles} particles; {task.input_frames} given frames, "
-        f"{task.horizon} predicted frames; {test_count} test scenarios, {train_count} "
-        f"train scenarios; version {size.version} of the data. The models are sorted "
-        f"by `{results.ranking}`, the best first."
+    text = (
+        f"Data of version {size.version}: {size.particles:,} particles, "
+        f"{task.input_frames} given frames, {task.horizon} predicted frames, "
+        f"{train_count} train scenarios, {test_count} test scenarios."
     )
-    yield horizon_table(results)
-    if not results.models:
-        return
-
-    if size.split in TABLE_4_8:
-        yield (
-            "This table has two errors for each scene, like Table 4.8 of the thesis: "
-            "`average` is `mse_avg` of the scenario, and `end` is its `mse_end`. A "
-            "cell is our value / the value of the thesis. Our scenario is not the one "
-            "of the thesis, but our first test scenario of the same scene."
+    run = run_of(results)
+    if run is not None and run.solver is not None:
+        text += (
+            " The simulator that made the data takes "
+            f"{format_time(run.solver)} for a frame."
         )
-        yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
-    elif size.split in EXPECTED:
-        yield _vorticity_note(results)
-        yield vorticity_table(results)
-        tau = order_agreement(results)
-        if tau is not None:
-            yield (
-                "Kendall's tau compares two orders of the models: by our MSE, averaged "
-                "over the test scenarios, and by the MSE of the thesis on T0. It is "
-                f"{tau} (1: the same order, -1: the reversed order)."
-            )
-    yield COST_NOTE
-    yield cost_table(results)
+    yield text
+    yield ranking_table(results)
+    if size.split == "cavity":
+        yield from _thesis_vorticity(results)
+    yield "**Other metrics.**"
+    yield metrics_table(results)
+    if results.models:
+        yield "**Trainings.**"
+        yield cost_table(results)
 
 
-def _vorticity_note(results: SplitResults) -> str:
-    note = (
-        "This table has the metrics of the vorticity at frame "
-        f"{key_frame(results.size)}. Tables 5.4 and 5.5 and Fig. 5.13 of the thesis "
-        "have the same metrics. A cell is the mean over test scenarios, with the first "
-        "test scenario (T0) in brackets"
+def _thesis_vorticity(results: SplitResults) -> Iterator[str]:
+    """Yield Table 5.4 of the thesis beside our values; nothing without its models."""
+    table = vorticity_table(results)
+    if not table:
+        return
+    yield (
+        f"**Table 5.4 of the thesis.** Errors of the vorticity at frame "
+        f"{key_frame(results.size)}. A cell of ours is the mean over the test "
+        "scenarios. The brackets contain the first test scenario. The thesis has only "
+        "this scenario, so compare its value with the brackets."
     )
-    if results.size.split == "cavity":
-        return f"{note}. The thesis has only T0: compare it with the brackets."
-    return f"{note}."
+    yield table
+    tau = order_agreement(results)
+    if tau is not None:
+        yield (
+            "Kendall's tau compares the order of the models by our mean MSE with their "
+            f"order by the MSE of the thesis. It is {tau}. (For equal orders it is 1, "
+            "for reversed orders -1.)"
+        )
 
 
 def _protocols(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:

@@ -330,11 +330,8 @@ def _count_verdicts(judged: Sequence[ComparedModels]) -> str:
         return "yes"
     if len(judged) == 1:
         return "no" if worse_count else "open"
-    ahead_count = sum(row.test.difference < 0.0 for row in judged)
-    return (
-        f"ahead of {ahead_count} of {len(judged)}; "
-        f"better than {better_count}, worse than {worse_count}"
-    )
+    open_count = len(judged) - better_count - worse_count
+    return f"better than {better_count}, worse than {worse_count}, open: {open_count}"
 
 
 def comparison_table(rows: Sequence[ComparedModels]) -> Table:

@@ -135,7 +135,7 @@ def test_first_place_takes_all_rivals() -> None:
     tied = claim_rows(FIRST, results)
     open_rivals = [row.second for row in tied if row.verdict is Verdict.OPEN]
     assert open_rivals == ["gns"]
-    counts = "ahead of 5 of 5; better than 4, worse than 0"
+    counts = "better than 4, worse than 0, open: 1"
     assert answer(tied) == f"{counts} (these weights)"
 
     last = claim_rows(FIRST, six(supergat=equal(0.9)))
