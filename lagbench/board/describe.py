@@ -70,7 +70,7 @@ def draft_entry(
         about = _describe(headers, meta, extended)
     with errors:
         weight_paths = require_weights(
-            weights, headers, rivals, folder=folder, place=place
+            weights, headers, rivals, folder=folder, place=place, kind=meta.kind
         )
     errors.raise_errors()
 

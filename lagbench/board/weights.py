@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +31,7 @@ from lagbench.errors import (
     check_regular,
 )
 from lagbench.models.onnx_model import check_onnx
+from lagbench.references.predictor import Kind
 from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
@@ -59,6 +61,13 @@ MOST_LOG_BYTES = 256 << 10
 
 TRAINING_LOG = "training.json"
 
+HYBRID_PREFIX = "hybrid-"
+"""Start of the names of our hybrid baselines; a learned baseline has another start."""
+
+
+class LogLeftOutWarning(UserWarning):
+    """A file beside submitted weights is no log of a training, and is not published."""
+
 
 def require_weights(
     weights: Sequence[str | Path],
@@ -67,6 +76,7 @@ def require_weights(
     *,
     folder: Folder,
     place: Place,
+    kind: Kind,
 ) -> tuple[Path | None, ...]:
     """Return the weights of each of the predictions, by seed; None where it has none.
 
@@ -76,12 +86,13 @@ def require_weights(
         rivals: other active entries of the data set, by path.
         folder: the leaderboard.
         place: split, size and method of the entry.
+        kind: what the submitter says of the method.
 
     Raises:
         UsageError: the weights are too large, or more files than predictions; they did
             not make the predictions, or the predictions do not say so; another entry
-            has the weights and predicts with them in the same way; or torch is not
-            installed.
+            has the weights and predicts with them in the same way; they are those of
+            a hybrid, and the kind is another one; or torch is not installed.
         UnreadableFileError: a file is no file of weights.
     """
     paths = [Path(path) for path in weights]
@@ -107,6 +118,7 @@ def require_weights(
             chosen[index] = path
             continue
         file = _inspect_weights(path)
+        _require_kind(file, kind)
         _require_fit(file, headers[0], seeds, any_size=keeper is not None)
         index = seeds.index(file.seed)
         if chosen[index] is not None:
@@ -244,6 +256,18 @@ def _require_new_use(
                 fix="predict with another option or size; or, if this entry replaces "
                 f"{use.entry.yaml_path}, set that one to status: superseded first",
             )
+
+
+def _require_kind(file: WeightsFile, kind: Kind) -> None:
+    """Refuse weights of a hybrid for an entry that states another kind."""
+    if file.baseline.startswith(HYBRID_PREFIX) and kind is not Kind.HYBRID:
+        raise UsageError(
+            "the weights are those of a hybrid, and the entry states another kind",
+            where=f"kind in --from meta.yaml, and {file.path}",
+            expected="kind: hybrid",
+            got=f"kind: {kind}, and weights of the baseline {file.baseline}",
+            fix="write kind: hybrid in meta.yaml",
+        )
 
 
 def _require_fit(
@@ -430,10 +454,16 @@ def _find_training_log(path: Path) -> Path | None:
     """Return the log of a training, None where weights have none.
 
     It has the name of the weights, as on a board. Without such a file it is
-    training.json, as in the folder of a run.
+    training.json, as in the folder of a run. A :class:`LogLeftOutWarning` tells of a
+    file that can be no log.
     """
     for candidate in (path.with_suffix(".json"), path.with_name(TRAINING_LOG)):
-        if not candidate.is_file() or reason_unfit_log(candidate) is not None:
+        if not candidate.is_file():
+            continue
+        reason = reason_unfit_log(candidate)
+        if reason is not None:
+            message = f"{candidate} is left out, for it is no log of a training: "
+            warnings.warn(message + reason, LogLeftOutWarning, stacklevel=2)
             continue
         # the JSON file that `lagbench predict` writes about costs has no step
         if "step" in json.loads(candidate.read_bytes()):

@@ -28,6 +28,7 @@ from lagbench.board.entry import EntryBudget, Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.publish import SubmitResult
 from lagbench.board.submit import submit
+from lagbench.board.weights import LogLeftOutWarning
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
     ChecksFailedError,
@@ -40,6 +41,10 @@ from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.submission import open_predictions
 from lagbench.submission.budget import Budget
+
+WEIGHTS = Path(__file__).parents[2] / "leaderboard/weights"
+"""Weights of the committed leaderboard."""
+
 
 BUDGET = Budget(
     windows=48,
@@ -794,6 +799,17 @@ def test_other_weights_are_refused(own: BoardBench) -> None:
     assert own.state() == before
 
 
+def test_weights_of_a_hybrid_are_not_those_of_a_learned_model(own: BoardBench) -> None:
+    """The kind of an entry is what its submitter says; these weights say otherwise."""
+    run = trained(own, 0)
+    hybrid = WEIGHTS / "cavity/mini/hybrid-projection_0.pt"
+    before = own.state()
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run, weights=(hybrid,))
+    assert str(caught.value.where).startswith("kind")
+    assert own.state() == before
+
+
 Damage = Callable[[BoardBench], object]
 
 
@@ -869,19 +885,25 @@ def test_what_the_check_finds(own: BoardBench, name: str) -> None:
 def test_what_is_no_record_is_not_copied(
     own: BoardBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The entry does without, as it may: too long, or what predictions cost. All
-    weights have a bound.
+    """The entry does without, as it may: too long, damaged, or what predictions cost.
+    All weights have a bound.
     """
     run = trained(own, 0)
     (run / "training.json").unlink()
     cost = json.dumps({"seconds_per_frame": 1.0})
-    for name, record in (
-        ("training.json", LONG_RECORD),
-        ("weights.json", cost),
+    for name, record, has_warning in (
+        ("training.json", LONG_RECORD, True),
+        ("training.json", "{", True),
+        ("training.json", "[]", True),
+        ("weights.json", cost, False),
     ):
         path = run / name
         path.write_text(record)
-        submitted(own, run, replace=True)
+        warned = nullcontext()
+        if has_warning:
+            warned = pytest.warns(LogLeftOutWarning, match=name)
+        with warned:
+            submitted(own, run, replace=True)
         assert list(kept_files(own)) == ["drift_0.pt"]
         path.unlink()
     assert_sound(own)
