@@ -124,8 +124,10 @@ def check_constants(
         if "fringe_length" not in values:
             raise _missing_parameter("fringe_length", kind, size)
         length = values["fringe_length"]
-        if not _POSITIVE.holds(length):
-            raise _impossible_value("fringe_length", length, str(_POSITIVE), size)
+        box_length = float(size.box.lengths[0])
+        limit = Limit(low=0.0, high=box_length, open_low=True)
+        if not limit.holds(length):
+            raise _impossible_value("fringe_length", length, str(limit), size)
 
 
 def place_of(size: Size) -> str:

@@ -7,6 +7,7 @@ followed: nothing outside the file is opened. Files of strangers are checked in
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +28,9 @@ FIRST_BYTES = 64
 """Bytes by which the format of a file is told."""
 
 OTHER_FORMATS: Mapping[bytes, str] = {
-    b"CDF": "netCDF-3, the old format",
+    b"CDF\x01": "netCDF-3, the old format",
+    b"CDF\x02": "netCDF-3, the old format",
+    b"CDF\x05": "netCDF-3, the old format",
     b"PK\x03\x04": "a zip archive, perhaps .npz",
     b"\x93NUMPY": "a NumPy .npy file",
     b"\x1f\x8b": "a gzip archive",
@@ -112,10 +115,14 @@ def guess_format(first_bytes: bytes) -> str:
             return format_name
     if not first_bytes:
         return "an empty file"
-    if first_bytes.isascii():
-        words = first_bytes.decode("ascii").split()
-        if "".join(words).isprintable():
-            return "a text file"
+    # an incremental decoder accepts a character that the end of the bytes cuts
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        words = decoder.decode(first_bytes).split()
+    except UnicodeDecodeError:
+        return "bytes of another format"
+    if "".join(words).isprintable():
+        return "a text file"
     return "bytes of another format"
 
 

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 
@@ -251,3 +251,24 @@ def test_a_folder_in_place_of_a_file_names_its_files(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError) as caught:
         check_regular(tmp_path, fix="write another one")
     assert caught.value.fix == "name a file in it: weights.pt"
+
+
+@pytest.mark.parametrize(
+    ("content", "got"),
+    [
+        (b"CDF\x02", "netCDF-3, the old format"),
+        (b"CDF is a format", "a text file"),
+        (("a" + "Ü" * 40).encode(), "a text file"),
+        (b"\xff\xfe\x00", "bytes of another format"),
+        (b"", "an empty file"),
+    ],
+)
+def test_a_file_of_another_format_is_named(
+    tmp_path: Path, content: bytes, got: str
+) -> None:
+    """A text in UTF-8 is a text, even where the first bytes end inside a character."""
+    path = tmp_path / "a.nc"
+    path.write_bytes(content)
+    with pytest.raises(UnreadableFileError) as caught:
+        check_file(path)
+    assert caught.value.got == got

@@ -525,6 +525,7 @@ def test_a_rate_of_zero_stands_for_no_fringe(
     [
         (None, ("parameter fringe_length", "declare fringe_length")),
         (0.0, ("parameter fringe_length", "a finite number, > 0", "0.0")),
+        (1.5, ("parameter fringe_length", "<= 1", "1.5")),
     ],
 )
 def test_a_fringe_with_a_rate_needs_a_length(
