@@ -49,8 +49,8 @@ def export_command(
         bool,
         option(
             "--wall-particles",
-            "Add particles that move with the walls; only for two-dimensional boxes with "
-            "four walls.",
+            "Add particles that move with the walls; only for two-dimensional boxes "
+            "with four walls.",
         ),
     ] = False,
     overwrite: Annotated[
