@@ -215,21 +215,21 @@ in which the test found this difference at the level of 5 %:
 |---|---|---|---|---|---|---|---|
 {rows}
 
-**Scatter.** A score varies around the mean of its method. The columns *seed*, *rest*
-and *method in scenario* show three standard deviations, relative to the mean:
+**Scatter.** With seed s in scenario i, a method of mean m has the score
+m (1 + b_i + c_s + e_si). The columns show the standard deviations of the three random
+terms:
 
-- *seed*: all scores of a seed are higher or lower;
-- *method in scenario*: all seeds of a method are worse or better in one scenario;
-- *rest*: one seed varies in one scenario.
+- *seed*: c_s changes all scores of a seed;
+- *method in scenario*: b_i changes the scores of all seeds of a method in a scenario;
+- *rest*: e_si changes the score of one seed in one scenario.
 
-With seed s in scenario i, a method of mean m has the score m (1 + b_i + c_s + e_si).
-Here b_i belongs to the method in the scenario, c_s to the seed, and e_si is the rest. A
-scenario may be harder for both methods. We left this out, because it nearly cancels.
+A scenario may be harder for both methods. We left out this effect, because it nearly
+cancels.
 
 **Rows.** The first three rows use assumed values. The other rows use values from the
-score files of size mini. These values are rough, because a split may have only one
-suitable pair of methods. In a suitable pair the means differ by less than a factor of
-two, and one method has several seeds. A split without such a pair has no row.
+score files of size mini. A pair of methods counts if the means differ by less than a
+factor of two, and one method has several seeds. A split may have only one such pair, so
+these values are rough. A split without such a pair has no row.
 
 More scenarios do not remove the scatter between seeds. Train more seeds if two methods
 differ by less than this scatter.
@@ -237,8 +237,8 @@ differ by less than this scatter.
 ## Differences between equal methods
 
 In this table both sides have seeds of the same method. With several seeds on each side
-the test should find a difference in at most 5 % of the draws. The statistical error of
-such a share is 1.4 percentage points (95 % interval).
+the test should find a difference in at most 5 % of the draws. The 95 % interval of a
+share of 5 % is 3.6 to 6.4 %.
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|
@@ -246,11 +246,11 @@ such a share is 1.4 percentage points (95 % interval).
 
 With one seed on each side, the test compares two sets of weights
 ([sign-flip test](scoring.md#comparing-two-methods)). One set may really be better than
-the other set, but the method is the same. So the leaderboard speaks of "these weights"
-if one side has only one seed.
+the other set, although the method is the same. So the leaderboard speaks of "these
+weights" if one side has only one seed.
 
-The rows *middling* and *large* are equal, because the test does not depend on the scale
-of the scatter.
+The rows *middling* and *large* are equal. In *large* all three deviations are twice as
+large, and a common factor does not change the test.
 
 The score files of size mini have {pair_count} pairs of two seeds of the same method:
 {pairs_by_split}. The test finds a difference in {differing_count} of these pairs. The

@@ -343,7 +343,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
         "bytes before compression": f"{raw_terabytes:.2f} TB",
-        "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB each)",
+        "bytes in files": f"{terabytes:.2f} TB ({file / 1e9:.1f} GB per scenario)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{writing:,.0f} core hours",
         perturbed_runs: f"{perturbed_hours:,.0f} core hours",
@@ -352,8 +352,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"The plan uses the times of q = {measured_q}. It is for {SCENARIOS:,} "
-        f"scenarios. A scenario has {n:,} particles, {frames} frames of {row.substeps} "
+        f"The plan is for {SCENARIOS:,} scenarios, with the times of q = {measured_q}. "
+        f"A scenario has {n:,} particles, {frames} frames of {row.substeps} "
         f"substeps, and a grid of {row.grid} x {row.grid} cells. The perturbed runs "
         "end with the horizon, as in fluid full:",
         "",
@@ -412,18 +412,18 @@ def main() -> int:
         "q names a row of Table 3.1 of the [thesis](../glossary.md). The row states "
         "the particles, the grid and the substeps.",
         "",
-        "The first table shows processor times for one particle, and its bytes in the "
-        "file. *Writing a frame* includes hashing and compressing. *Hashing a written "
-        "frame* is the work of `lagbench verify`. *Statistics of a frame* is the work "
-        "for the means and standard deviations over train.",
+        "The first table shows processor times and bytes for one particle. *Writing a "
+        "frame* includes hashing and compressing. *Hashing a written frame* is the "
+        "work of `lagbench verify`. *Statistics of a frame* is the work for the "
+        "means and standard deviations over train.",
         "",
         *parts_table(measured),
         "",
-        "The next table shows a *whole generation*. It makes one scenario of train, "
-        "one scenario of test, and the [perturbed run](../glossary.md) of the test "
-        "scenario. The *sum of the parts* comes from the first table. A whole "
-        "generation takes longer, because it also imports, compiles, writes the "
-        "manifest and draws the pictures. The *client* is the process that you start. "
+        "A *whole generation* makes one scenario of train, one scenario of test, and "
+        "the [perturbed run](../glossary.md) of the test scenario. The *sum of the "
+        "parts* comes from the first table. A whole generation takes longer, because "
+        "the command also imports, compiles, writes the manifest and draws the "
+        "pictures. The *client* is the process that you start. "
         "The client starts the workers.",
         "",
         *whole_table(measured),

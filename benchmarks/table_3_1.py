@@ -210,9 +210,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     clock = "as wall-clock time in milliseconds"
     if device == Device.CPU:
         clock = "as processor time in milliseconds"
-    consequence = "On a CPU this is often less than the noise."
+    consequence = "On a CPU the copy is often shorter than the noise."
     if device == Device.CUDA:
-        consequence = "On a GPU this matters, because a copy takes long."
+        consequence = "On a GPU a copy takes long."
     return [
         "## Table 3.1: time of the solver for more and more particles",
         "",
@@ -223,9 +223,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "",
         f"Our times are the shortest of {repeats} runs, {clock}. t/frame is the time "
         "of all substeps of a frame. fps is the number of frames per second. "
-        f"t/substep is the time of {FIXED} substeps, divided by {FIXED}. Both times "
-        "include one copy of all positions. So the copy adds more to t/substep "
-        f"if a frame has more than {FIXED} substeps. {consequence}",
+        f"t/substep is the time of {FIXED} substeps, divided by {FIXED}. Each measured "
+        f"time includes one copy of all positions, so t/substep has 1/{FIXED} of a "
+        f"copy. {consequence}",
         "",
     ]
 
@@ -256,9 +256,8 @@ def markdown(
     lines += [
         "",
         "The next table shows how the times grow. The row `t/frame against q^2` has "
-        "the exponent p in t/frame ~ (q^2)^p, from a least-squares fit. The last two "
-        "columns show the exponents of the thesis, first for the rows above, then for "
-        "all nine rows.",
+        "the exponent p in t/frame ~ (q^2)^p, from a least-squares fit. *Same rows* "
+        "are the rows of the table above. *All rows* are the nine rows of the thesis.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",

@@ -67,9 +67,10 @@ On this page you can look up for each data set:
 - whether a model is better than a classical solver that costs no more;
 - which recipe trained a model, and how long the training took.
 
-This table has the best learned model and the best hybrid of each data set. The
-[verdict](#verdict) follows. Then each data set has a chapter with all models that have
-an [active entry](glossary.md). At the end stand the [claims](#claims) of the thesis."""
+The next table has the best learned model and the best hybrid of each data set. The
+[verdict](#verdict) follows. Then each data set has a chapter with its
+[active entries](glossary.md) and reference predictors. Last come the [claims](#claims)
+of the thesis and notes on the trainings."""
 
 SUMMARY_NOTE = """\
 - Scores are errors, so lower is better.
@@ -78,25 +79,26 @@ SUMMARY_NOTE = """\
   trains them.
 - A *learned* model contains no solver. A *hybrid* is a classical solver with a learned
   part. Some data sets have no hybrid.
-- The time in brackets is the processor time of one frame on one core. It is the mean
-  over the first ten frames. All times of a data set come from one run on one machine.
-  Times of two data sets may come from two machines.
-- `skill` is 1 - (score of the model) / (score of the best naive predictor). A model
-  with skill 1 is perfect. A model with skill 0 is as good as that predictor.
+- The time in brackets is the processor time of one frame on one core, as a mean over
+  the first ten frames. Compare only times of one data set. They come from one run on
+  one machine.
+- `skill` is 1 - (score of the model) / (score of the best naive predictor). Skill 1 is
+  perfect. Skill 0 is as good as that predictor.
 - `against_classical` is (score of the model) / (score of a classical solver). The
   solver is the best one that costs no more per frame than the model. The brackets
   contain the 95 % interval. The name of the solver follows.
 - If every solver costs more than the model, the ratio uses the cheapest solver. Then
   the cell says "which costs more".
-- *Learning pays* on a data set if the whole interval of its best model, learned or
-  hybrid, is below 1."""
+- *Learning pays* on a data set if the whole interval of `against_classical` is below 1.
+  The best learned or hybrid model decides.
+- If every solver costs more, there is a verdict only for an interval below 1."""
 
 VERDICT = "## Verdict"
 
 HOW_TO_READ = """\
 ## How to read the chapters
 
-Each chapter has three tables. Only cavity mini has a fourth one, Table 5.4 of the
+Each chapter has three tables. Cavity mini also has Table 5.4 of the
 [thesis](glossary.md).
 
 **Ranking.** The best method comes first.
@@ -104,21 +106,21 @@ Each chapter has three tables. Only cavity mini has a fourth one, Table 5.4 of t
 - The score is the mean over the test scenarios. The brackets contain its 95 % interval
   (bootstrap over scenarios).
 - If a model has several seeds, the number after ± is the standard deviation over the
-  seeds. The leaderboard resamples the seeds too, so its intervals are wider.
+  seeds. The leaderboard resamples seeds too, so the leaderboard has wider intervals.
 - A dash means that there is no value.
 - `readme-network` is the network of the program in the README.
 - The times and `against_classical` mean the same as in the first table.
 
 **Other metrics.** The table has means over scenarios and frames. [Scoring](scoring.md)
-defines the metrics. In the heads ↓ means that lower is better, and ↑ that higher is
-better. After ◎ stands the best value. A star marks a metric that is undefined in some
-frames. The mean leaves these frames out. On [free surfaces](glossary.md) the table has
-no metrics of the vorticity.
+defines the metrics. ↓ means that lower is better, and ↑ that higher is better. After ◎
+stands the best value. A star marks a metric that is undefined in some frames. The mean
+leaves these frames out. On [free surfaces](glossary.md) the table has no metrics of the
+vorticity.
 
 **Trainings.**
 
-- `changed` lists the options that differ from the recipe. If seeds differ in a value,
-  slashes separate the values.
+- `changed` lists the options that differ from the recipe. If seeds differ, slashes
+  separate their values.
 - Hours are processor hours, without hours on a GPU and without validations. Only the
   hours of the first seed of NeuralMPM on cavity mini include validations.
 - If a training started from other weights, its hours include the earlier trainings.
@@ -127,79 +129,77 @@ no metrics of the vorticity.
 score files and the records of the trainings. Do not edit the page."""
 
 CLAIMS_NOTE = """\
-The second table asks one question per row. Most questions test a claim of the thesis on
-our data. The answers use the ranking metric:
+The next table explains the answers to the questions below. Some questions test a claim
+of the thesis on our data. The answers use the ranking metric and the level of 5 %:
 
 | answer | meaning |
 | --- | --- |
-| yes, better | significantly better at 5 % |
-| no, worse | significantly worse at 5 % |
-| open | the test finds no difference |
-| better than 4, worse than 0, open: 1 | the numbers of other models with this result |
+| yes | significantly better than every other model |
+| no | significantly worse than the only other model |
+| open | the test finds no difference from the other model |
+| better than 4, worse than 0, open: 1 | better than four models, open for one |
 | 3 of 5 compared | two of the five other models have no usable entry |
-| these weights | a model has fewer than three trainings; other seeds may differ |
-| - | an entry is missing |
+| these weights | a model has fewer than three seeds, so the answer may change |
+| - | no usable entries to compare |
 
-A usable entry is active and passes all [gates](baselines.md#gates). Graph networks are
-named after their [operator](glossary.md). Models with ", pushforward" in their names
-replace the plain ones in the first two questions.
+A usable entry is active and fails no [gate](baselines.md#gates). Graph networks are
+named after their [operator](glossary.md). In the first two questions a model named
+", pushforward" stands for its operator.
 
 Do not compare the errors of the thesis with ours directly. The thesis trained on its
-own data, at the size `full`, for hours on GPUs. Each of its values comes from one
-scenario."""
+own data, at the size `full`. Each value of the thesis comes from one scenario."""
 
 COMPARISONS_NOTE = """\
 The next tables have the comparisons behind the answers:
 
-- `first` and `second` are the two models. The first number of `means` and of `seeds`
-  belongs to the first model.
-- The means use the seeds that both models have. Without common seeds they use all.
-- `lead` is the difference of the means. It is positive if the first model is better.
+- The first number of `means` and of `seeds` belongs to the model `first`.
+- The means use the seeds that both models have. Without common seeds the means use all
+  seeds.
+- `lead` is the difference of the means, positive if the first model is better.
 - `won` counts the scenarios in which the first model is better.
-- `p (Holm)` is corrected for the number of models in the comparison. If both models
-  have one seed, it comes from the sign-flip test. Otherwise it comes from a t-test over
-  scenarios and seeds ([tests](scoring.md#comparing-two-methods)).
+- `p (Holm)` is corrected for the number of other models. If both models have one seed,
+  p comes from the sign-flip test. Otherwise p comes from a t-test over scenarios and
+  seeds ([tests](scoring.md#comparing-two-methods)).
 - Some tables have rows for a second metric. The answers do not use them."""
 
 LEADING_NOTE = """\
-In these metrics the mean of a reference predictor is better than the mean of every
-model. The chapters have the values."""
+The table lists the metrics in which a reference predictor has a better mean than every
+learned or hybrid model."""
 
 TRAINING_NOTE = """\
-The columns *validation at* show the lowest validation error so far: after a quarter of
-the steps, after half of them, and at the end. They belong to the first seed.
+All rows are of the first seed. The columns *validation at* show the lowest validation
+error until then: after a quarter of the steps, after half of them, and at the end.
 `validated` is the metric of this error (`rmse` is the position error).
 
 The last column shows how much the error decreased in the second half. A training with a
 decrease of more than 2 % has not converged.
 
-An epoch is one pass over all windows of train. VAR and the hybrids are fitted, without
-steps. If a training started from other weights, the steps of the earlier trainings
-count too."""
+The third column has the steps and the windows per step. An epoch is one pass over all
+windows of train. VAR and the hybrids are fitted, without steps. If a training started
+from other weights, the steps of the earlier trainings count too."""
 
 COMMANDS = """\
 ## How to make these results again
 
 ```
 lagbench generate --split cavity --size mini
-lagbench train --baseline supergat --split cavity --size mini --seed 0
-lagbench predict runs/cavity/mini/supergat-0/weights.pt -o predictions.nc
+lagbench train --baseline neuralmpm --split cavity --size mini --seed 0
+lagbench predict runs/cavity/mini/neuralmpm-0/weights.pt -o predictions.nc
 lagbench score predictions.nc
-lagbench submit predictions.nc --from meta.yaml
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
-figures of the thesis, and trains the models that they need. `--split` limits the
-command to one split. If you interrupt the command, run it again: it continues where it
-stopped.
+figures of the thesis, and trains the models that they need. After an interruption the
+same command continues.
 
-These models need more than the option `--baseline`. Each line has the options of
-`lagbench train`, or the command:"""
+A mirror-averaged model has the weights of the model without averaging. Predict with
+`lagbench predict --set model.average=true`. The other variants need these options of
+`lagbench train`:"""
 
 MISSING_NOTE = """\
-These models have no active entry, so this page does not show them. If a line has a
-command, the command trains the models of this line for which lagbench has a recipe.
-Semicolons separate the names of the models."""
+These models have no active entry, so this page does not show them. The command in a
+line trains the models of the line that have a recipe. Semicolons separate the names of
+the models."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -234,7 +234,10 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     if studies:
         parts += ["## MLPs from frame to frame", *studies]
 
-    variants = [_variant_line(model) for model in ROSTER.values() if model.variant_of]
+    variants = []
+    for model in ROSTER.values():
+        if model.variant_of and not model.weights_of:
+            variants.append(_variant_line(model))
     missing = [line for results in thesis_results for line in _missing_lines(results)]
     parts += [COMMANDS, "\n".join(variants), "## Missing"]
     if missing:
@@ -328,18 +331,18 @@ def _thesis_vorticity(results: SplitResults) -> Iterator[str]:
     if not table:
         return
     yield (
-        f"**Table 5.4 of the thesis.** Errors of the vorticity at frame "
-        f"{key_frame(results.size)}. A cell of ours is the mean over the test "
-        "scenarios. The brackets contain the first test scenario. The thesis has only "
-        "this scenario, so compare its value with the brackets."
+        f"**Table 5.4 of the thesis.** Measures of the vorticity at frame "
+        f"{key_frame(results.size)}. Our cells have the mean over the test scenarios, "
+        "and in brackets the value of the first test scenario. Table 5.4 has only one "
+        "test scenario, which corresponds to our first one."
     )
     yield table
     tau = order_agreement(results)
     if tau is not None:
         yield (
-            "Kendall's tau compares the order of the models by our mean MSE with their "
-            f"order by the MSE of the thesis. It is {tau}. (For equal orders it is 1, "
-            "for reversed orders -1.)"
+            "Kendall's tau compares the order of the models by our mean MSE with the "
+            f"order by the MSE of the thesis. Here tau is {tau}. (For equal orders tau "
+            "is 1, for reversed orders -1.)"
         )
 
 
@@ -370,13 +373,10 @@ def _studies(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
 
 
 def _variant_line(model: RosterModel) -> str:
-    """Return how a variant of a reference model is made."""
+    """Return how a variant of a reference model is trained."""
     settings = "".join(f" --set {setting}" for setting in model.settings)
-    if model.weights_of:
-        weights = f"weights of `{model.weights_of}`"
-        return f"- `{model.name}`: `lagbench predict{settings}` with {weights}"
     recipe = f" --recipe {model.recipe}" if model.recipe else ""
-    return f"- `{model.name}`: `--baseline {model.baseline}{recipe}{settings}`"
+    return f"- {model.label}: `--baseline {model.baseline}{recipe}{settings}`"
 
 
 def _missing_lines(results: SplitResults) -> Iterator[str]:
