@@ -84,13 +84,15 @@ class NodalStressND:
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
 
-        self.dimension = box.dimension
-        self.axes = tuple(range(self.dimension))
-        self.has_z = self.dimension == 3
+        dimension = box.dimension
+        self.dimension = dimension
+        self.axes = tuple(range(dimension))
+        self.has_z = dimension == 3
         self.periodic = box.periodic
         self.has_walls = not all(self.periodic)
         self.has_obstacle = p.obstacle_particles > 0
         self.has_fringe = p.fringe_rate > 0.0
+        self.has_force = p.force_layers > 0
         # particles of the fluid, and behind them those of the obstacle
         self.particles = p.particles + p.obstacle_particles
         # the field of forces has a layer even where no force acts
@@ -102,7 +104,8 @@ class NodalStressND:
         self.stride = tables.stride
         image_signs = tables.images.sign
         self.image_signs = image_signs.tolist()
-        self.image_count = len(self.image_signs)
+        image_count = len(self.image_signs)
+        self.image_numbers = tuple(range(image_count))
 
         self.inv_dx = float(p.grid)
         self.dt = p.dt
@@ -116,16 +119,20 @@ class NodalStressND:
         position_max = high_faces - inset
         self.position_min = position_min.tolist()
         self.position_max = position_max.tolist()
-        self.period = box.lengths.tolist()
+        period = box.lengths
+        self.period = period.tolist()
 
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
-        reach = _REACH[self.dimension]
+        reach = _REACH[dimension]
         speed_reach = reach * self.speed_bound
-        self.velocity_scale = fixed_point_scale(self.particles, speed_reach)
-        self.count_scale = fixed_point_scale(self.particles, JACOBIAN_BOUND)
-        self.velocity_unit = 1.0 / self.velocity_scale
-        self.count_unit = 1.0 / self.count_scale
-        self.cell_scale = self.velocity_scale * dx
+        particles = self.particles
+        velocity_scale = fixed_point_scale(particles, speed_reach)
+        count_scale = fixed_point_scale(particles, JACOBIAN_BOUND)
+        self.velocity_scale = velocity_scale
+        self.count_scale = count_scale
+        self.velocity_unit = 1.0 / velocity_scale
+        self.count_unit = 1.0 / count_scale
+        self.cell_scale = velocity_scale * dx
 
         # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
         double_density = p.density * 2.0
@@ -409,21 +416,24 @@ class NodalStressND:
         number = 0
         offset = vec3(0.0)
         for axis in ti.static(self.axes):
-            origin = ti.static(self.origin[axis])
-            stride = ti.static(self.stride[axis])
-            last = ti.static(self.cells[axis] - 1)
-            from_zero = x[axis] * self.inv_dx  # [cells]
+            origin = self.origin[axis]
+            cells = self.cells[axis]
+            last_cell = cells - 1
+            coordinate = x[axis]
+            from_zero = coordinate * self.inv_dx  # [cells]
             scaled = from_zero - origin
             half_below = scaled - 0.5
             lowest = ti.cast(half_below, i32)
             # A periodic coordinate may round up to the end of its last cell.
-            lowest = ti.min(lowest, last)
+            lowest = ti.min(lowest, last_cell)
             node = ti.cast(lowest, f32)
             f = scaled - node
             low, mid, high = spline_weights(f)
             weights = vec4(low, mid, high, 0.0)
             self.weights[axis][s, p] = weights
-            offset[axis] = f - 1.0
+            from_middle = f - 1.0
+            offset[axis] = from_middle
+            stride = self.stride[axis]
             nodes_before = lowest * stride
             number += nodes_before
         number_bits = ti.bit_cast(number, f32)
@@ -456,12 +466,10 @@ class NodalStressND:
         self, weight_x: vec4, weight_y: vec4, weight_z: vec4, step: Template
     ) -> Value:
         """Return the weights of the three nodes of a row, and a zero."""
-        column = ti.static(step[0] + 1)
-        across = weight_x[column]
+        across = weight_x[step[0] + 1]
         weights = across * weight_y
         if ti.static(self.has_z):
-            line = ti.static(step[1] + 1)
-            along_y = weight_y[line]
+            along_y = weight_y[step[1] + 1]
             across = across * along_y
             weights = across * weight_z
         return weights
@@ -471,9 +479,10 @@ class NodalStressND:
         """Return the number of the first node of a row."""
         number = lowest
         for axis in ti.static(self.row_axes):
-            stride = ti.static(self.stride[axis])
-            steps_from_low = ti.static(step[axis] + 1)
-            number += ti.static(steps_from_low * stride)
+            stride = self.stride[axis]
+            steps_from_low = step[axis] + 1
+            nodes_before = steps_from_low * stride
+            number += nodes_before
         return number
 
     @ti.func
@@ -486,16 +495,17 @@ class NodalStressND:
         # Weights carry the scale of n and J, so that v lacks the rest of its own. All
         # are powers of two, which round nothing.
         weight_x = self.count_scale * weight_x
-        rest = ti.static(self.velocity_scale / self.count_scale)
+        rest = self.velocity_scale / self.count_scale
         scale = vec4(rest, rest, rest, 1.0)
         # J has no slope; a product with 0 is one, as nodes, and so slopes, are finite.
-        cell = ti.static(self.cell_scale / self.count_scale)
+        cell = self.cell_scale / self.count_scale
         slope_scale = vec4(cell, cell, cell, 0.0)
         step_x = slope_scale * slope_x
         step_y = slope_scale * slope_y
         step_z = slope_scale * slope_z
 
-        at_particle = scale * self.particle_state[s, p]
+        particle_state = self.particle_state[s, p]
+        at_particle = scale * particle_state
         way_x = place.x * step_x
         way_y = place.y * step_y
         at_middle = at_particle - way_x
@@ -544,7 +554,7 @@ class NodalStressND:
         total = self.sums[s, n]
         weight_sum = self.weight_sum[s, n]
         drag = vec4(0.0)
-        for k in ti.static(range(self.image_count)):
+        for k in ti.static(self.image_numbers):
             ghost = self.image_ghost[e, k]
             if ghost >= 0:
                 ghost_weight = self.weight_sum[s, ghost]
@@ -617,9 +627,10 @@ class NodalStressND:
         """Return the number of a node's neighbour, or of the opposite one."""
         number = n
         for axis in ti.static(self.axes):
-            stride = ti.static(self.stride[axis])
-            steps = ti.static(side * step[axis])
-            number += ti.static(steps * stride)
+            stride = self.stride[axis]
+            steps = side * step[axis]
+            nodes_between = steps * stride
+            number += nodes_between
         return number
 
     @ti.func
@@ -635,18 +646,17 @@ class NodalStressND:
             rise = jacobian_ahead - jacobian_behind
             further = ti.static(_axis_count(step) - 1)
             for axis in ti.static(self.axes):
-                side = ti.static(step[axis])
                 sum_before = rises[further, axis]
-                sum_after = stepped(sum_before, rise, side)
+                sum_after = stepped(sum_before, rise, step[axis])
                 rises[further, axis] = sum_after
 
         gradient = vec4(0.0)
-        nearest_weight = ti.static(self.pair_weight[0])
+        nearest_weight = self.pair_weight[0]
         for axis in ti.static(self.axes):
             nearest_rise = rises[0, axis]
             slope = nearest_weight * nearest_rise
             for further in ti.static(self.further_counts):
-                weight = ti.static(self.pair_weight[further])
+                weight = self.pair_weight[further]
                 further_rise = rises[further, axis]
                 further_slope = weight * further_rise
                 slope = slope + further_slope
@@ -665,7 +675,7 @@ class NodalStressND:
             pair_sum = state_ahead + state_behind
             neighbour_sum = neighbour_sum + pair_sum
         middle = self.node_state[s, n]
-        neighbour_count = ti.static(2.0 * self.dimension)
+        neighbour_count = 2.0 * self.dimension
         middle_sum = neighbour_count * middle
         return neighbour_sum - middle_sum
 
@@ -680,7 +690,7 @@ class NodalStressND:
         pressure_gain = self.pressure_factor * gradient
         viscous_gain = diffusion * laplacian
         gain = pressure_gain + viscous_gain
-        if ti.static(self.parameters.force_layers > 0):
+        if ti.static(self.has_force):
             layer = self.force_layer[n]
             force_gain = self.force_gain[s, layer]
             gain = gain + force_gain
@@ -839,30 +849,36 @@ class NodalStressND:
         shift = vec3(0.0)
         shift_change = vec3(0.0)  # of the velocity, along the shift
         divergence = 0.0
+        shift_bound = self.shift_bound
         shift_strength = self.shift_factor * volume
         for axis in ti.static(self.axes):
             slope = self.slopes[axis][s, p]
             velocity_slope = slope.xyz
             density_slope = slope[3]
+            strain_rate = slope[axis]
             wanted = shift_strength * density_slope
-            axis_shift = bounded(wanted, -self.shift_bound, self.shift_bound)
+            axis_shift = bounded(wanted, -shift_bound, shift_bound)
             shift[axis] = axis_shift
             axis_change = axis_shift * velocity_slope
             if ti.static(axis == 0):
                 shift_change = axis_change
-                divergence = slope[0]
+                divergence = strain_rate
             else:
                 shift_change = shift_change + axis_change
-                divergence = divergence + slope[axis]
+                divergence = divergence + strain_rate
         v = v + shift_change
 
         old_x = self.x[s, p]
         inside = vec3(0.0)
         for axis in ti.static(self.axes):
-            flow_step = self.dt * grid_velocity[axis]
-            step = flow_step + shift[axis]
-            target = old_x[axis] + step
-            inside[axis] = self.kept_inside(target, axis)
+            flow_speed = grid_velocity[axis]
+            axis_shift = shift[axis]
+            flow_step = self.dt * flow_speed
+            step = flow_step + axis_shift
+            old_coordinate = old_x[axis]
+            target = old_coordinate + step
+            coordinate = self.kept_inside(target, axis)
+            inside[axis] = coordinate
         x = inside
         if ti.static(self.has_obstacle):
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
@@ -944,11 +960,11 @@ class NodalStressND:
     @ti.func
     def kept_inside(self, target: f32, axis: Template) -> f32:
         """Return a coordinate between the walls, or wrapped into [low, high)."""
-        low = ti.static(self.position_min[axis])
-        high = ti.static(self.position_max[axis])
+        low = self.position_min[axis]
+        high = self.position_max[axis]
         x = target
         if ti.static(self.periodic[axis]):
-            period = ti.static(self.period[axis])
+            period = self.period[axis]
             is_above = x >= high
             lowered = x - period
             x = ti.select(is_above, lowered, x)
