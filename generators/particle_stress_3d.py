@@ -45,7 +45,7 @@ from .transfer import (
 )
 
 _AXES = (0, 1, 2)
-_ENTRIES = 6  # of a symmetric matrix, in Voigt's order
+_ENTRIES = tuple(range(6))  # of a symmetric matrix, in Voigt's order
 
 # nodes of a stencil along one axis
 _NODES = (0, 1, 2)
@@ -83,6 +83,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         and Jbar.
         """
         super()._declare_fields()
+        self.slope_x, self.slope_y, self.slope_z = self.slopes
         # by how much the number of a node grows along each axis
         width = self.width
         layer = width**2
@@ -92,8 +93,13 @@ class ParticleStress3D(FreeSurfaceKernels):
         self.deformation_columns = _vector_fields()
         # columns of A times velocity_scale; the fourth entry is 0
         self.momentum_slopes = _vector_fields()
+        slope_x, slope_y, slope_z = self.momentum_slopes
+        self.momentum_slope_x = slope_x
+        self.momentum_slope_y = slope_y
+        self.momentum_slope_z = slope_z
         # the three weights along each axis; the fourth entry is 0
         self.weights = _vector_fields()
+        self.weight_x, self.weight_y, self.weight_z = self.weights
         # offset from the middle node of the stencil [cells]; the fourth entry has the
         # bits of the number of the lowest node
         self.stencil_place = vec4.field()
@@ -113,8 +119,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         # without damping [mass/(length s^2)], the factor on Jp [1], and det F [1]
         self.listed_gradient = _matrix_fields()
         self.listed_slopes = _matrix_fields()
-        self.listed_moduli = _number_fields(2)
-        self.listed_stress = _number_fields(_ENTRIES)
+        self.listed_mu = ti.field(f32)
+        self.listed_la = ti.field(f32)
+        self.listed_stress = _number_fields(6)
         self.listed_growth = ti.field(f32)
         self.listed_jacobian = ti.field(f32)
 
@@ -146,8 +153,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
         super()._place_fields()
-        blocks = math.ceil(self.particles / _LANES)
-        whole_blocks = _LANES * blocks
+        filled_blocks = self.particles / _LANES
+        blocks = math.ceil(filled_blocks)
+        list_length = _LANES * blocks
+        list_shape = (list_length,)
         listed = (
             self.solids,
             *self.listed_gradient[0],
@@ -156,12 +165,13 @@ class ParticleStress3D(FreeSurfaceKernels):
             *self.listed_slopes[0],
             *self.listed_slopes[1],
             *self.listed_slopes[2],
-            *self.listed_moduli,
+            self.listed_mu,
+            self.listed_la,
             *self.listed_stress,
             self.listed_growth,
             self.listed_jacobian,
         )
-        backend.place(((whole_blocks,), listed))
+        backend.place((list_shape, listed))
 
     def sort_by_material(self, material: NDArray[np.int32]) -> None:
         """Note whether there are solids, and list those of scenario 0.
@@ -242,9 +252,9 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat3:
         """Return C of a particle."""
-        slope_x = self.slopes[0][s, p]
-        slope_y = self.slopes[1][s, p]
-        slope_z = self.slopes[2][s, p]
+        slope_x = self.slope_x[s, p]
+        slope_y = self.slope_y[s, p]
+        slope_z = self.slope_z[s, p]
         return columns(slope_x, slope_y, slope_z)
 
     @ti.func
@@ -324,17 +334,17 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Copy Lame's constants of a solid to its place in the list of solids."""
         p = self.solids[number]
         mu, la = self.moduli(0, p)
-        self.listed_moduli[0][number] = mu
-        self.listed_moduli[1][number] = la
+        self.listed_mu[number] = mu
+        self.listed_la[number] = la
 
     @ti.func
     def compute_listed_stress(self, block: i32) -> None:
         """Compute the Kirchhoff stress of a block of solids without damping."""
-        mu = load_lanes(self.listed_moduli[0], block)
-        la = load_lanes(self.listed_moduli[1], block)
+        mu = load_lanes(self.listed_mu, block)
+        la = load_lanes(self.listed_la, block)
         rows = load_rows(self.listed_gradient, block)
         stress = corotated_stress(rows, mu, la)
-        for entry in ti.static(range(_ENTRIES)):
+        for entry in ti.static(_ENTRIES):
             values = stress[entry]
             store_lanes(self.listed_stress[entry], block, values)
 
@@ -436,9 +446,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         place = self.stencil_place[s, p]
         number_bits = place[3]
         lowest = node_number(number_bits, self.node_count)
-        step_x = self.momentum_slopes[0][s, p]
-        step_y = self.momentum_slopes[1][s, p]
-        step_z = self.momentum_slopes[2][s, p]
+        step_x = self.momentum_slope_x[s, p]
+        step_y = self.momentum_slope_y[s, p]
+        step_z = self.momentum_slope_z[s, p]
         scale = vec4(
             self.velocity_scale,
             self.velocity_scale,
@@ -454,9 +464,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         at_middle = at_middle - way_y
         at_middle = at_middle - way_z
 
-        weight_x = self.weights[0][s, p]
-        weight_y = self.weights[1][s, p]
-        weight_z = self.weights[2][s, p]
+        weight_x = self.weight_x[s, p]
+        weight_y = self.weight_y[s, p]
+        weight_z = self.weight_z[s, p]
         for i, j in ti.static(_ROWS):
             along_x = weight_x[i]
             along_y = weight_y[j]
@@ -580,9 +590,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         place = self.stencil_place[s, p]
         number_bits = place[3]
         lowest = node_number(number_bits, self.node_count)
-        weight_x = self.weights[0][s, p]
-        weight_y = self.weights[1][s, p]
-        weight_z = self.weights[2][s, p]
+        weight_x = self.weight_x[s, p]
+        weight_y = self.weight_y[s, p]
+        weight_z = self.weight_z[s, p]
         state = ti.Vector.zero(f32, 8)
         # first moments of v and Jbar about the particle [cells]: x, then y
         moments_xy = ti.Vector.zero(f32, 8)
@@ -620,21 +630,26 @@ class ParticleStress3D(FreeSurfaceKernels):
         slopes_xy = slope_factor * moments_xy
         slope_z = slope_factor * moments_z
         self.grid_slopes[s, p] = slopes_xy
-        self.slopes[2][s, p] = slope_z
+        self.slope_z[s, p] = slope_z
         self.grid_state[s, p] = state
 
     @ti.func
     def flow(self, s: i32, p: i32, solid: Template) -> None:
         """Move a particle with the grid's velocity, and update J of a liquid."""
         grid_state = self.grid_state[s, p]
-        velocity = vec3(grid_state[0], grid_state[1], grid_state[2])
+        u = grid_state[0]
+        v = grid_state[1]
+        w = grid_state[2]
+        velocity = vec3(u, v, w)
         grid_jacobian = grid_state[3]
         grid_density = grid_state[4]
         old_position = self.x[s, p]
         old_x = old_position.xyz
         step = self.dt * velocity
         x = old_x + step
-        x = bounded(x, self.position_min, self.position_max)
+        low = self.position_min
+        high = self.position_max
+        x = bounded(x, low, high)
         position = vec4(x, 0.0)
         self.x[s, p] = position
 
@@ -644,20 +659,22 @@ class ParticleStress3D(FreeSurfaceKernels):
         slopes_xy = self.grid_slopes[s, p]
         slope_x = slopes_xy[:4]
         slope_y = slopes_xy[4:]
-        slope_z = self.slopes[2][s, p]
-        self.slopes[0][s, p] = slope_x
-        self.slopes[1][s, p] = slope_y
+        slope_z = self.slope_z[s, p]
+        self.slope_x[s, p] = slope_x
+        self.slope_y[s, p] = slope_y
         strain_rate_x = slope_x[0]
         strain_rate_y = slope_y[1]
         strain_rate_z = slope_z[2]
         divergence = strain_rate_x + strain_rate_y + strain_rate_z
-        j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
+        jacobian = self.liquid_jacobian(
+            old_ratio, divergence, grid_jacobian, grid_density
+        )
         is_liquid = kind == LIQUID
-        ratio = j
-        spread_jacobian = j
+        ratio = jacobian
+        spread_jacobian = jacobian
         if ti.static(solid):
-            ratio = ti.select(is_liquid, j, old_ratio)
-            spread_jacobian = ti.select(is_liquid, j, 1.0)
+            ratio = ti.select(is_liquid, jacobian, old_ratio)
+            spread_jacobian = ti.select(is_liquid, jacobian, 1.0)
         particle_state = vec4(velocity, spread_jacobian)
         self.particle_state[s, p] = particle_state
         self.store_ratio(s, p, ratio)
@@ -667,12 +684,12 @@ class ParticleStress3D(FreeSurfaceKernels):
         old_speed = extremes[0]
         extremes[0] = larger(speed, old_speed)
         self.extremes[s, p] = extremes
-        kept_jacobian = j
+        kept_jacobian = jacobian
         if ti.static(solid):
             # det F of a solid is computed later. Until then the old minimum stands for
             # it, which changes neither extreme.
             old_min = extremes[1]
-            kept_jacobian = ti.select(is_liquid, j, old_min)
+            kept_jacobian = ti.select(is_liquid, jacobian, old_min)
         self.keep_jacobian(s, p, kept_jacobian)
 
     @ti.func
