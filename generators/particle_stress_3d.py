@@ -315,10 +315,11 @@ class ParticleStress3D(FreeSurfaceKernels):
     def copy_gradient_from_list(self, number: i32) -> None:
         """Copy F of a solid from its place in the list of solids to the particle."""
         p = self.solids[number]
+        x_row, y_row, z_row = ti.static(self.listed_gradient)
         for axis in ti.static(_AXES):
-            x = self.listed_gradient[0][axis][number]
-            y = self.listed_gradient[1][axis][number]
-            z = self.listed_gradient[2][axis][number]
+            x = x_row[axis][number]
+            y = y_row[axis][number]
+            z = z_row[axis][number]
             column = vec4(x, y, z, 0.0)
             self.deformation_columns[axis][0, p] = column
 
@@ -495,9 +496,7 @@ class ParticleStress3D(FreeSurfaceKernels):
         A node without particles is at rest.
         """
         node = self.at(i, j, k)
-        u = 0.0
-        v = 0.0
-        w = 0.0
+        velocity = vec3(0.0)
         jacobian = 1.0
         density = 0.0
         weight_sum, shifts = row_count(self.row_sums, s, node)
@@ -508,39 +507,42 @@ class ParticleStress3D(FreeSurfaceKernels):
             jacobian_total = total[3]
             momentum = from_fixed(total, self.velocity_unit)
             jacobian_sum = from_fixed(jacobian_total, self.count_unit)
-            u = momentum.x / count
-            weightless_v = momentum.y / count
-            v = weightless_v - self.gravity_gain
-            w = momentum.z / count
             jacobian = jacobian_sum / count
-            u, v, w = self.contact(i, u, v, w, friction)
-            v, w, u = self.contact(j, v, w, u, friction)
-            w, u, v = self.contact(k, w, u, v, friction)
+            velocity = momentum.xyz / count
+            weightless_speed = velocity.y
+            velocity.y = weightless_speed - self.gravity_gain
+            velocity = self.contact(i, 0, velocity, friction)
+            velocity = self.contact(j, 1, velocity, friction)
+            velocity = self.contact(k, 2, velocity, friction)
             mirrored_sum = self.mirrored_count(s, i, j, k)
             mirrored_count = from_fixed(mirrored_sum, self.count_unit)
             density = mirrored_count * particle_volume
-        state = ti.Vector([u, v, w, jacobian, density, 0.0, 0.0, 0.0])
+        state = ti.Vector.zero(f32, 8)
+        for axis in ti.static(_AXES):
+            component = velocity[axis]
+            state[axis] = component
+        state[3] = jacobian
+        state[4] = density
         self.node_state[s, node] = state
 
     @ti.func
     def contact(
-        self, index: i32, normal: f32, first: f32, second: f32, friction: f32
-    ) -> Value:
+        self, index: i32, axis: Template, velocity: vec3, friction: f32
+    ) -> vec3:
         """Return the velocity of a node after contact with one of two opposite walls.
 
         Args:
             index: place of the node along the normal of the walls.
-            normal: component of the velocity along the normal.
-            first: a tangential component.
-            second: the other one.
+            axis: that of the normal.
+            velocity: that of the node.
             friction: Coulomb's coefficient of the walls.
-
-        Returns:
-            The normal and the two tangential components.
         """
-        new_normal = normal
-        new_first = first
-        new_second = second
+        first_axis = ti.static((axis + 1) % 3)
+        second_axis = ti.static((axis + 2) % 3)
+        normal = velocity[axis]
+        first = velocity[first_axis]
+        second = velocity[second_axis]
+        new_velocity = velocity
         if self.is_outward(index, normal):
             impact_speed = ti.abs(normal)
             first_square = first * first
@@ -551,10 +553,12 @@ class ParticleStress3D(FreeSurfaceKernels):
             lost_speed = friction * impact_speed
             loss = lost_speed / divisor
             kept = larger(1.0 - loss, 0.0)
-            new_normal = 0.0
             new_first = first * kept
             new_second = second * kept
-        return new_normal, new_first, new_second
+            new_velocity[axis] = 0.0
+            new_velocity[first_axis] = new_first
+            new_velocity[second_axis] = new_second
+        return new_velocity
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32, k: i32) -> i64:
