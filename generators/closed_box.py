@@ -43,8 +43,11 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         # nu dt / dx^2, shape [scenario]
         viscosities = [state.viscosity for state in states]
         viscosity = np.array(viscosities)
-        diffusion_number = viscosity * p.dt * p.grid**2
-        kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
+        timed_viscosity = viscosity * p.dt
+        cells_square = p.grid**2
+        diffusion_number = timed_viscosity * cells_square
+        rounded_number = diffusion_number.astype(np.float32)
+        kernels.diffusion_number.from_numpy(rounded_number)
         for field in (
             kernels.node_state,
             kernels.next_state,
@@ -58,23 +61,26 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its
         next frame.
         """
+        walls = self._kernels.walls
         tangential = velocity[:, _WALL_NUMBERS, _TANGENT_AXES]
-        self._kernels.walls.speed.from_numpy(tangential)
+        walls.speed.from_numpy(tangential)
 
     def _move_walls_towards(self, frame: int) -> None:
         velocities = [state.walls_towards(frame) for state in self._states]
-        velocity = np.stack(velocities)
-        self.move_walls(velocity.astype(np.float32))
+        exact = np.stack(velocities)
+        velocity = exact.astype(np.float32)
+        self.move_walls(velocity)
 
     def _drive(self, end: int) -> int:
-        if all(state.wall_velocity.ndim == 2 for state in self._states):
+        if not any(_has_program(state) for state in self._states):
             return end
         interval = self.parameters.substeps_per_frame
         frame, past = divmod(self._substeps, interval)
         next_frame = frame + 1
         if past == 0:
             self._move_walls_towards(next_frame)
-        return min(end, next_frame * interval)
+        until = next_frame * interval
+        return min(end, until)
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario."""
@@ -86,7 +92,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
     def jacobian(self) -> Singles:
         """Volume ratio J of the particles [1], shape [scenario, particle]."""
         state = self._kernels.particle_state.to_numpy()
-        return np.asarray(state[:, :, 3])
+        jacobian = state[:, :, 3]
+        return np.asarray(jacobian)
 
     def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s], shape [scenario, node_x,
@@ -104,32 +111,38 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         """
         velocity_sum = self._kernels.velocity_sum.to_numpy()
         total = self._on_grid(velocity_sum)
-        return total / max(self._averaged, 1)
+        count = max(self._averaged, 1)
+        return total / count
 
     def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
         width = self.parameters.grid + 1
-        return values.reshape(self.scenarios, width, width, 2)
+        shape = (self.scenarios, width, width, 2)
+        return values.reshape(shape)
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance.
 
         Before the first one these are the extremes of the loaded state.
         """
+        kernels = self._kernels
         # largest abs(v_x), abs(v_y), J and -J of any particle, shape [scenario, 4]
-        particle_extremes = self._read(self._kernels.extremes)
+        particle_extremes = self._read(kernels.extremes)
         extremes = particle_extremes.max(axis=1)
         # largest velocity component of any node, shape [scenario]
-        node_peaks = self._kernels.peak_speed.to_numpy()
+        node_peaks = kernels.peak_speed.to_numpy()
         peaks = node_peaks.max(axis=1)
         healths = []
         for extreme, peak in zip(extremes, peaks, strict=True):
             u, v, jacobian, minus_jacobian = extreme
-            is_finite = np.isfinite([*extreme, peak])
-            max_speed = np.max([u, v, peak])
+            numbers = [*extreme, peak]
+            is_finite = np.isfinite(numbers)
+            speeds = [u, v, peak]
+            max_speed = np.max(speeds)
+            jacobian_min = -minus_jacobian
             health = Health(
                 finite=bool(is_finite.all()),
                 max_speed=float(max_speed),
-                jacobian_min=float(-minus_jacobian),
+                jacobian_min=float(jacobian_min),
                 jacobian_max=float(jacobian),
             )
             healths.append(health)
@@ -142,30 +155,40 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
+        jacobian_min = health.jacobian_min
+        jacobian_max = health.jacobian_max
+        return broken_jacobian_bounds(jacobian_min, jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
         check_undriven(index, state)
         check_no_friction(index, state)
+        velocity = state.wall_velocity
         where = f"scenario {index}, wall_velocity"
-        check_program(state.wall_velocity, (4, 2), where=where, has_one_row=True)
-        speed_bound = self._kernels.speed_bound / 2.0
-        speeds = np.abs(state.wall_velocity)
-        normal = state.wall_velocity[..., _WALL_NUMBERS, _NORMAL_AXES]
+        check_program(velocity, (4, 2), where=where, has_one_row=True)
+        cfl_bound = self._kernels.speed_bound
+        speed_bound = cfl_bound / 2.0
+        speeds = np.abs(velocity)
+        is_slow = speeds <= speed_bound
+        is_slow_enough = is_slow.all()
+        normal = velocity[..., _WALL_NUMBERS, _NORMAL_AXES]
         has_normal_motion = normal.any()
-        is_slow_enough = (speeds <= speed_bound).all()
         is_sliding = speeds.any()
         may_slide = self.parameters.no_slip or not is_sliding
         if has_normal_motion or not is_slow_enough or not may_slide:
             by_frame = speeds.reshape(-1, 4, 2)
-            largest_speeds = by_frame.max(axis=0).tolist()
+            largest_speeds = by_frame.max(axis=0)
             order = ", ".join(WALLS)
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
                 where=f"{where} in the order {order}",
                 expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}",
-                got=f"speeds up to {largest_speeds}",
+                got=f"speeds up to {largest_speeds.tolist()}",
                 fix="correct what initial_state returns: docs/extending.md",
             )
+
+
+def _has_program(state: InitialState) -> bool:
+    """Tell whether walls change from frame to frame."""
+    return state.wall_velocity.ndim != 2

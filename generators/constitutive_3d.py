@@ -42,6 +42,8 @@ from .transfer import Template, Value, bounded
 _NEWTON_STEPS = 6
 # pairs of axes that a sweep rotates, one pair after the other
 _AXIS_PAIRS = ((0, 1), (0, 2), (1, 2))
+# rows of an eigenvector
+_ROWS = (0, 1, 2)
 # sweeps of Jacobi's method over the three pairs of axes
 _SWEEPS = 4
 # lower bound of two divisors: the derivative of the quartic, and
@@ -52,7 +54,10 @@ _EPSILON = 1e-6
 @ti.func
 def rows_of(f: mat3) -> Value:
     """Return the matrix of one particle as a list of rows."""
-    return [row_of(f, 0), row_of(f, 1), row_of(f, 2)]
+    x_row = row_of(f, 0)
+    y_row = row_of(f, 1)
+    z_row = row_of(f, 2)
+    return [x_row, y_row, z_row]
 
 
 @ti.func
@@ -67,10 +72,13 @@ def row_of(f: mat3, row: Template) -> Value:
 @ti.func
 def dot(a: Template, b: Template) -> Value:
     """Return the dot product of two rows."""
-    along_x = a[0] * b[0]
-    along_y = a[1] * b[1]
-    along_z = a[2] * b[2]
-    return (along_x + along_y) + along_z
+    a_x, a_y, a_z = a
+    b_x, b_y, b_z = b
+    along_x = a_x * b_x
+    along_y = a_y * b_y
+    along_z = a_z * b_z
+    along_xy = along_x + along_y
+    return along_xy + along_z
 
 
 @ti.func
@@ -95,35 +103,94 @@ def symmetric_square(b: Template) -> Value:
     x = [xx, xy, xz]
     y = [xy, yy, yz]
     z = [xz, yz, zz]
-    return times_transposed([x, y, z])
+    rows = [x, y, z]
+    return times_transposed(rows)
+
+
+@ti.func
+def times(b: Template, factor: Value) -> Value:
+    """Return a symmetric matrix times a number."""
+    xx, yy, zz, yz, xz, xy = b
+    return [
+        factor * xx,
+        factor * yy,
+        factor * zz,
+        factor * yz,
+        factor * xz,
+        factor * xy,
+    ]
+
+
+@ti.func
+def minus(a: Template, b: Template) -> Value:
+    """Return the difference A - B of two symmetric matrices."""
+    xx = a[0] - b[0]
+    yy = a[1] - b[1]
+    zz = a[2] - b[2]
+    yz = a[3] - b[3]
+    xz = a[4] - b[4]
+    xy = a[5] - b[5]
+    return [xx, yy, zz, yz, xz, xy]
+
+
+@ti.func
+def plus_isotropic(b: Template, amount: Value) -> Value:
+    """Return B + amount I of a symmetric matrix."""
+    b_xx, b_yy, b_zz, yz, xz, xy = b
+    xx = b_xx + amount
+    yy = b_yy + amount
+    zz = b_zz + amount
+    return [xx, yy, zz, yz, xz, xy]
 
 
 @ti.func
 def principal_minors(b: Template) -> Value:
     """Return the sum of the three principal minors of a symmetric matrix."""
     xx, yy, zz, yz, xz, xy = b
-    minor_z = xx * yy - xy * xy
-    minor_x = yy * zz - yz * yz
-    minor_y = xx * zz - xz * xz
-    return (minor_z + minor_x) + minor_y
+    # of each minor, the products along its main and along its other diagonal
+    main_x = yy * zz
+    main_y = xx * zz
+    main_z = xx * yy
+    other_x = yz * yz
+    other_y = xz * xz
+    other_z = xy * xy
+    minor_x = main_x - other_x
+    minor_y = main_y - other_y
+    minor_z = main_z - other_z
+    minors_zx = minor_z + minor_x
+    return minors_zx + minor_y
 
 
 @ti.func
 def determinant(rows: Template) -> Value:
     """Return det F, expanded along the first row."""
-    xx, xy, xz = rows[0]
-    yx, yy, yz = rows[1]
-    zx, zy, zz = rows[2]
-    minor_x = yy * zz - yz * zy
-    minor_y = yx * zz - yz * zx
-    minor_z = yx * zy - yy * zx
-    return (xx * minor_x - xy * minor_y) + xz * minor_z
+    x_row, y_row, z_row = rows
+    xx, xy, xz = x_row
+    yx, yy, yz = y_row
+    zx, zy, zz = z_row
+    # of each minor, the products along its main and along its other diagonal
+    main_x = yy * zz
+    main_y = yx * zz
+    main_z = yx * zy
+    other_x = yz * zy
+    other_y = yz * zx
+    other_z = yy * zx
+    minor_x = main_x - other_x
+    minor_y = main_y - other_y
+    minor_z = main_z - other_z
+    x_term = xx * minor_x
+    y_term = xy * minor_y
+    z_term = xz * minor_z
+    return (x_term - y_term) + z_term
 
 
 @ti.func
 def trace(b: Template) -> Value:
     """Return the sum of the diagonal of a symmetric matrix."""
-    return (b[0] + b[1]) + b[2]
+    xx = b[0]
+    yy = b[1]
+    zz = b[2]
+    return (xx + yy) + zz
 
 
 @ti.func
@@ -131,12 +198,19 @@ def stretch_sum(b: Template, jacobian: Value) -> Value:
     """Return the sum of the principal stretches, the largest root of the quartic."""
     b_trace = trace(b)
     minors = principal_minors(b)
-    total = ti.sqrt(3.0 * b_trace)
+    linear_factor = 8.0 * jacobian
+    constant_term = 4.0 * minors
+    triple_trace = 3.0 * b_trace
+    total = ti.sqrt(triple_trace)
     for _ in ti.static(range(_NEWTON_STEPS)):
-        double_pairs = total * total - b_trace
-        leading = double_pairs * double_pairs
-        quartic = (leading - 8.0 * jacobian * total) - 4.0 * minors
-        derivative = 4.0 * total * double_pairs - 8.0 * jacobian
+        total_square = total * total
+        double_pairs = total_square - b_trace
+        leading_term = double_pairs * double_pairs
+        linear_term = linear_factor * total
+        quartic = (leading_term - linear_term) - constant_term
+        fourfold_total = 4.0 * total
+        leading_slope = fourfold_total * double_pairs
+        derivative = leading_slope - linear_factor
         divisor = larger(derivative, _EPSILON)
         step = quartic / divisor
         total = total - step
@@ -152,28 +226,21 @@ def left_stretch(b: Template, jacobian: Value) -> Value:
     """
     b_trace = trace(b)
     total = stretch_sum(b, jacobian)
-    pairs = 0.5 * (total * total - b_trace)
-    sum_product = pairs * total - jacobian
+    total_square = total * total
+    double_pairs = total_square - b_trace
+    pairs = 0.5 * double_pairs
+    pairs_total = pairs * total
+    sum_product = pairs_total - jacobian
     divisor = larger(sum_product, _EPSILON)
     inverse = 1.0 / divisor
+    # (pairs + tr B) B - B^2 + total J I
     b_factor = pairs + b_trace
-    isotropic = total * jacobian
+    b_term = times(b, b_factor)
     b_square = symmetric_square(b)
-    # entries of (pairs + tr B) B - B^2
-    xx = b_factor * b[0] - b_square[0]
-    yy = b_factor * b[1] - b_square[1]
-    zz = b_factor * b[2] - b_square[2]
-    yz = b_factor * b[3] - b_square[3]
-    xz = b_factor * b[4] - b_square[4]
-    xy = b_factor * b[5] - b_square[5]
-    return [
-        inverse * (xx + isotropic),
-        inverse * (yy + isotropic),
-        inverse * (zz + isotropic),
-        inverse * yz,
-        inverse * xz,
-        inverse * xy,
-    ]
+    without_identity = minus(b_term, b_square)
+    isotropic = total * jacobian
+    numerator = plus_isotropic(without_identity, isotropic)
+    return times(numerator, inverse)
 
 
 @ti.func
@@ -185,24 +252,13 @@ def corotated_stress(rows: Template, mu: Value, la: Value) -> Value:
     b = times_transposed(rows)
     jacobian = determinant(rows)
     volume_change = jacobian - 1.0
-    volumetric = la * volume_change * jacobian
+    pressure = la * volume_change
+    volumetric = pressure * jacobian
     v = left_stretch(b, jacobian)
+    strain = minus(b, v)
     double_mu = 2.0 * mu
-    # entries of 2 mu (B - V)
-    xx = double_mu * (b[0] - v[0])
-    yy = double_mu * (b[1] - v[1])
-    zz = double_mu * (b[2] - v[2])
-    yz = double_mu * (b[3] - v[3])
-    xz = double_mu * (b[4] - v[4])
-    xy = double_mu * (b[5] - v[5])
-    return [
-        xx + volumetric,
-        yy + volumetric,
-        zz + volumetric,
-        yz,
-        xz,
-        xy,
-    ]
+    shear_stress = times(strain, double_mu)
+    return plus_isotropic(shear_stress, volumetric)
 
 
 @ti.func
@@ -214,22 +270,29 @@ def follow_flow(rows: Template, gradient: Template, dt: f32) -> Value:
         gradient: the velocity gradient C [1/s].
         dt: duration of the substep [s].
     """
+    old_x_row, old_y_row, old_z_row = rows
+    x_gradient, y_gradient, z_gradient = gradient
     columns = transposed(rows)
-    x_rate = dot_with_each(gradient[0], columns)
-    y_rate = dot_with_each(gradient[1], columns)
-    z_rate = dot_with_each(gradient[2], columns)
-    x_row = add_rate(rows[0], x_rate, dt)
-    y_row = add_rate(rows[1], y_rate, dt)
-    z_row = add_rate(rows[2], z_rate, dt)
+    x_rate = dot_with_each(x_gradient, columns)
+    y_rate = dot_with_each(y_gradient, columns)
+    z_rate = dot_with_each(z_gradient, columns)
+    x_row = add_rate(old_x_row, x_rate, dt)
+    y_row = add_rate(old_y_row, y_rate, dt)
+    z_row = add_rate(old_z_row, z_rate, dt)
     return [x_row, y_row, z_row]
 
 
 @ti.func
 def add_rate(row: Template, rate: Template, dt: f32) -> Value:
     """Return row + dt rate; the rate is in [1/s]."""
-    x = row[0] + dt * rate[0]
-    y = row[1] + dt * rate[1]
-    z = row[2] + dt * rate[2]
+    old_x, old_y, old_z = row
+    x_rate, y_rate, z_rate = rate
+    x_step = dt * x_rate
+    y_step = dt * y_rate
+    z_step = dt * z_rate
+    x = old_x + x_step
+    y = old_y + y_step
+    z = old_z + z_step
     return [x, y, z]
 
 
@@ -248,13 +311,17 @@ def rotation_tangent(difference: Value, double_entry: Value) -> Value:
         difference: d.
         double_entry: 2 b_pq.
     """
-    discriminant = difference * difference + double_entry * double_entry
+    difference_square = difference * difference
+    entry_square = double_entry * double_entry
+    discriminant = difference_square + entry_square
     root = ti.sqrt(discriminant)
-    signed_root = ti.select(difference < 0.0, -root, root)
+    is_negative = difference < 0.0
+    signed_root = ti.select(is_negative, -root, root)
     divisor = difference + signed_root
     is_diagonal = divisor == 0.0
     safe_divisor = ti.select(is_diagonal, 1.0, divisor)
-    return ti.select(is_diagonal, 0.0, double_entry / safe_divisor)
+    tangent = double_entry / safe_divisor
+    return ti.select(is_diagonal, 0.0, tangent)
 
 
 @ti.func
@@ -262,8 +329,12 @@ def rotated(
     p_component: Value, q_component: Value, cosine: Value, sine: Value
 ) -> Value:
     """Return two components after the axes p and q were rotated."""
-    new_p_component = cosine * p_component - sine * q_component
-    new_q_component = sine * p_component + cosine * q_component
+    p_from_p = cosine * p_component
+    p_from_q = sine * q_component
+    q_from_p = sine * p_component
+    q_from_q = cosine * q_component
+    new_p_component = p_from_p - p_from_q
+    new_q_component = q_from_p + q_from_q
     return new_p_component, new_q_component
 
 
@@ -274,31 +345,41 @@ def principal_axes(b: Template) -> Value:
     Jacobi's method rotates one pair of axes at a time, so that the off-diagonal entry
     of the pair becomes 0. A sweep rotates the three pairs; there are four sweeps.
     """
-    diagonal = [b[0], b[1], b[2]]
-    # Entry r is the off-diagonal entry of the two other axes: yz, xz, xy.
-    off_diagonal = [b[3], b[4], b[5]]
-    zero = 0.0 * b[0]
+    xx, yy, zz, yz, xz, xy = b
+    diagonal = [xx, yy, zz]
+    # Entry r is the off-diagonal entry of the two other axes.
+    off_diagonal = [yz, xz, xy]
+    zero = 0.0 * xx
     one = zero + 1.0
-    axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
+    x_axis = [one, zero, zero]
+    y_axis = [zero, one, zero]
+    z_axis = [zero, zero, one]
+    axes = [x_axis, y_axis, z_axis]
     for _ in ti.static(range(_SWEEPS)):
         for p, q in ti.static(_AXIS_PAIRS):
             r = ti.static(3 - p - q)  # the third axis
+            entry_pp = diagonal[p]
+            entry_qq = diagonal[q]
             entry_pq = off_diagonal[r]
-            difference = diagonal[q] - diagonal[p]
-            tangent = rotation_tangent(difference, 2.0 * entry_pq)
-            secant = ti.sqrt(tangent * tangent + 1.0)
+            difference = entry_qq - entry_pp
+            double_entry = 2.0 * entry_pq
+            tangent = rotation_tangent(difference, double_entry)
+            tangent_square = tangent * tangent
+            secant_square = tangent_square + 1.0
+            secant = ti.sqrt(secant_square)
             cosine = 1.0 / secant
             sine = tangent * cosine
+
             shift = tangent * entry_pq
-            diagonal[p] = diagonal[p] - shift
-            diagonal[q] = diagonal[q] + shift
+            diagonal[p] = entry_pp - shift
+            diagonal[q] = entry_qq + shift
             off_diagonal[r] = zero
             entry_pr = off_diagonal[q]
             entry_qr = off_diagonal[p]
             new_pr, new_qr = rotated(entry_pr, entry_qr, cosine, sine)
             off_diagonal[q] = new_pr
             off_diagonal[p] = new_qr
-            for row in ti.static(range(3)):
+            for row in ti.static(_ROWS):
                 p_entry = axes[p][row]
                 q_entry = axes[q][row]
                 new_p_entry, new_q_entry = rotated(p_entry, q_entry, cosine, sine)
@@ -310,24 +391,29 @@ def principal_axes(b: Template) -> Value:
 @ti.func
 def transposed(rows: Template) -> Value:
     """Return the rows of the transposed matrix."""
-    return [column_of(rows, 0), column_of(rows, 1), column_of(rows, 2)]
+    x_column = column_of(rows, 0)
+    y_column = column_of(rows, 1)
+    z_column = column_of(rows, 2)
+    return [x_column, y_column, z_column]
 
 
 @ti.func
 def column_of(rows: Template, column: Template) -> Value:
     """Return a column of a matrix as a list."""
-    x = rows[0][column]
-    y = rows[1][column]
-    z = rows[2][column]
+    x_row, y_row, z_row = rows
+    x = x_row[column]
+    y = y_row[column]
+    z = z_row[column]
     return [x, y, z]
 
 
 @ti.func
 def dot_with_each(row: Template, rows: Template) -> Value:
     """Return the dot products of a row with three rows."""
-    x = dot(row, rows[0])
-    y = dot(row, rows[1])
-    z = dot(row, rows[2])
+    x_row, y_row, z_row = rows
+    x = dot(row, x_row)
+    y = dot(row, y_row)
+    z = dot(row, z_row)
     return [x, y, z]
 
 
@@ -338,7 +424,8 @@ def clamp_ratios(square: Value, low: f32, high: f32) -> Value:
     ``square`` is the squared trial stretch, an eigenvalue of B.
     """
     positive_square = larger(square, 0.0)
-    trial = larger(ti.sqrt(positive_square), STRETCH_MIN)
+    root = ti.sqrt(positive_square)
+    trial = larger(root, STRETCH_MIN)
     clamped = bounded(trial, low, high)
     ratio = clamped / trial
     growth = trial / clamped
@@ -350,10 +437,11 @@ def elastic_row(
     i: Template, ratios: Template, q_rows: Template, f_columns: Template
 ) -> Value:
     """Return row i of the elastic gradient Q diag(ratios) Q^T F."""
-    q_row = q_rows[i]
-    first = ratios[0] * q_row[0]
-    second = ratios[1] * q_row[1]
-    third = ratios[2] * q_row[2]
+    first_ratio, second_ratio, third_ratio = ratios
+    q_first, q_second, q_third = q_rows[i]
+    first = first_ratio * q_first
+    second = second_ratio * q_second
+    third = third_ratio * q_third
     scaled = [first, second, third]
     stretch_row = dot_with_each(scaled, q_rows)  # of Q diag(ratios) Q^T
     return dot_with_each(stretch_row, f_columns)
@@ -374,14 +462,17 @@ def plastic_return(rows: Template, low: f32, high: f32) -> Value:
     """
     b = times_transposed(rows)
     squares, axes = principal_axes(b)
-    ratio_1, growth_1 = clamp_ratios(squares[0], low, high)
-    ratio_2, growth_2 = clamp_ratios(squares[1], low, high)
-    ratio_3, growth_3 = clamp_ratios(squares[2], low, high)
-    growth = (growth_1 * growth_2) * growth_3
+    square_1, square_2, square_3 = squares
+    ratio_1, growth_1 = clamp_ratios(square_1, low, high)
+    ratio_2, growth_2 = clamp_ratios(square_2, low, high)
+    ratio_3, growth_3 = clamp_ratios(square_3, low, high)
+    growth_12 = growth_1 * growth_2
+    growth = growth_12 * growth_3
     ratios = [ratio_1, ratio_2, ratio_3]
     q_rows = transposed(axes)
     f_columns = transposed(rows)
     x_row = elastic_row(0, ratios, q_rows, f_columns)
     y_row = elastic_row(1, ratios, q_rows, f_columns)
     z_row = elastic_row(2, ratios, q_rows, f_columns)
-    return [x_row, y_row, z_row], growth
+    elastic_rows = [x_row, y_row, z_row]
+    return elastic_rows, growth

@@ -77,13 +77,23 @@ def _draw_place(rng: RandomSource, size: Size, solid: Solid, lowest: float) -> P
     least = low + margin
     most = high - margin
     reach_x, reach_y, reach_z = solid.reach
-    lowest = max(lowest, least + reach_y)
+    # where its centre may lie
+    least_x = least + reach_x
+    least_y = least + reach_y
+    least_z = least + reach_z
+    most_x = most - reach_x
+    most_y = most - reach_y
+    most_z = most - reach_z
+    least_y = max(lowest, least_y)
+
+    bottom = least_y - reach_y
     across = (least, most)
-    upright = (lowest - reach_y, most)
-    check_room(solid, [across, upright, across])
-    x = uniform(rng, least + reach_x, most - reach_x)
-    y = uniform(rng, lowest, most - reach_y)
-    z = uniform(rng, least + reach_z, most - reach_z)
+    upright = (bottom, most)
+    room = [across, upright, across]
+    check_room(solid, room)
+    x = uniform(rng, least_x, most_x)
+    y = uniform(rng, least_y, most_y)
+    z = uniform(rng, least_z, most_z)
     return x, y, z
 
 
@@ -94,7 +104,8 @@ def _falling_ball(rng: RandomSource, size: Size) -> InitialState:
     centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "fall_velocity")
     body = _LiquidBody(ball, centre, velocity)
-    return _state(rng, size, "falling-ball", [body])
+    bodies = [body]
+    return _state(rng, size, "falling-ball", bodies)
 
 
 def _draw_sign(rng: RandomSource) -> float:
@@ -108,57 +119,75 @@ def _thrown_block(rng: RandomSource, size: Size) -> InitialState:
     width = draw_between(rng, size, "block_side")
     height = draw_between(rng, size, "block_side")
     depth = draw_between(rng, size, "block_side")
-    block = Block((width, height, depth))
+    sides = (width, height, depth)
+    block = Block(sides)
     centre = _draw_place(rng, size, block, 0.0)
     u, v, w = _draw_vector(rng, size, "throw_velocity")
     # towards either end of both horizontal axes
-    velocity_x = _draw_sign(rng) * u
-    velocity_z = _draw_sign(rng) * w
+    sign_x = _draw_sign(rng)
+    sign_z = _draw_sign(rng)
+    velocity_x = sign_x * u
+    velocity_z = sign_z * w
     velocity = (velocity_x, v, velocity_z)
     body = _LiquidBody(block, centre, velocity)
-    return _state(rng, size, "thrown-block", [body])
+    bodies = [body]
+    return _state(rng, size, "thrown-block", bodies)
 
 
 def _dam_break(rng: RandomSource, size: Size, number: int) -> InitialState:
     low, high = free_surface_walls(size)
+    walls = (low, high)
+    side = high - low
+    doubled_middle = low + high
+    middle = 0.5 * doubled_middle
     width = draw_between(rng, size, "column_width")
     height = draw_between(rng, size, "column_height")
     half_width = 0.5 * width
+    half_height = 0.5 * height
     start = low + half_width
     if choice(rng, 2) == 1:
         start = high - half_width
-    y = low + 0.5 * height
-    middle = 0.5 * (low + high)
-    side = high - low
-    if number % 2 == 0:
-        column = Block((width, height, side))
-        centre = (start, y, middle)
-    else:
-        column = Block((side, height, width))
+    y = low + half_height
+    sides = (width, height, side)
+    centre = (start, y, middle)
+    is_turned = number % 2 == 1
+    if is_turned:
+        sides = (side, height, width)
         centre = (middle, y, start)
-    check_room(column, [(low, high)] * 3)
+    column = Block(sides)
+    room = [walls, walls, walls]
+    check_room(column, room)
     body = _LiquidBody(column, centre, AT_REST)
-    return _state(rng, size, "dam-break", [body])
+    bodies = [body]
+    return _state(rng, size, "dam-break", bodies)
 
 
 def _splash(rng: RandomSource, size: Size) -> InitialState:
     low, high = free_surface_walls(size)
-    depth = draw_between(rng, size, "pool_depth")
+    walls = (low, high)
     side = high - low
-    pool = Block((side, depth, side))
-    check_room(pool, [(low, high)] * 3)
-    middle = 0.5 * (low + high)
-    pool_y = low + 0.5 * depth
+    doubled_middle = low + high
+    middle = 0.5 * doubled_middle
+    depth = draw_between(rng, size, "pool_depth")
+    half_depth = 0.5 * depth
+    sides = (side, depth, side)
+    pool = Block(sides)
+    room = [walls, walls, walls]
+    check_room(pool, room)
+    pool_y = low + half_depth
     pool_centre = (middle, pool_y, middle)
     radius = draw_between(rng, size, "drop_radius")
     ball = Ball(radius)
+    margin = size.value("margin")
     surface = low + depth
-    lowest = surface + size.value("margin") + radius
+    bottom = surface + margin
+    lowest = bottom + radius
     ball_centre = _draw_place(rng, size, ball, lowest)
     velocity = _draw_vector(rng, size, "drop_velocity")
     pool_body = _LiquidBody(pool, pool_centre, AT_REST)
     ball_body = _LiquidBody(ball, ball_centre, velocity)
-    return _state(rng, size, "splash", [pool_body, ball_body])
+    bodies = [pool_body, ball_body]
+    return _state(rng, size, "splash", bodies)
 
 
 def _state(
@@ -173,39 +202,51 @@ def _state(
     """
     volumes = [body.solid.measure for body in bodies]
     total_volume = add_in_order(volumes)
+    particles = size.particles
     positions = []
     velocities = []
-    left_count = size.particles
+    left_count = particles
+    last_index = len(bodies) - 1
     for index, body in enumerate(bodies):
         count = left_count
-        if index < len(bodies) - 1:
-            volume_share = volumes[index] / total_volume
-            count = int(size.particles * volume_share)
+        if index < last_index:
+            volume = volumes[index]
+            volume_share = volume / total_volume
+            particle_share = particles * volume_share
+            count = int(particle_share)
         left_count -= count
         centre = np.array(body.centre)
         place = Body(body.solid, centre)
-        position = sample_points(rng, place, count)
-        velocity = np.full(position.shape, body.velocity)
-        positions.append(position)
-        velocities.append(velocity)
+        body_position = sample_points(rng, place, count)
+        body_shape = body_position.shape
+        body_velocity = np.full(body_shape, body.velocity)
+        positions.append(body_position)
+        velocities.append(body_velocity)
 
     low, high = free_surface_walls(size)
     all_positions = np.concatenate(positions)
     all_velocities = np.concatenate(velocities)
+    position = np.clip(all_positions, low, high)
+    velocity = quantise(all_velocities)
+    affine_shape = (particles, 3, 3)
+    affine = np.zeros(affine_shape)
     last_body = bodies[-1]
+    last_centre = quantise(last_body.centre)
+    last_velocity = last_body.velocity
     parameters: dict[str, int | float | str] = {
         "family": family,
         "volume": total_volume,
     }
-    last_centre = quantise(last_body.centre)
     for axis, name in enumerate("xyz"):
-        parameters[f"centre_{name}"] = float(last_centre[axis])
-        parameters[f"velocity_{name}"] = float(last_body.velocity[axis])
+        coordinate = last_centre[axis]
+        component = last_velocity[axis]
+        parameters[f"centre_{name}"] = float(coordinate)
+        parameters[f"velocity_{name}"] = float(component)
     return InitialState(
-        position=np.clip(all_positions, low, high),
-        velocity=quantise(all_velocities),
-        affine=np.zeros((size.particles, 3, 3)),
-        material=liquid(size.particles),
+        position=position,
+        velocity=velocity,
+        affine=affine,
+        material=liquid(particles),
         area=total_volume,
         wall_velocity=np.zeros((6, 3)),
         parameters=parameters,
@@ -214,11 +255,13 @@ def _state(
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw one or two bodies of liquid, their places and velocities."""
-    family = FAMILIES[scenario % len(FAMILIES)]
+    family_count = len(FAMILIES)
+    family = FAMILIES[scenario % family_count]
     if family == "falling-ball":
         return _falling_ball(rng, size)
     if family == "thrown-block":
         return _thrown_block(rng, size)
     if family == "dam-break":
-        return _dam_break(rng, size, scenario // len(FAMILIES))
+        number = scenario // family_count
+        return _dam_break(rng, size, number)
     return _splash(rng, size)

@@ -51,8 +51,11 @@ class FullBox(Driver[FullBoxParameters]):
         # nu dt / dx^2, shape [scenario]
         viscosities = [state.viscosity for state in states]
         viscosity = np.array(viscosities)
-        diffusion_number = viscosity * p.dt * p.grid**2
-        kernels.diffusion_number.from_numpy(diffusion_number.astype(np.float32))
+        timed_viscosity = viscosity * p.dt
+        cells_square = p.grid**2
+        diffusion_number = timed_viscosity * cells_square
+        rounded_number = diffusion_number.astype(np.float32)
+        kernels.diffusion_number.from_numpy(rounded_number)
         if p.obstacle_particles:
             obstacles = _obstacles_of(states)
             kernels.place_obstacles(obstacles)
@@ -70,34 +73,43 @@ class FullBox(Driver[FullBoxParameters]):
     def _inside(self, position: Singles) -> Singles:
         """Return positions between the walls, wrapped along periodic axes [length]."""
         box = self.parameters.box
+        is_periodic = box.periodic
         start = np.asarray(box.low, np.float32)
         end = np.asarray(box.high, np.float32)
-        wrapped = box.wrap(position).astype(np.float32)
+        exact = box.wrap(position)
+        wrapped = exact.astype(np.float32)
         # Rounding to float32 may reach the end of a period, which is its start.
         is_at_end = wrapped >= end
-        is_rounded_up = is_at_end & box.periodic
+        is_rounded_up = is_at_end & is_periodic
         wrapped = np.where(is_rounded_up, start, wrapped)
         clipped = super()._inside(wrapped)
-        return np.where(box.periodic, wrapped, clipped)
+        return np.where(is_periodic, wrapped, clipped)
 
     def _fixed_positions(self, states: Sequence[InitialState]) -> Singles:
         """Return the positions of the obstacles' particles, filled up with zeros."""
-        shape = (len(states), self.parameters.obstacle_particles, LANES)
+        scenarios = len(states)
+        particles = self.parameters.obstacle_particles
+        shape = (scenarios, particles, LANES)
         position = np.zeros(shape, np.float32)
-        for rows, state in zip(position, states, strict=True):
-            if state.obstacle is not None:
-                rows[:, : self.dimension] = state.obstacle.position
+        for index, state in enumerate(states):
+            obstacle = state.obstacle
+            if obstacle is not None:
+                rows = position[index]
+                rows[:, : self.dimension] = obstacle.position
         return position
 
     def _drive_towards(self, frame: int) -> None:
         """Set walls and forces as they act up to a frame."""
+        kernels = self._kernels
         walls = [state.walls_towards(frame) for state in self._states]
-        wall_velocity = np.stack(walls)
-        self._kernels.move_walls(wall_velocity.astype(np.float32))
+        exact_velocity = np.stack(walls)
+        wall_velocity = exact_velocity.astype(np.float32)
+        kernels.move_walls(wall_velocity)
         if self.parameters.force_layers:
             forces = [state.force_towards(frame) for state in self._states]
-            body_force = np.stack(forces)
-            self._kernels.apply_force(body_force.astype(np.float32))
+            exact_force = np.stack(forces)
+            body_force = exact_force.astype(np.float32)
+            kernels.apply_force(body_force)
 
     def _drive(self, end: int) -> int:
         if not any(_has_program(state) for state in self._states):
@@ -107,52 +119,62 @@ class FullBox(Driver[FullBoxParameters]):
         next_frame = frame + 1
         if past == 0:
             self._drive_towards(next_frame)
-        return min(end, next_frame * interval)
+        until = next_frame * interval
+        return min(end, until)
 
     def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
+        particles = self.parameters.particles
         state = self._kernels.particle_state.to_numpy()
-        fluid = state[:, : self.parameters.particles]
-        return np.asarray(fluid[..., 3])
+        fluid = state[:, :particles]
+        jacobian = fluid[..., 3]
+        return np.asarray(jacobian)
 
     def grid_velocity(self) -> Singles:
         """Nodal velocities of the last substep [length/s].
 
         The shape is [scenario, *cells, axis]; a node is the middle of its cell.
         """
-        nodes = self._kernels.tables.shape
-        state = self._kernels.next_state.to_numpy()
+        kernels = self._kernels
+        nodes = kernels.tables.shape
+        state = kernels.next_state.to_numpy()
         values = state.reshape(self.scenarios, *nodes, -1)
         without_ghosts = slice(1, -1)
         places = [slice(None)]
         for _ in nodes:
             places.append(without_ghosts)
         interior = values[tuple(places)]
-        return np.asarray(interior[..., : self.dimension])
+        velocity = interior[..., : self.dimension]
+        return np.asarray(velocity)
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance.
 
         Before the first one these are the extremes of the loaded state.
         """
+        kernels = self._kernels
         # largest velocity of any particle by component, and J, shape [scenario, 4]
-        particle_extremes = self._read(self._kernels.extremes)
+        particle_extremes = self._read(kernels.extremes)
         extremes = particle_extremes.max(axis=1)
         # the fields of positions hold the largest -J of each particle
-        positions = self._read(self._kernels.x)
-        lowest = positions[..., 3].max(axis=1)
+        positions = self._read(kernels.x)
+        minus_jacobians = positions[..., 3]
+        lowest = minus_jacobians.max(axis=1)
         # largest velocity component of any node, shape [scenario]
-        node_peaks = self._kernels.peak_speed.to_numpy()
+        node_peaks = kernels.peak_speed.to_numpy()
         peaks = node_peaks.max(axis=1)
         healths = []
         for extreme, low, peak in zip(extremes, lowest, peaks, strict=True):
             *speeds, jacobian = extreme
-            is_finite = np.isfinite([*extreme, low, peak])
-            max_speed = np.max([*speeds, peak])
+            numbers = [*extreme, low, peak]
+            is_finite = np.isfinite(numbers)
+            all_speeds = [*speeds, peak]
+            max_speed = np.max(all_speeds)
+            jacobian_min = -low
             health = Health(
                 finite=bool(is_finite.all()),
                 max_speed=float(max_speed),
-                jacobian_min=float(-low),
+                jacobian_min=float(jacobian_min),
                 jacobian_max=float(jacobian),
             )
             healths.append(health)
@@ -165,7 +187,9 @@ class FullBox(Driver[FullBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
+        jacobian_min = health.jacobian_min
+        jacobian_max = health.jacobian_max
+        return broken_jacobian_bounds(jacobian_min, jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
@@ -178,22 +202,28 @@ class FullBox(Driver[FullBoxParameters]):
     def _check_walls(self, index: int, state: InitialState) -> None:
         """Refuse walls that move as no wall of this box can."""
         p = self.parameters
-        speed_bound = self._kernels.speed_bound / 2.0
-        wall_count = 2 * self.dimension
-        shape = (wall_count, self.dimension)
+        dimension = self.dimension
+        cfl_bound = self._kernels.speed_bound
+        speed_bound = cfl_bound / 2.0
+        wall_count = 2 * dimension
+        shape = (wall_count, dimension)
         where = f"scenario {index}, wall_velocity"
-        check_program(state.wall_velocity, shape, where=where, has_one_row=True)
-        speeds = np.abs(state.wall_velocity)
+        velocity = state.wall_velocity
+        check_program(velocity, shape, where=where, has_one_row=True)
+        speeds = np.abs(velocity)
         wall = np.arange(wall_count)
         normal = wall // 2
         is_periodic = np.repeat(p.box.periodic, 2)
         may_move = np.full(shape, p.no_slip)
         may_move[wall, normal] = False  # a wall does not move along its normal
         may_move[is_periodic] = False
-        moves_well = may_move & (speeds <= speed_bound)
-        is_allowed = (speeds == 0.0) | moves_well
+        is_slow = speeds <= speed_bound
+        moves_well = may_move & is_slow
+        is_at_rest = speeds == 0.0
+        is_allowed = is_at_rest | moves_well
         if not is_allowed.all():
-            first = tuple(np.argwhere(~is_allowed)[0])
+            refused = np.argwhere(~is_allowed)
+            first = tuple(refused[0])
             wall_number, axis = first[-2:]
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
@@ -209,10 +239,12 @@ class FullBox(Driver[FullBoxParameters]):
     def _check_force(self, index: int, state: InitialState) -> None:
         """Refuse a body force of other layers than the solver has."""
         layer_count = self.parameters.force_layers
-        if state.body_force is None and layer_count == 0:
+        body_force = state.body_force
+        if body_force is None and layer_count == 0:
             return
         where = f"scenario {index}, body_force"
-        check_program(state.body_force, (layer_count, self.dimension), where=where)
+        row_shape = (layer_count, self.dimension)
+        check_program(body_force, row_shape, where=where)
 
     def _check_obstacle(self, index: int, state: InitialState) -> None:
         """Refuse an obstacle whose number of particles is not the solver's."""
@@ -254,31 +286,38 @@ class FullBox(Driver[FullBoxParameters]):
         """
         box = self.parameters.box
         axes = (self.dimension,)
+        radius = obstacle.radius
         centre = np.asarray(obstacle.centre)
         position = np.asarray(obstacle.position)
         if centre.shape != axes or position.shape[1:] != axes:
             expected = f"centre of {self.dimension} axes, positions [particle, axis]"
             got = f"centre of shape {centre.shape}, positions of shape {position.shape}"
             return expected, got
-        if not obstacle.radius > 0.0:
-            return "a radius above 0", f"radius {obstacle.radius:g}"
-        reach = obstacle.radius + LEAST_GAP / self.parameters.grid
-        is_clear_below = centre - reach >= box.low
-        is_clear_above = centre + reach <= box.high
+        if not radius > 0.0:
+            return "a radius above 0", f"radius {radius:g}"
+        gap = LEAST_GAP / self.parameters.grid
+        reach = radius + gap
+        low_end = centre - reach
+        high_end = centre + reach
+        is_clear_below = low_end >= box.low
+        is_clear_above = high_end <= box.high
         is_clear = is_clear_below & is_clear_above
         if not is_clear.all():
             expected = f"a centre {reach:g} or more from all faces of the box"
             return expected, f"centre {obstacle.centre}"
-        if not np.isfinite(position).all():
+        is_finite = np.isfinite(position)
+        if not is_finite.all():
             return "finite positions", "NaN or infinity"
-        if not is_inside(position, obstacle.centre, obstacle.radius).all():
-            expected = f"particles less than {obstacle.radius:g} from the centre"
+        is_own = is_inside(position, obstacle.centre, radius)
+        if not is_own.all():
+            expected = f"particles less than {radius:g} from the centre"
             return expected, "some farther away"
         return None
 
     def _check_stream(self, index: int, state: InitialState) -> None:
         """Refuse a stream where no fringe is, a fringe without one, or a fast one."""
-        if state.stream is None and not self.parameters.fringe_rate:
+        fringe_rate = self.parameters.fringe_rate
+        if state.stream is None and not fringe_rate:
             return
         if not self.parameters.fringe_rate:
             raise UsageError(
@@ -291,8 +330,14 @@ class FullBox(Driver[FullBoxParameters]):
             )
         speed_bound = self._kernels.speed_bound
         stream = np.asarray(state.stream)
-        is_velocity = stream.shape == (self.dimension,) and stream.dtype.kind in "fiu"
-        if not is_velocity or float(np.abs(stream).max()) > speed_bound:
+        has_axes = stream.shape == (self.dimension,)
+        is_numeric = stream.dtype.kind in "fiu"
+        is_valid = False
+        if has_axes and is_numeric:
+            speeds = np.abs(stream)
+            max_speed = float(speeds.max())
+            is_valid = max_speed <= speed_bound
+        if not is_valid:
             raise UsageError(
                 "a fringe needs a stream",
                 where=f"scenario {index}, stream",
@@ -305,15 +350,27 @@ class FullBox(Driver[FullBoxParameters]):
 
 def _obstacles_of(states: Sequence[InitialState]) -> list[Obstacle]:
     """Return the obstacles of states that all have one."""
-    return [state.obstacle for state in states if state.obstacle is not None]
+    obstacles = []
+    for state in states:
+        obstacle = state.obstacle
+        if obstacle is not None:
+            obstacles.append(obstacle)
+    return obstacles
 
 
 def _streams_of(states: Sequence[InitialState]) -> Singles:
     """Return the streams of states that all have one, shape [scenario, axis]."""
-    streams = [state.stream for state in states if state.stream is not None]
-    return np.stack(streams).astype(np.float32)
+    streams = []
+    for state in states:
+        stream = state.stream
+        if stream is not None:
+            streams.append(stream)
+    exact = np.stack(streams)
+    return exact.astype(np.float32)
 
 
 def _has_program(state: InitialState) -> bool:
     """Tell whether walls or forces change from frame to frame."""
-    return state.wall_velocity.ndim == 3 or state.body_force is not None
+    has_wall_program = state.wall_velocity.ndim == 3
+    has_force = state.body_force is not None
+    return has_wall_program or has_force

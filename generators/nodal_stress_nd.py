@@ -56,6 +56,7 @@ from .transfer import (
 )
 
 _INSET = 1e-3  # distance that particles keep from a wall [cells]
+_ROW = (0, 1, 2)  # the nodes of a row
 _REACH = {2: 16.0, 3: 32.0}
 """Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1], by dimension: 1 +
 2 x 4 x 1.5 = 13 and 1 + 3 x 4 x 1.5 = 19; :mod:`.nodal_stress` says why.
@@ -76,46 +77,74 @@ class NodalStressND:
     ) -> None:
         """Round the constants, make the tables and take the memory."""
         p = parameters
+        box = p.box
         dx = 1.0 / p.grid
         self.parameters = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
-        self.dimension = p.box.dimension
-        self.periodic = p.box.periodic
-        self.has_walls = not all(p.box.periodic)
+
+        dimension = box.dimension
+        self.dimension = dimension
+        self.axes = tuple(range(dimension))
+        self.has_z = dimension == 3
+        self.periodic = box.periodic
+        self.has_walls = not all(self.periodic)
         self.has_obstacle = p.obstacle_particles > 0
         self.has_fringe = p.fringe_rate > 0.0
+        self.has_force = p.force_layers > 0
         # particles of the fluid, and behind them those of the obstacle
         self.particles = p.particles + p.obstacle_particles
+        # the field of forces has a layer even where no force acts
+        self.layer_count = max(1, p.force_layers)
+
         self.cells = p.cells
-        self.tables = BoxTables(p.cells, periodic=p.box.periodic, no_slip=p.no_slip)
+        tables = BoxTables(p.cells, periodic=box.periodic, no_slip=p.no_slip)
+        self.tables = tables
+        self.stride = tables.stride
+        image_signs = tables.images.sign
+        self.image_signs = image_signs.tolist()
+        image_count = len(self.image_signs)
+        self.image_numbers = tuple(range(image_count))
+
         self.inv_dx = float(p.grid)
         self.dt = p.dt
         self.origin = p.origin  # coordinate of node 0 of each axis [cells]
-        wall_inset = _INSET * dx
-        inset = np.where(p.box.periodic, 0.0, wall_inset)
         # smallest and largest coordinate of a particle along each axis
-        position_min = np.array(p.box.low) + inset
-        position_max = np.array(p.box.high) - inset
+        wall_inset = _INSET * dx
+        inset = np.where(box.periodic, 0.0, wall_inset)
+        low_faces = np.array(box.low)
+        high_faces = np.array(box.high)
+        position_min = low_faces + inset
+        position_max = high_faces - inset
         self.position_min = position_min.tolist()
         self.position_max = position_max.tolist()
-        self.period = p.box.lengths.tolist()
+        period = box.lengths
+        self.period = period.tolist()
+
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
-        speed_reach = _REACH[self.dimension] * self.speed_bound
-        self.velocity_scale = fixed_point_scale(self.particles, speed_reach)
-        self.count_scale = fixed_point_scale(self.particles, JACOBIAN_BOUND)
-        self.velocity_unit = 1.0 / self.velocity_scale
-        self.count_unit = 1.0 / self.count_scale
-        self.cell_scale = self.velocity_scale * dx
+        reach = _REACH[dimension]
+        speed_reach = reach * self.speed_bound
+        particles = self.particles
+        velocity_scale = fixed_point_scale(particles, speed_reach)
+        count_scale = fixed_point_scale(particles, JACOBIAN_BOUND)
+        self.velocity_scale = velocity_scale
+        self.count_scale = count_scale
+        self.velocity_unit = 1.0 / velocity_scale
+        self.count_unit = 1.0 / count_scale
+        self.cell_scale = velocity_scale * dx
+
         # dt E / (2 rho dx): gain of velocity by a difference of Jbar over two cells
-        divisor = p.density * 2.0 * dx
-        self.pressure_factor = p.dt * p.modulus / divisor
+        double_density = p.density * 2.0
+        divisor = double_density * dx
+        timed_modulus = p.dt * p.modulus
+        self.pressure_factor = timed_modulus / divisor
         self.slope_factor = 4.0 * self.inv_dx  # 4/dx
-        self.shift_factor = -p.shift * dx * dx  # -beta dx^2
+        # -beta dx^2
+        shift_per_cell = -p.shift * dx
+        self.shift_factor = shift_per_cell * dx
         self.shift_bound = 0.1 * dx
-        self.image_signs = self.tables.images.sign.tolist()
-        self.image_count = len(self.image_signs)
+
         self._make_stencils()
         self._declare_fields()
         self._tree = self._place_fields()
@@ -127,83 +156,96 @@ class NodalStressND:
 
         The kernels unroll them.
         """
+        dimension = self.dimension
         # the rows of three nodes that a particle touches: steps along all but the last
         # axis
-        row_axes = self.dimension - 1
+        row_axes = dimension - 1
+        self.row_axes = tuple(range(row_axes))
         row_steps = itertools.product((-1, 0, 1), repeat=row_axes)
         self.row_steps = tuple(row_steps)
+
         # one of each pair of opposite neighbours; nearest first
         pairs = []
-        middle = (0,) * self.dimension
-        for step in itertools.product((1, 0, -1), repeat=self.dimension):
+        middle = (0,) * dimension
+        all_steps = itertools.product((1, 0, -1), repeat=dimension)
+        for step in all_steps:
             if step > middle:
                 pairs.append(step)
-        self.pairs = tuple(sorted(pairs, key=_axis_count))
+        pairs.sort(key=_axis_count)
+        self.pairs = tuple(pairs)
+        # the two of these differ along one axis only
+        self.nearest_pairs = self.pairs[:dimension]
+
         # weight in a gradient of the difference of a pair, by the number of further
         # axes along which the two differ
         weights = []
-        for further in range(self.dimension):
+        for further in range(dimension):
             equal_axes = row_axes - further
-            weights.append(0.75**equal_axes * 0.125**further)
+            equal_weight = 0.75**equal_axes
+            further_weight = 0.125**further
+            weight = equal_weight * further_weight
+            weights.append(weight)
         self.pair_weight = tuple(weights)
+        self.further_counts = tuple(range(1, dimension))
 
     def _declare_fields(self) -> None:
         """Name the fields; they have no memory yet."""
-        axes = range(self.dimension)
         # of each particle: its position [length], and the largest -J since the
         # advance began
-        self.x = vec4.field()
-        self.particle_state = vec4.field()  # v_p, J_p
-        self.at_rest = (0.0, 0.0, 0.0, 1.0)  # state of a particle at rest
+        self.x = _vector_field()
+        self.particle_state = _vector_field()  # v_p, J_p
+        # state of a particle at rest
+        self.at_rest = (0.0, 0.0, 0.0, 1.0)
         # v and r of the nodes, at the particle
-        self.grid_state = vec4.field()
+        self.grid_state = _vector_field()
         # derivative of the same along each axis
-        self.slopes = [vec4.field() for _ in axes]
+        self.slopes = [_vector_field() for _ in self.axes]
         # dt a and Jbar of the nodes, at the particle
-        self.grid_gain = vec4.field()
+        self.grid_gain = _vector_field()
         # largest abs(v) by component, and largest J, since the advance began
-        self.extremes = vec4.field()
+        self.extremes = _vector_field()
         # the three weights along each axis
-        self.weights = [vec4.field() for _ in axes]
+        self.weights = [_vector_field() for _ in self.axes]
         # offset from the middle node [cells], and the bits of the lowest node's number
-        self.stencil_place = vec4.field()
+        self.stencil_place = _vector_field()
 
         # of each node: n v, n J
-        self.sums = ti.Vector.field(LANES, i64)
+        self.sums = _sum_field()
         self.weight_sum = ti.field(i64)  # n
-        self.drag = vec4.field()  # what moving walls add to n v
-        self.node_state = vec4.field()  # v, r
-        self.node_jacobian = ti.field(f32)  # Jbar
-        self.next_state = vec4.field()  # v, r after the forces
-        self.node_gain = vec4.field()  # dt a, Jbar
+        self.drag = _vector_field()  # what moving walls add to n v
+        self.node_state = _vector_field()  # v, r
+        self.node_jacobian = _number_field()  # Jbar
+        self.next_state = _vector_field()  # v, r after the forces
+        self.node_gain = _vector_field()  # dt a, Jbar
         # largest absolute velocity component since the advance began
-        self.peak_speed = ti.field(f32)
+        self.peak_speed = _number_field()
         # 1 in the fluid, 0 inside an obstacle
-        self.fluid_mask = ti.field(f32)
-        self.fringe_damping = ti.field(f32)  # dt sigma, equal in all scenarios
-        self.force_layer = ti.field(i32)
+        self.fluid_mask = _number_field()
+        # dt sigma, equal in all scenarios
+        self.fringe_damping = _number_field()
+        self.force_layer = _index_field()
         # n of three nodes in a row
-        self.row_sums = ti.Vector.field(LANES, i64)
+        self.row_sums = _sum_field()
 
         # of each scenario: nu dt / dx^2 and m / (rho dx^d)
-        self.diffusion_number = ti.field(f32)
-        self.particle_volume = ti.field(f32)
+        self.diffusion_number = _number_field()
+        self.particle_volume = _number_field()
         # centre of the obstacle, and the least distance from it [length]
-        self.obstacle = vec4.field()
-        self.stream = vec4.field()  # U
+        self.obstacle = _vector_field()
+        self.stream = _vector_field()  # U
 
         # tables, shape [ghost], [edge], [edge, image] and [interior]
-        self.ghost_node = ti.field(i32)
-        self.ghost_source = ti.field(i32)
-        self.ghost_sign = vec4.field()
-        self.edge_node = ti.field(i32)
-        self.image_ghost = ti.field(i32)
-        self.interior_node = ti.field(i32)
+        self.ghost_node = _index_field()
+        self.ghost_source = _index_field()
+        self.ghost_sign = _vector_field()
+        self.edge_node = _index_field()
+        self.image_ghost = _index_field()
+        self.interior_node = _index_field()
         # what walls and forces do now, shape [scenario, ghost], [scenario, edge,
         # image] and [scenario, layer]
-        self.ghost_drive = vec4.field()  # added to a ghost's v
-        self.image_drag = vec4.field()  # n v per particle
-        self.force_gain = vec4.field()  # dt f
+        self.ghost_drive = _vector_field()  # added to a ghost's v
+        self.image_drag = _vector_field()  # n v per particle
+        self.force_gain = _vector_field()  # dt f
 
     def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
         """Give the fields their memory, each an array of its own."""
@@ -240,14 +282,14 @@ class NodalStressND:
         ghost_count = len(tables.ghosts.node)
         edge_count = len(tables.images.node)
         image_shape = tables.images.ghost.shape
-        layer_count = max(1, self.parameters.force_layers)
+        interior_shape = tables.interior.shape
         particle_shape = (scenarios, self.particles)
         node_shape = (scenarios, node_count)
         # Two more: a node counts the rows of the two nodes before it as well.
         row_shape = (scenarios, node_count + 2)
         drive_shape = (scenarios, ghost_count)
         drag_shape = (scenarios, *image_shape)
-        force_shape = (scenarios, layer_count)
+        force_shape = (scenarios, self.layer_count)
         mask_shape = (1, 1)
         if self.has_obstacle:
             mask_shape = node_shape
@@ -261,7 +303,7 @@ class NodalStressND:
             ((ghost_count,), ghost_fields),
             ((edge_count,), [self.edge_node]),
             (image_shape, [self.image_ghost]),
-            (tables.interior.shape, [self.interior_node]),
+            (interior_shape, [self.interior_node]),
             ((node_count,), [self.force_layer]),
             (drive_shape, [self.ghost_drive]),
             (drag_shape, [self.image_drag]),
@@ -273,31 +315,40 @@ class NodalStressND:
 
     def _fill_tables(self) -> None:
         tables = self.tables
-        self.ghost_node.from_numpy(tables.ghosts.node)
-        self.ghost_source.from_numpy(tables.ghosts.source)
-        self.ghost_sign.from_numpy(tables.ghosts.sign)
-        self.edge_node.from_numpy(tables.images.node)
-        self.image_ghost.from_numpy(tables.images.ghost)
+        ghosts = tables.ghosts
+        images = tables.images
+        self.ghost_node.from_numpy(ghosts.node)
+        self.ghost_source.from_numpy(ghosts.source)
+        self.ghost_sign.from_numpy(ghosts.sign)
+        self.edge_node.from_numpy(images.node)
+        self.image_ghost.from_numpy(images.ghost)
         self.interior_node.from_numpy(tables.interior)
+
         # the layer of each node along y; ghosts belong to the nearest one
         row_count = self.cells[1]
-        layer_count = max(1, self.parameters.force_layers)
         last_row = row_count - 1
-        row = tables.index[:, 1] - 1
+        row_with_ghosts = tables.index[:, 1]
+        row = row_with_ghosts - 1
         row = np.clip(row, 0, last_row)
-        layer = row * layer_count // row_count
-        self.force_layer.from_numpy(layer.astype(np.int32))
+        scaled_row = row * self.layer_count
+        layer = scaled_row // row_count
+        layer_number = layer.astype(np.int32)
+        self.force_layer.from_numpy(layer_number)
+
         if self.has_fringe:
             places = self._node_places()
             x = places[:, 0]
             rates = self.parameters.fringe_rates(x)
             damping = self.dt * rates
-            self.fringe_damping.from_numpy(damping.astype(np.float32))
+            rounded_damping = damping.astype(np.float32)
+            self.fringe_damping.from_numpy(rounded_damping)
 
     def _node_places(self) -> NDArray[np.float64]:
         """Return where the nodes lie [length], ghosts included, shape [node, axis]."""
-        cells = self.tables.index + np.array(self.origin)
-        return np.asarray(cells / self.inv_dx)
+        origin = np.array(self.origin)
+        cells = self.tables.index + origin
+        places = cells / self.inv_dx
+        return np.asarray(places)
 
     def move_walls(self, velocity: Singles) -> None:
         """Let walls slide [length/s], shape [scenario, 2 axis, axis]."""
@@ -310,25 +361,30 @@ class NodalStressND:
         """Let a force act [length/s^2], shape [scenario, layer, axis]."""
         scenarios, layers, dimension = acceleration.shape
         dt = np.float32(self.dt)
+        velocity_gain = dt * acceleration
         shape = (scenarios, layers, LANES)
         gain = np.zeros(shape, np.float32)
-        gain[..., :dimension] = dt * acceleration
+        gain[..., :dimension] = velocity_gain
         self.force_gain.from_numpy(gain)
 
     def place_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Set the nodes that each scenario's obstacle holds at rest."""
         places = self._node_places()
-        mask_shape = (self.scenarios, len(places))
+        node_count = len(places)
+        mask_shape = (self.scenarios, node_count)
         disc_shape = (self.scenarios, LANES)
         mask = np.empty(mask_shape, np.float32)
         discs = np.zeros(disc_shape, np.float32)
         inset = _INSET / self.inv_dx
         for s, obstacle in enumerate(obstacles):
-            least_distance = obstacle.radius + inset
-            is_solid = is_inside(places, obstacle.centre, obstacle.radius)
+            centre = obstacle.centre
+            radius = obstacle.radius
+            is_solid = is_inside(places, centre, radius)
             mask[s] = ~is_solid
-            discs[s, : self.dimension] = obstacle.centre
-            discs[s, 3] = least_distance
+            disc = discs[s]
+            disc[: self.dimension] = centre
+            least_distance = radius + inset
+            disc[3] = least_distance
         self.fluid_mask.from_numpy(mask)
         self.obstacle.from_numpy(discs)
 
@@ -350,7 +406,8 @@ class NodalStressND:
         """Set a node's sums to zero."""
         zero = ti.Vector.zero(i64, LANES)
         self.sums[s, n] = zero
-        self.row_sums[s, n + 2] = zero
+        row = n + 2
+        self.row_sums[s, row] = zero
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
@@ -358,27 +415,36 @@ class NodalStressND:
         x = self.x[s, p]
         number = 0
         offset = vec3(0.0)
-        for axis in ti.static(range(self.dimension)):
-            origin = ti.static(self.origin[axis])
-            stride = ti.static(self.tables.stride[axis])
-            last = ti.static(self.cells[axis] - 1)
-            scaled = x[axis] * self.inv_dx - origin
-            lowest = ti.cast(scaled - 0.5, i32)
+        for axis in ti.static(self.axes):
+            origin = self.origin[axis]
+            cells = self.cells[axis]
+            last_cell = cells - 1
+            coordinate = x[axis]
+            from_zero = coordinate * self.inv_dx  # [cells]
+            scaled = from_zero - origin
+            half_below = scaled - 0.5
+            lowest = ti.cast(half_below, i32)
             # A periodic coordinate may round up to the end of its last cell.
-            lowest = ti.min(lowest, last)
+            lowest = ti.min(lowest, last_cell)
             node = ti.cast(lowest, f32)
             f = scaled - node
             low, mid, high = spline_weights(f)
-            self.weights[axis][s, p] = vec4(low, mid, high, 0.0)
-            offset[axis] = f - 1.0
-            number += lowest * stride
+            weights = vec4(low, mid, high, 0.0)
+            self.weights[axis][s, p] = weights
+            from_middle = f - 1.0
+            offset[axis] = from_middle
+            stride = self.stride[axis]
+            nodes_before = lowest * stride
+            number += nodes_before
         number_bits = ti.bit_cast(number, f32)
-        self.stencil_place[s, p] = vec4(offset, number_bits)
+        place = vec4(offset, number_bits)
+        self.stencil_place[s, p] = place
 
     @ti.func
     def lowest_node(self, place: vec4) -> i32:
         """Return the number of the lowest node of a particle's stencil."""
-        return node_number(place[3], self.tables.node_count)
+        number_bits = place[3]
+        return node_number(number_bits, self.tables.node_count)
 
     @ti.func
     def load_along(self, fields: Template, s: i32, p: i32) -> Value:
@@ -391,7 +457,7 @@ class NodalStressND:
         first = fields[0][s, p]
         second = fields[1][s, p]
         third = vec4(0.0)
-        if ti.static(self.dimension == 3):
+        if ti.static(self.has_z):
             third = fields[2][s, p]
         return first, second, third
 
@@ -402,8 +468,9 @@ class NodalStressND:
         """Return the weights of the three nodes of a row, and a zero."""
         across = weight_x[step[0] + 1]
         weights = across * weight_y
-        if ti.static(self.dimension == 3):
-            across = across * weight_y[step[1] + 1]
+        if ti.static(self.has_z):
+            along_y = weight_y[step[1] + 1]
+            across = across * along_y
             weights = across * weight_z
         return weights
 
@@ -411,10 +478,11 @@ class NodalStressND:
     def row_start(self, lowest: i32, step: Template) -> i32:
         """Return the number of the first node of a row."""
         number = lowest
-        for axis in ti.static(range(self.dimension - 1)):
-            stride = ti.static(self.tables.stride[axis])
-            steps_from_low = ti.static(step[axis] + 1)
-            number += ti.static(steps_from_low * stride)
+        for axis in ti.static(self.row_axes):
+            stride = self.stride[axis]
+            steps_from_low = step[axis] + 1
+            nodes_before = steps_from_low * stride
+            number += nodes_before
         return number
 
     @ti.func
@@ -427,40 +495,50 @@ class NodalStressND:
         # Weights carry the scale of n and J, so that v lacks the rest of its own. All
         # are powers of two, which round nothing.
         weight_x = self.count_scale * weight_x
-        rest = ti.static(self.velocity_scale / self.count_scale)
+        rest = self.velocity_scale / self.count_scale
         scale = vec4(rest, rest, rest, 1.0)
         # J has no slope; a product with 0 is one, as nodes, and so slopes, are finite.
-        cell = ti.static(self.cell_scale / self.count_scale)
+        cell = self.cell_scale / self.count_scale
         slope_scale = vec4(cell, cell, cell, 0.0)
         step_x = slope_scale * slope_x
         step_y = slope_scale * slope_y
         step_z = slope_scale * slope_z
-        at_middle = scale * self.particle_state[s, p]
-        at_middle = at_middle - place.x * step_x
-        at_middle = at_middle - place.y * step_y
-        if ti.static(self.dimension == 3):
-            at_middle = at_middle - place.z * step_z
+
+        particle_state = self.particle_state[s, p]
+        at_particle = scale * particle_state
+        way_x = place.x * step_x
+        way_y = place.y * step_y
+        at_middle = at_particle - way_x
+        at_middle = at_middle - way_y
+        if ti.static(self.has_z):
+            way_z = place.z * step_z
+            at_middle = at_middle - way_z
+
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
             at_row = stepped(at_middle, step_x, step[0])
             row_step = step_y
-            if ti.static(self.dimension == 3):
+            if ti.static(self.has_z):
                 at_row = stepped(at_row, step_y, step[1])
                 row_step = step_z
-            for k in ti.static(range(3)):
+            for k in ti.static(_ROW):
+                node = start + k
+                weight = weights[k]
                 at_node = stepped(at_row, row_step, k - 1)
-                share = weights[k] * at_node
-                add_shifted(self.sums, s, start + k, share, self.atomic)
+                share = weight * at_node
+                add_shifted(self.sums, s, node, share, self.atomic)
             # The fourth weight is 0, so that the fourth sum counts shifts.
-            add_shifted(self.row_sums, s, start + 2, weights, self.atomic)
+            last = start + 2
+            add_shifted(self.row_sums, s, last, weights, self.atomic)
 
     @ti.func
     def settle(self, s: i32, n: i32) -> None:
         """Take the shifts off a node's sums, and add up its n from three rows."""
         weight_sum, shifts = row_count(self.row_sums, s, n)
-        total = self.sums[s, n]
-        self.sums[s, n] = total - shifts
+        shifted_total = self.sums[s, n]
+        total = shifted_total - shifts
+        self.sums[s, n] = total
         self.weight_sum[s, n] = weight_sum
 
     @ti.func
@@ -476,18 +554,20 @@ class NodalStressND:
         total = self.sums[s, n]
         weight_sum = self.weight_sum[s, n]
         drag = vec4(0.0)
-        for k in ti.static(range(self.image_count)):
+        for k in ti.static(self.image_numbers):
             ghost = self.image_ghost[e, k]
             if ghost >= 0:
                 ghost_weight = self.weight_sum[s, ghost]
-                ghost_sums = self.sums[s, ghost]
+                ghost_total = self.sums[s, ghost]
                 sign = self.image_sign(k)
-                total += sign * ghost_sums
+                mirrored_total = sign * ghost_total
+                total += mirrored_total
                 weight_sum += ghost_weight
                 if ti.static(self.has_walls):
-                    count = from_fixed(ghost_weight, self.count_unit)
+                    ghost_count = from_fixed(ghost_weight, self.count_unit)
                     drag_per_particle = self.image_drag[s, e, k]
-                    drag += drag_per_particle * count
+                    wall_drag = drag_per_particle * ghost_count
+                    drag += wall_drag
         self.sums[s, n] = total
         self.weight_sum[s, n] = weight_sum
         self.drag[s, n] = drag
@@ -500,13 +580,15 @@ class NodalStressND:
         weight_sum = self.weight_sum[s, n]
         if weight_sum > 0:
             total = self.sums[s, n]
+            jacobian_total = total[3]
             count = from_fixed(weight_sum, self.count_unit)
             received = from_fixed(total, self.velocity_unit)
             drag = self.drag[s, n]
             momentum = received + drag
             state = momentum / count
-            state[3] = count * particle_volume
-            jacobian_sum = from_fixed(total[3], self.count_unit)
+            density = count * particle_volume
+            state[3] = density
+            jacobian_sum = from_fixed(jacobian_total, self.count_unit)
             jacobian = jacobian_sum / count
         self.node_state[s, n] = state
         self.node_jacobian[s, n] = jacobian
@@ -520,7 +602,9 @@ class NodalStressND:
         drive = self.ghost_drive[s, g]
         state = self.node_state[s, source]
         jacobian = self.node_jacobian[s, source]
-        self.node_state[s, n] = sign * state + drive
+        mirrored_state = sign * state
+        ghost_state = mirrored_state + drive
+        self.node_state[s, n] = ghost_state
         self.node_jacobian[s, n] = jacobian
 
     @ti.func
@@ -532,16 +616,21 @@ class NodalStressND:
         drive = self.ghost_drive[s, g]
         state = self.next_state[s, source]
         gain = self.node_gain[s, source]
-        self.next_state[s, n] = sign * state + drive
-        self.node_gain[s, n] = sign * gain
+        mirrored_state = sign * state
+        ghost_state = mirrored_state + drive
+        ghost_gain = sign * gain
+        self.next_state[s, n] = ghost_state
+        self.node_gain[s, n] = ghost_gain
 
     @ti.func
     def neighbour(self, n: i32, step: Template, side: Template) -> i32:
         """Return the number of a node's neighbour, or of the opposite one."""
         number = n
-        for axis in ti.static(range(self.dimension)):
-            stride = ti.static(self.tables.stride[axis])
-            number += ti.static(side * step[axis] * stride)
+        for axis in ti.static(self.axes):
+            stride = self.stride[axis]
+            steps = side * step[axis]
+            nodes_between = steps * stride
+            number += nodes_between
         return number
 
     @ti.func
@@ -556,73 +645,87 @@ class NodalStressND:
             jacobian_behind = self.node_jacobian[s, behind]
             rise = jacobian_ahead - jacobian_behind
             further = ti.static(_axis_count(step) - 1)
-            for axis in ti.static(range(self.dimension)):
-                side = ti.static(step[axis])
+            for axis in ti.static(self.axes):
                 sum_before = rises[further, axis]
-                rises[further, axis] = stepped(sum_before, rise, side)
+                sum_after = stepped(sum_before, rise, step[axis])
+                rises[further, axis] = sum_after
+
         gradient = vec4(0.0)
-        for axis in ti.static(range(self.dimension)):
-            nearest_weight = ti.static(self.pair_weight[0])
-            slope = nearest_weight * rises[0, axis]
-            for further in ti.static(range(1, self.dimension)):
-                weight = ti.static(self.pair_weight[further])
-                slope = slope + weight * rises[further, axis]
+        nearest_weight = self.pair_weight[0]
+        for axis in ti.static(self.axes):
+            nearest_rise = rises[0, axis]
+            slope = nearest_weight * nearest_rise
+            for further in ti.static(self.further_counts):
+                weight = self.pair_weight[further]
+                further_rise = rises[further, axis]
+                further_slope = weight * further_rise
+                slope = slope + further_slope
             gradient[axis] = slope
         return gradient
 
     @ti.func
     def laplacian(self, s: i32, n: i32) -> vec4:
         """Return dx^2 times the Laplacian of (v, r), by the nearest neighbours."""
-        neighbours = vec4(0.0)
-        for step in ti.static(self.pairs[: self.dimension]):
+        neighbour_sum = vec4(0.0)
+        for step in ti.static(self.nearest_pairs):
             ahead = self.neighbour(n, step, 1)
             behind = self.neighbour(n, step, -1)
             state_ahead = self.node_state[s, ahead]
             state_behind = self.node_state[s, behind]
-            neighbours = neighbours + (state_ahead + state_behind)
+            pair_sum = state_ahead + state_behind
+            neighbour_sum = neighbour_sum + pair_sum
         middle = self.node_state[s, n]
-        neighbour_count = ti.static(2.0 * self.dimension)
-        return neighbours - neighbour_count * middle
+        neighbour_count = 2.0 * self.dimension
+        middle_sum = neighbour_count * middle
+        return neighbour_sum - middle_sum
 
     @ti.func
     def add_forces(self, s: i32, n: i32) -> None:
         """Add dt a = dt (E/rho) grad Jbar + dt nu lap v + dt f."""
         state = self.node_state[s, n]
+        density = state[3]
         gradient = self.pressure_gradient(s, n)
         laplacian = self.laplacian(s, n)
         diffusion = self.diffusion_number[s]
-        gain = self.pressure_factor * gradient + diffusion * laplacian
-        if ti.static(self.parameters.force_layers > 0):
+        pressure_gain = self.pressure_factor * gradient
+        viscous_gain = diffusion * laplacian
+        gain = pressure_gain + viscous_gain
+        if ti.static(self.has_force):
             layer = self.force_layer[n]
             force_gain = self.force_gain[s, layer]
             gain = gain + force_gain
         if ti.static(self.has_fringe):
-            lag = self.stream[s] - state
+            stream = self.stream[s]
+            lag = stream - state
             damping = self.fringe_damping[n]
-            gain = gain + damping * lag
+            fringe_gain = damping * lag
+            gain = gain + fringe_gain
         v = state + gain
         if ti.static(self.has_obstacle):
             mask = self.fluid_mask[s, n]
             gain = mask * gain
             v = mask * v
+
         speed = ti.abs(v)
         peak = self.peak_speed[s, n]
-        for axis in ti.static(range(self.dimension)):
-            peak = largest(speed[axis], peak)
+        for axis in ti.static(self.axes):
+            component = speed[axis]
+            peak = largest(component, peak)
         self.peak_speed[s, n] = peak
         # The fourth lanes hold Jbar and r.
-        gain[3] = self.node_jacobian[s, n]
-        v[3] = state[3]
+        jacobian = self.node_jacobian[s, n]
+        gain[3] = jacobian
+        v[3] = density
         self.node_gain[s, n] = gain
         self.next_state[s, n] = v
 
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
         """Interpolate (v, r), its slopes, dt a and Jbar."""
-        if ti.static(self.dimension == 2):
-            self.g2p_flat(s, p)
-        else:
+        if ti.static(self.has_z):
             self.g2p_solid(s, p)
+        else:
+            self.g2p_flat(s, p)
 
     @ti.func
     def g2p_flat(self, s: i32, p: i32) -> None:
@@ -632,25 +735,35 @@ class NodalStressND:
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         state = vec4(0.0)
         gain = vec4(0.0)
-        slope_x = vec4(0.0)
-        slope_y = vec4(0.0)
+        # first moments of the state about the middle node [cells]
+        moment_x = vec4(0.0)
+        moment_y = vec4(0.0)
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
             start = self.row_start(lowest, step)
-            for k in ti.static(range(3)):
+            for k in ti.static(_ROW):
                 node = start + k
                 weight = weights[k]
-                share = weight * self.next_state[s, node]
-                gain += weight * self.node_gain[s, node]
+                node_state = self.next_state[s, node]
+                share = weight * node_state
+                node_gain = self.node_gain[s, node]
+                gain_share = weight * node_gain
+                gain += gain_share
                 state += share
-                slope_x = stepped(slope_x, share, step[0])
-                slope_y = stepped(slope_y, share, k - 1)
+                moment_x = stepped(moment_x, share, step[0])
+                moment_y = stepped(moment_y, share, k - 1)
         self.grid_state[s, p] = state
         self.grid_gain[s, p] = gain
-        slope_x = slope_x - place.x * state
-        slope_y = slope_y - place.y * state
-        self.slopes[0][s, p] = self.slope_factor * slope_x
-        self.slopes[1][s, p] = self.slope_factor * slope_y
+
+        # from there to the particle
+        shift_x = place.x * state
+        shift_y = place.y * state
+        moment_x = moment_x - shift_x
+        moment_y = moment_y - shift_y
+        slope_x = self.slope_factor * moment_x
+        slope_y = self.slope_factor * moment_y
+        self.slopes[0][s, p] = slope_x
+        self.slopes[1][s, p] = slope_y
 
     @ti.func
     def g2p_solid(self, s: i32, p: i32) -> None:
@@ -662,35 +775,57 @@ class NodalStressND:
         weight_x, weight_y, weight_z = self.load_along(self.weights, s, p)
         state = vec4(0.0)
         gain = vec4(0.0)
-        slope_x = vec4(0.0)
-        slope_y = vec4(0.0)
-        slope_z = vec4(0.0)
+        # first moments of the state about the middle node [cells]
+        moment_x = vec4(0.0)
+        moment_y = vec4(0.0)
+        moment_z = vec4(0.0)
         for step in ti.static(self.row_steps):
             weights = self.row_weights(weight_x, weight_y, weight_z, step)
+            low_weight = weights[0]
+            mid_weight = weights[1]
+            high_weight = weights[2]
             start = self.row_start(lowest, step)
             middle = start + 1
             last = start + 2
-            low = weights[0] * self.next_state[s, start]
-            mid = weights[1] * self.next_state[s, middle]
-            high = weights[2] * self.next_state[s, last]
-            row_state = low + mid + high
-            low_gain = weights[0] * self.node_gain[s, start]
-            mid_gain = weights[1] * self.node_gain[s, middle]
-            high_gain = weights[2] * self.node_gain[s, last]
-            row_gain = low_gain + mid_gain + high_gain
+
+            low_state = self.next_state[s, start]
+            mid_state = self.next_state[s, middle]
+            high_state = self.next_state[s, last]
+            low_share = low_weight * low_state
+            mid_share = mid_weight * mid_state
+            high_share = high_weight * high_state
+            row_state = low_share + mid_share + high_share
+
+            low_gain = self.node_gain[s, start]
+            mid_gain = self.node_gain[s, middle]
+            high_gain = self.node_gain[s, last]
+            low_gain_share = low_weight * low_gain
+            mid_gain_share = mid_weight * mid_gain
+            high_gain_share = high_weight * high_gain
+            row_gain = low_gain_share + mid_gain_share + high_gain_share
+
             state += row_state
             gain += row_gain
-            slope_x = stepped(slope_x, row_state, step[0])
-            slope_y = stepped(slope_y, row_state, step[1])
-            slope_z += high - low
+            moment_x = stepped(moment_x, row_state, step[0])
+            moment_y = stepped(moment_y, row_state, step[1])
+            row_moment = high_share - low_share
+            moment_z += row_moment
         self.grid_state[s, p] = state
         self.grid_gain[s, p] = gain
-        slope_x = slope_x - place.x * state
-        slope_y = slope_y - place.y * state
-        slope_z = slope_z - place.z * state
-        self.slopes[0][s, p] = self.slope_factor * slope_x
-        self.slopes[1][s, p] = self.slope_factor * slope_y
-        self.slopes[2][s, p] = self.slope_factor * slope_z
+
+        # from there to the particle
+        shift_x = place.x * state
+        shift_y = place.y * state
+        shift_z = place.z * state
+        moment_x = moment_x - shift_x
+        moment_y = moment_y - shift_y
+        moment_z = moment_z - shift_z
+        slope_x = self.slope_factor * moment_x
+        slope_y = self.slope_factor * moment_y
+        slope_z = self.slope_factor * moment_z
+        self.slopes[0][s, p] = slope_x
+        self.slopes[1][s, p] = slope_y
+        self.slopes[2][s, p] = slope_z
 
     @ti.func
     def update(self, s: i32, p: i32) -> None:
@@ -699,67 +834,89 @@ class NodalStressND:
         grid_velocity = grid_state.xyz
         grid_density = grid_state[3]
         grid_gain = self.grid_gain[s, p]
+        velocity_gain = grid_gain.xyz
         grid_jacobian = grid_gain[3]
         density = largest(grid_density, 0.5)
         volume = 1.0 / density
         old_state = self.particle_state[s, p]
-        v = old_state.xyz + grid_gain.xyz
+        old_velocity = old_state.xyz
+        old_jacobian = old_state[3]
+        v = old_velocity + velocity_gain
         velocity_lag = grid_velocity - v
-        v = v + self.parameters.velocity_relaxation * velocity_lag
+        relaxation = self.parameters.velocity_relaxation * velocity_lag
+        v = v + relaxation
 
         shift = vec3(0.0)
         shift_change = vec3(0.0)  # of the velocity, along the shift
         divergence = 0.0
-        for axis in ti.static(range(self.dimension)):
+        shift_bound = self.shift_bound
+        shift_strength = self.shift_factor * volume
+        for axis in ti.static(self.axes):
             slope = self.slopes[axis][s, p]
+            velocity_slope = slope.xyz
             density_slope = slope[3]
-            wanted = self.shift_factor * volume * density_slope
-            shift[axis] = bounded(wanted, -self.shift_bound, self.shift_bound)
-            axis_change = shift[axis] * slope.xyz
+            strain_rate = slope[axis]
+            wanted = shift_strength * density_slope
+            axis_shift = bounded(wanted, -shift_bound, shift_bound)
+            shift[axis] = axis_shift
+            axis_change = axis_shift * velocity_slope
             if ti.static(axis == 0):
                 shift_change = axis_change
-                divergence = slope[0]
+                divergence = strain_rate
             else:
                 shift_change = shift_change + axis_change
-                divergence = divergence + slope[axis]
+                divergence = divergence + strain_rate
         v = v + shift_change
 
         old_x = self.x[s, p]
         inside = vec3(0.0)
-        for axis in ti.static(range(self.dimension)):
-            step = self.dt * grid_velocity[axis] + shift[axis]
-            target = old_x[axis] + step
-            inside[axis] = self.kept_inside(target, axis)
+        for axis in ti.static(self.axes):
+            flow_speed = grid_velocity[axis]
+            axis_shift = shift[axis]
+            flow_step = self.dt * flow_speed
+            step = flow_step + axis_shift
+            old_coordinate = old_x[axis]
+            target = old_coordinate + step
+            coordinate = self.kept_inside(target, axis)
+            inside[axis] = coordinate
         x = inside
         if ti.static(self.has_obstacle):
             # Not of x itself: in three dimensions Taichi 1.7.4 then drops the result.
             x = self.kept_outside(s, inside)
 
-        old_jacobian = old_state[3]
-        growth = self.dt * divergence * old_jacobian
+        strain = self.dt * divergence
+        growth = strain * old_jacobian
         flowed = old_jacobian + growth
         jacobian = self.relaxed(flowed, old_jacobian, grid_jacobian, volume)
-        self.particle_state[s, p] = vec4(v, jacobian)
+        state = vec4(v, jacobian)
+        self.particle_state[s, p] = state
         speed = ti.abs(v)
         reached = vec4(speed, jacobian)
         extremes = self.extremes[s, p]
-        self.extremes[s, p] = largest(reached, extremes)
+        extremes = largest(reached, extremes)
+        self.extremes[s, p] = extremes
         old_minus_jacobian = old_x[3]
         minus_jacobian = largest(-jacobian, old_minus_jacobian)
-        self.x[s, p] = vec4(x, minus_jacobian)
+        position = vec4(x, minus_jacobian)
+        self.x[s, p] = position
 
     @ti.func
     def hold(self, s: i32, p: i32) -> None:
         """Relax J_p of an obstacle's particle, which neither moves nor deforms."""
-        grid_density = self.grid_state[s, p][3]
+        grid_state = self.grid_state[s, p]
+        grid_density = grid_state[3]
         density = largest(grid_density, 0.5)
         volume = 1.0 / density
-        grid_jacobian = self.grid_gain[s, p][3]
-        for axis in ti.static(range(self.dimension)):
-            self.slopes[axis][s, p] = vec4(0.0)
-        old_jacobian = self.particle_state[s, p][3]
+        grid_gain = self.grid_gain[s, p]
+        grid_jacobian = grid_gain[3]
+        no_slope = vec4(0.0)
+        for axis in ti.static(self.axes):
+            self.slopes[axis][s, p] = no_slope
+        old_state = self.particle_state[s, p]
+        old_jacobian = old_state[3]
         jacobian = self.relaxed(old_jacobian, old_jacobian, grid_jacobian, volume)
-        self.particle_state[s, p] = vec4(0.0, 0.0, 0.0, jacobian)
+        state = vec4(0.0, 0.0, 0.0, jacobian)
+        self.particle_state[s, p] = state
 
     @ti.func
     def relaxed(
@@ -780,31 +937,43 @@ class NodalStressND:
     def kept_outside(self, s: i32, target: vec3) -> Value:
         """Return a place, or the nearest on the obstacle's surface if inside."""
         obstacle = self.obstacle[s]
+        centre = obstacle.xyz
         radius = obstacle[3]
-        way = target - obstacle.xyz
-        square = way.x * way.x + way.y * way.y + way.z * way.z
+        way = target - centre
+        square_x = way.x * way.x
+        square_y = way.y * way.y
+        square_z = way.z * way.z
+        square = square_x + square_y + square_z
+        radius_square = radius * radius
         # A place at the very centre has no nearest one; it stays.
-        is_near = square < radius * radius
+        is_near = square < radius_square
         is_off_centre = square > 0.0
         is_inside = is_near and is_off_centre
         safe_square = ti.select(is_inside, square, 1.0)
         distance = ti.sqrt(safe_square)
         stretch = radius / distance
-        on_surface = target + (stretch - 1.0) * way
+        excess = stretch - 1.0
+        way_out = excess * way
+        on_surface = target + way_out
         return ti.select(is_inside, on_surface, target)
 
     @ti.func
     def kept_inside(self, target: f32, axis: Template) -> f32:
         """Return a coordinate between the walls, or wrapped into [low, high)."""
-        low = ti.static(self.position_min[axis])
-        high = ti.static(self.position_max[axis])
+        low = self.position_min[axis]
+        high = self.position_max[axis]
         x = target
         if ti.static(self.periodic[axis]):
-            period = ti.static(self.period[axis])
-            x = ti.select(x >= high, x - period, x)
-            x = ti.select(x < low, x + period, x)
+            period = self.period[axis]
+            is_above = x >= high
+            lowered = x - period
+            x = ti.select(is_above, lowered, x)
+            is_below = x < low
+            raised = x + period
+            x = ti.select(is_below, raised, x)
             # The sum may round up to the end of the period; NaN becomes its start.
-            x = ti.select(x < high, x, low)
+            is_within = x < high
+            x = ti.select(is_within, x, low)
         else:
             x = bounded(x, low, high)
         return x
@@ -863,11 +1032,13 @@ class NodalStressND:
             for e in range(edges):
                 self.add_images(0, e)
             for i in range(interior):
-                self.fold(0, self.interior_node[i], particle_volume)
+                n = self.interior_node[i]
+                self.fold(0, n, particle_volume)
             for g in range(ghosts):
                 self.mirror(0, g)
             for i in range(interior):
-                self.add_forces(0, self.interior_node[i])
+                n = self.interior_node[i]
+                self.add_forces(0, n)
             for g in range(ghosts):
                 self.mirror_forces(0, g)
             for p in range(particles):
@@ -888,34 +1059,38 @@ class NodalStressND:
         edges: i32,
         ghosts: i32,
     ) -> Nothing:
-        ti.loop_config(parallelize=self.threads)
-        for s, n in ti.ndrange(self.scenarios, nodes):
+        threads = ti.static(self.threads)
+        scenarios = ti.static(self.scenarios)
+        ti.loop_config(parallelize=threads)
+        for s, n in ti.ndrange(scenarios, nodes):
             self.clear(s, n)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.locate(s, p)
             self.p2g(s, p)
-        ti.loop_config(parallelize=self.threads)
-        for s, n in ti.ndrange(self.scenarios, nodes):
+        ti.loop_config(parallelize=threads)
+        for s, n in ti.ndrange(scenarios, nodes):
             self.settle(s, n)
-        ti.loop_config(parallelize=self.threads)
-        for s, e in ti.ndrange(self.scenarios, edges):
+        ti.loop_config(parallelize=threads)
+        for s, e in ti.ndrange(scenarios, edges):
             self.add_images(s, e)
-        ti.loop_config(parallelize=self.threads)
-        for s, i in ti.ndrange(self.scenarios, interior):
+        ti.loop_config(parallelize=threads)
+        for s, i in ti.ndrange(scenarios, interior):
+            n = self.interior_node[i]
             particle_volume = self.particle_volume[s]
-            self.fold(s, self.interior_node[i], particle_volume)
-        ti.loop_config(parallelize=self.threads)
-        for s, g in ti.ndrange(self.scenarios, ghosts):
+            self.fold(s, n, particle_volume)
+        ti.loop_config(parallelize=threads)
+        for s, g in ti.ndrange(scenarios, ghosts):
             self.mirror(s, g)
-        ti.loop_config(parallelize=self.threads)
-        for s, i in ti.ndrange(self.scenarios, interior):
-            self.add_forces(s, self.interior_node[i])
-        ti.loop_config(parallelize=self.threads)
-        for s, g in ti.ndrange(self.scenarios, ghosts):
+        ti.loop_config(parallelize=threads)
+        for s, i in ti.ndrange(scenarios, interior):
+            n = self.interior_node[i]
+            self.add_forces(s, n)
+        ti.loop_config(parallelize=threads)
+        for s, g in ti.ndrange(scenarios, ghosts):
             self.mirror_forces(s, g)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.g2p(s, p)
             if ti.static(self.has_obstacle):
                 if p < fluid:
@@ -927,19 +1102,27 @@ class NodalStressND:
 
     def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
-        self._restart_extremes(self.parameters.particles, self.tables.node_count)
+        fluid = self.parameters.particles
+        nodes = self.tables.node_count
+        self._restart_extremes(fluid, nodes)
 
     @ti.kernel
     def _restart_extremes(self, particles: i32, nodes: i32) -> Nothing:
-        ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, p in ti.ndrange(self.scenarios, particles):
+        is_serial = ti.static(not self.atomic)
+        scenarios = ti.static(self.scenarios)
+        ti.loop_config(serialize=is_serial)
+        for s, p in ti.ndrange(scenarios, particles):
             state = self.particle_state[s, p]  # v_p, J_p
-            speed = ti.abs(state.xyz)
+            velocity = state.xyz
             jacobian = state[3]
-            self.extremes[s, p] = vec4(speed, jacobian)
-            self.x[s, p][3] = -jacobian  # this lane keeps the largest -J
-        ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, n in ti.ndrange(self.scenarios, nodes):
+            speed = ti.abs(velocity)
+            extremes = vec4(speed, jacobian)
+            self.extremes[s, p] = extremes
+            # this lane keeps the largest -J
+            minus_jacobian = -jacobian
+            self.x[s, p][3] = minus_jacobian
+        ti.loop_config(serialize=is_serial)
+        for s, n in ti.ndrange(scenarios, nodes):
             self.peak_speed[s, n] = 0.0
 
 
@@ -947,3 +1130,23 @@ def _axis_count(step: tuple[int, ...]) -> int:
     """Return along how many axes a neighbour lies off."""
     nonzero = [value for value in step if value != 0]
     return len(nonzero)
+
+
+def _vector_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of vectors of four."""
+    return vec4.field()
+
+
+def _number_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of numbers."""
+    return ti.field(f32)
+
+
+def _index_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of numbers of nodes, ghosts or layers."""
+    return ti.field(i32)
+
+
+def _sum_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of fixed-point sums of vectors of four."""
+    return ti.Vector.field(LANES, i64)

@@ -11,7 +11,9 @@ Only ``+ - * /``, ``sqrt`` and comparisons are used, and sums are integers
 Source: Hu et al. 2018; Jiang et al. 2015 (APIC).
 """
 
+import itertools
 import math
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -43,7 +45,18 @@ from .transfer import (
 )
 
 _AXES = (0, 1, 2)
-_ENTRIES = 6  # of a symmetric matrix, in Voigt's order
+_ENTRIES = tuple(range(6))  # of a symmetric matrix, in Voigt's order
+
+# nodes of a stencil along one axis
+_NODES = (0, 1, 2)
+# rows of a stencil along the third axis, by their nodes along the other two
+_ROWS = tuple(itertools.product(_NODES, repeat=2))
+# row and column of each entry of a matrix
+_PLACES = tuple(itertools.product(_AXES, repeat=2))
+# a node and its seven mirror images, by what is mirrored along each axis
+_SIDES = tuple(itertools.product((0, 1), repeat=3))
+# numbers of a node whose slopes G2P computes: v and Jbar
+_SLOPED = (0, 1, 2, 3)
 
 # The serial driver computes solids in blocks of this many particles, one in each lane
 # of a vector register. LLVM makes vector instructions only if a loop reads its lanes
@@ -52,6 +65,7 @@ _ENTRIES = 6  # of a symmetric matrix, in Voigt's order
 # what other phases computed, a second one computes block by block, and a third one
 # copies the results back. F stays in its lists during an advance.
 _LANES = 8
+_LANE_NUMBERS = tuple(range(_LANES))
 
 
 @ti.data_oriented
@@ -69,22 +83,30 @@ class ParticleStress3D(FreeSurfaceKernels):
         and Jbar.
         """
         super()._declare_fields()
+        self.slope_x, self.slope_y, self.slope_z = self.slopes
         # by how much the number of a node grows along each axis
-        self.stride = (self.width**2, self.width, 1)
+        width = self.width
+        layer = width**2
+        self.stride = (layer, width, 1)
         # of each particle: columns of the deformation gradient of a solid [1]; the
         # fourth entry of a column is 0
-        self.deformation_columns = [vec4.field() for _ in _AXES]
+        self.deformation_columns = _vector_fields()
         # columns of A times velocity_scale; the fourth entry is 0
-        self.momentum_slopes = [vec4.field() for _ in _AXES]
+        self.momentum_slopes = _vector_fields()
+        slope_x, slope_y, slope_z = self.momentum_slopes
+        self.momentum_slope_x = slope_x
+        self.momentum_slope_y = slope_y
+        self.momentum_slope_z = slope_z
         # the three weights along each axis; the fourth entry is 0
-        self.weights = [vec4.field() for _ in _AXES]
+        self.weights = _vector_fields()
+        self.weight_x, self.weight_y, self.weight_z = self.weights
         # offset from the middle node of the stencil [cells]; the fourth entry has the
         # bits of the number of the lowest node
         self.stencil_place = vec4.field()
         # v, Jbar and r of the nodes, at the particle, and three zeros
-        self.grid_state = ti.Vector.field(8, f32)
+        self.grid_state = _wide_field()
         # slopes of v and Jbar of the nodes at the particle: along x, then along y
-        self.grid_slopes = ti.Vector.field(8, f32)
+        self.grid_slopes = _wide_field()
         # Kirchhoff stress of a solid without damping [mass/(length s^2)]: entries xx,
         # yy and zz; entries yz, xz and xy; the fourth entries are 0
         self.elastic_diagonal = vec4.field()
@@ -95,19 +117,20 @@ class ParticleStress3D(FreeSurfaceKernels):
         # at the place of a solid in this list: entries of F [1] and of C [1/s], Lame's
         # constants mu and lambda [mass/(length s^2)], entries of the Kirchhoff stress
         # without damping [mass/(length s^2)], the factor on Jp [1], and det F [1]
-        self.listed_gradient = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
-        self.listed_slopes = [[ti.field(f32) for _ in _AXES] for _ in _AXES]
-        self.listed_moduli = [ti.field(f32), ti.field(f32)]
-        self.listed_stress = [ti.field(f32) for _ in range(_ENTRIES)]
+        self.listed_gradient = _matrix_fields()
+        self.listed_slopes = _matrix_fields()
+        self.listed_mu = ti.field(f32)
+        self.listed_la = ti.field(f32)
+        self.listed_stress = _number_fields(6)
         self.listed_growth = ti.field(f32)
         self.listed_jacobian = ti.field(f32)
 
         # of each node: n v and n J
-        self.sums = ti.Vector.field(4, i64)
+        self.sums = _sum_field()
         # n of each row of three nodes along the third axis, at its last node
-        self.row_sums = ti.Vector.field(4, i64)
+        self.row_sums = _sum_field()
         # v, Jbar, r and three zeros: G2P reads all of them from one address
-        self.node_state = ti.Vector.field(8, f32)
+        self.node_state = _wide_field()
 
     def _particle_fields(self) -> tuple[ti.Field, ...]:
         return (
@@ -130,8 +153,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     def _place_fields(self) -> None:
         """Give the fields their memory, each an array of its own."""
         super()._place_fields()
-        blocks = math.ceil(self.particles / _LANES)
-        whole_blocks = _LANES * blocks
+        filled_blocks = self.particles / _LANES
+        blocks = math.ceil(filled_blocks)
+        list_length = _LANES * blocks
+        list_shape = (list_length,)
         listed = (
             self.solids,
             *self.listed_gradient[0],
@@ -140,12 +165,13 @@ class ParticleStress3D(FreeSurfaceKernels):
             *self.listed_slopes[0],
             *self.listed_slopes[1],
             *self.listed_slopes[2],
-            *self.listed_moduli,
+            self.listed_mu,
+            self.listed_la,
             *self.listed_stress,
             self.listed_growth,
             self.listed_jacobian,
         )
-        backend.place(((whole_blocks,), listed))
+        backend.place((list_shape, listed))
 
     def sort_by_material(self, material: NDArray[np.int32]) -> None:
         """Note whether there are solids, and list those of scenario 0.
@@ -156,23 +182,27 @@ class ParticleStress3D(FreeSurfaceKernels):
         super().sort_by_material(material)
         first_material = material[0]
         is_snow = first_material == SNOW
-        is_other_solid = (first_material != LIQUID) & ~is_snow
+        is_solid = first_material != LIQUID
+        is_other_solid = is_solid & ~is_snow
         snow = np.flatnonzero(is_snow)
         other_solids = np.flatnonzero(is_other_solid)
-        numbers = np.zeros(self.solids.shape, np.int32)
         solids = np.concatenate([snow, other_solids])
-        numbers[: len(solids)] = solids
-        self.solids.from_numpy(numbers)
         self.snow_count = len(snow)
         self.solid_count = len(solids)
+        # the list has room for all particles
+        numbers = np.zeros(self.solids.shape, np.int32)
+        numbers[: self.solid_count] = solids
+        self.solids.from_numpy(numbers)
 
     # The phases: each function is one phase at one particle or node.
 
     @ti.func
     def at(self, i: i32, j: i32, k: i32) -> i32:
         """Return the number of a node."""
-        row = i * self.width + j
-        return row * self.width + k
+        width = self.width
+        rows_before = i * width + j
+        nodes_before = rows_before * width
+        return nodes_before + k
 
     @ti.func
     def clear(self, s: i32, n: i32) -> None:
@@ -193,24 +223,38 @@ class ParticleStress3D(FreeSurfaceKernels):
         number = 0
         offset = vec3(0.0)
         for axis in ti.static(_AXES):
-            stride = ti.static(self.stride[axis])
-            scaled = x[axis] * self.inv_dx
-            lowest = ti.cast(scaled - 0.5, i32)
+            coordinate = x[axis]
+            scaled = coordinate * self.inv_dx
+            half_below = scaled - 0.5
+            lowest = ti.cast(half_below, i32)
             node = ti.cast(lowest, f32)
             f = scaled - node
             low, mid, high = spline_weights(f)
-            self.weights[axis][s, p] = vec4(low, mid, high, 0.0)
-            offset[axis] = f - 1.0
-            number += lowest * stride
+            weights = vec4(low, mid, high, 0.0)
+            self.weights[axis][s, p] = weights
+            from_middle = f - 1.0
+            offset[axis] = from_middle
+            stride = self.stride[axis]
+            nodes_before = lowest * stride
+            number += nodes_before
         number_bits = ti.bit_cast(number, f32)
-        self.stencil_place[s, p] = vec4(offset, number_bits)
+        place = vec4(offset, number_bits)
+        self.stencil_place[s, p] = place
+
+    @ti.func
+    def row_start(self, lowest: i32, i: Template, j: Template) -> i32:
+        """Return the number of the first node of a row of a particle's stencil."""
+        width = self.width
+        rows_before = i * width + j
+        nodes_before = rows_before * width
+        return lowest + nodes_before
 
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat3:
         """Return C of a particle."""
-        slope_x = self.slopes[0][s, p]
-        slope_y = self.slopes[1][s, p]
-        slope_z = self.slopes[2][s, p]
+        slope_x = self.slope_x[s, p]
+        slope_y = self.slope_y[s, p]
+        slope_z = self.slope_z[s, p]
         return columns(slope_x, slope_y, slope_z)
 
     @ti.func
@@ -224,8 +268,9 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def moduli(self, s: i32, p: i32) -> Value:
         """Return Lame's constants mu and lambda of a solid [mass/(length s^2)]."""
-        kind = self.matter[s, p][0]
-        ratio = self.matter[s, p][1]
+        matter = self.matter[s, p]
+        kind = matter[0]
+        ratio = matter[1]
         mu, la = self.jelly
         if kind == ROPE:
             mu, la = self.rope
@@ -245,8 +290,10 @@ class ParticleStress3D(FreeSurfaceKernels):
     def store_elastic_stress(self, s: i32, p: i32, stress: Template) -> None:
         """Store the Kirchhoff stress of a solid without damping."""
         xx, yy, zz, yz, xz, xy = stress
-        self.elastic_diagonal[s, p] = vec4(xx, yy, zz, 0.0)
-        self.elastic_off_diagonal[s, p] = vec4(yz, xz, xy, 0.0)
+        diagonal = vec4(xx, yy, zz, 0.0)
+        off_diagonal = vec4(yz, xz, xy, 0.0)
+        self.elastic_diagonal[s, p] = diagonal
+        self.elastic_off_diagonal[s, p] = off_diagonal
 
     @ti.func
     def compute_elastic_stress(self, s: i32, p: i32) -> None:
@@ -262,44 +309,45 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Copy F of a solid to its place in the list of solids."""
         p = self.solids[number]
         f = self.deformation(0, p)
-        for row, column in ti.static(ti.ndrange(3, 3)):
-            self.listed_gradient[row][column][number] = f[row, column]
+        store_matrix(self.listed_gradient, number, f)
 
     @ti.func
     def copy_gradient_from_list(self, number: i32) -> None:
         """Copy F of a solid from its place in the list of solids to the particle."""
         p = self.solids[number]
+        x_row, y_row, z_row = ti.static(self.listed_gradient)
         for axis in ti.static(_AXES):
-            x = self.listed_gradient[0][axis][number]
-            y = self.listed_gradient[1][axis][number]
-            z = self.listed_gradient[2][axis][number]
-            self.deformation_columns[axis][0, p] = vec4(x, y, z, 0.0)
+            x = x_row[axis][number]
+            y = y_row[axis][number]
+            z = z_row[axis][number]
+            column = vec4(x, y, z, 0.0)
+            self.deformation_columns[axis][0, p] = column
 
     @ti.func
     def copy_slopes_to_list(self, number: i32) -> None:
         """Copy C of a solid to its place in the list of solids."""
         p = self.solids[number]
         c = self.velocity_gradient(0, p)
-        for row, column in ti.static(ti.ndrange(3, 3)):
-            self.listed_slopes[row][column][number] = c[row, column]
+        store_matrix(self.listed_slopes, number, c)
 
     @ti.func
     def copy_moduli_to_list(self, number: i32) -> None:
         """Copy Lame's constants of a solid to its place in the list of solids."""
         p = self.solids[number]
         mu, la = self.moduli(0, p)
-        self.listed_moduli[0][number] = mu
-        self.listed_moduli[1][number] = la
+        self.listed_mu[number] = mu
+        self.listed_la[number] = la
 
     @ti.func
     def compute_listed_stress(self, block: i32) -> None:
         """Compute the Kirchhoff stress of a block of solids without damping."""
-        mu = load_lanes(self.listed_moduli[0], block)
-        la = load_lanes(self.listed_moduli[1], block)
+        mu = load_lanes(self.listed_mu, block)
+        la = load_lanes(self.listed_la, block)
         rows = load_rows(self.listed_gradient, block)
         stress = corotated_stress(rows, mu, la)
-        for entry in ti.static(range(_ENTRIES)):
-            store_lanes(self.listed_stress[entry], block, stress[entry])
+        for entry in ti.static(_ENTRIES):
+            values = stress[entry]
+            store_lanes(self.listed_stress[entry], block, values)
 
     @ti.func
     def copy_stress_from_list(self, number: i32) -> None:
@@ -318,7 +366,8 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def viscosity(self, s: i32, p: i32) -> f32:
         """Return the dynamic viscosity of a liquid, or the damping of a solid."""
-        kind = self.matter[s, p][0]
+        matter = self.matter[s, p]
+        kind = matter[0]
         is_snow = kind == SNOW
         is_liquid = kind == LIQUID
         damping = ti.select(is_snow, 0.0, self.solid_viscosity)
@@ -327,7 +376,8 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def stress(self, s: i32, p: i32, solid: Template) -> None:
         """Compute A of a particle, and a bound of the speeds that it gives to nodes."""
-        spread_jacobian = self.particle_state[s, p][3]
+        particle_state = self.particle_state[s, p]
+        spread_jacobian = particle_state[3]
         modulus = self.parameters.liquid_modulus
         isotropic_stress = liquid_stress(spread_jacobian, modulus)
         c = self.velocity_gradient(s, p)
@@ -337,7 +387,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         if ti.static(solid):
             viscosity = self.viscosity(s, p)
             # Selections instead of branches: LLVM makes vector instructions.
-            is_liquid = self.matter[s, p][0] == LIQUID
+            matter = self.matter[s, p]
+            kind = matter[0]
+            is_liquid = kind == LIQUID
             elastic_diagonal = self.elastic_diagonal[s, p]
             elastic_off_diagonal = self.elastic_off_diagonal[s, p]
             diagonal = ti.select(is_liquid, diagonal, elastic_diagonal)
@@ -350,27 +402,39 @@ class ParticleStress3D(FreeSurfaceKernels):
             a = vec4(0.0)
             for row in ti.static(_AXES):
                 slope = c[row, column]
-                shear_rate = slope + c[column, row]
+                mirrored_slope = c[column, row]
+                shear_rate = slope + mirrored_slope
                 tau = viscosity * shear_rate
                 if ti.static(row == column):
-                    tau = tau + diagonal[row]
+                    normal_stress = diagonal[row]
+                    tau = tau + normal_stress
                 elif ti.static(solid):
-                    tau = tau + off_diagonal[3 - row - column]
+                    shear_stress = off_diagonal[3 - row - column]
+                    tau = tau + shear_stress
                 speed_per_cell = self.dx * slope
-                a[row] = speed_per_cell - self.stress_factor * tau
-            affine_speed = affine_speed + 1.5 * ti.abs(a.xyz)
-            self.momentum_slopes[column][s, p] = self.velocity_scale * a
+                gain_per_cell = self.stress_factor * tau
+                a[row] = speed_per_cell - gain_per_cell
+            cell_speed = ti.abs(a.xyz)
+            reached_speed = 1.5 * cell_speed
+            affine_speed = affine_speed + reached_speed
+            momentum_slope = self.velocity_scale * a
+            self.momentum_slopes[column][s, p] = momentum_slope
         self.keep_node_speed(s, p, affine_speed)
 
     @ti.func
     def keep_node_speed(self, s: i32, p: i32, affine_speed: vec3) -> None:
         """Keep the largest speed that a particle gives to a node in this advance."""
-        velocity = self.particle_state[s, p].xyz
-        node_speed = ti.abs(velocity) + affine_speed
+        particle_state = self.particle_state[s, p]
+        velocity = particle_state.xyz
+        speed = ti.abs(velocity)
+        node_speed = speed + affine_speed
         extremes = self.extremes[s, p]
+        largest = extremes[3]
         for axis in ti.static(_AXES):
-            component = finite(node_speed[axis])
-            extremes[3] = larger(component, extremes[3])
+            axis_speed = node_speed[axis]
+            component = finite(axis_speed)
+            largest = larger(component, largest)
+        extremes[3] = largest
         self.extremes[s, p] = extremes
 
     @ti.func
@@ -381,36 +445,47 @@ class ParticleStress3D(FreeSurfaceKernels):
         and then stepped to the neighbours, dx away.
         """
         place = self.stencil_place[s, p]
-        lowest = node_number(place[3], self.node_count)
-        step_x = self.momentum_slopes[0][s, p]
-        step_y = self.momentum_slopes[1][s, p]
-        step_z = self.momentum_slopes[2][s, p]
+        number_bits = place[3]
+        lowest = node_number(number_bits, self.node_count)
+        step_x = self.momentum_slope_x[s, p]
+        step_y = self.momentum_slope_y[s, p]
+        step_z = self.momentum_slope_z[s, p]
         scale = vec4(
             self.velocity_scale,
             self.velocity_scale,
             self.velocity_scale,
             self.count_scale,
         )
-        at_middle = scale * self.particle_state[s, p]
-        at_middle = at_middle - place.x * step_x
-        at_middle = at_middle - place.y * step_y
-        at_middle = at_middle - place.z * step_z
-        weight_x = self.weights[0][s, p]
-        weight_y = self.weights[1][s, p]
-        weight_z = self.weights[2][s, p]
-        for i, j in ti.static(ti.ndrange(3, 3)):
-            across = weight_x[i] * weight_y[j]
+        particle_state = self.particle_state[s, p]
+        at_particle = scale * particle_state
+        way_x = place.x * step_x
+        way_y = place.y * step_y
+        way_z = place.z * step_z
+        at_middle = at_particle - way_x
+        at_middle = at_middle - way_y
+        at_middle = at_middle - way_z
+
+        weight_x = self.weight_x[s, p]
+        weight_y = self.weight_y[s, p]
+        weight_z = self.weight_z[s, p]
+        for i, j in ti.static(_ROWS):
+            along_x = weight_x[i]
+            along_y = weight_y[j]
+            across = along_x * along_y
             weights = across * weight_z
             at_column = stepped(at_middle, step_x, i - 1)
             at_row = stepped(at_column, step_y, j - 1)
-            row = lowest + (i * self.width + j) * self.width
-            for k in ti.static(range(3)):
+            start = self.row_start(lowest, i, j)
+            for k in ti.static(_NODES):
+                node = start + k
+                weight = weights[k]
                 at_node = stepped(at_row, step_z, k - 1)
-                share = weights[k] * at_node
-                add_shifted(self.sums, s, row + k, share, self.atomic)
+                share = weight * at_node
+                add_shifted(self.sums, s, node, share, self.atomic)
             # The fourth weight is 0, so that the fourth sum counts shifts.
+            last = start + 2
             counts = self.count_scale * weights
-            add_shifted(self.row_sums, s, row + 2, counts, self.atomic)
+            add_shifted(self.row_sums, s, last, counts, self.atomic)
 
     @ti.func
     def update(
@@ -421,59 +496,69 @@ class ParticleStress3D(FreeSurfaceKernels):
         A node without particles is at rest.
         """
         node = self.at(i, j, k)
-        u = 0.0
-        v = 0.0
-        w = 0.0
+        velocity = vec3(0.0)
         jacobian = 1.0
         density = 0.0
         weight_sum, shifts = row_count(self.row_sums, s, node)
         if weight_sum > 0:
             count = from_fixed(weight_sum, self.count_unit)
-            total = self.sums[s, node] - shifts
+            shifted_total = self.sums[s, node]
+            total = shifted_total - shifts
+            jacobian_total = total[3]
             momentum = from_fixed(total, self.velocity_unit)
-            jacobian_sum = from_fixed(total[3], self.count_unit)
-            u = momentum.x / count
-            v = momentum.y / count - self.gravity_gain
-            w = momentum.z / count
+            jacobian_sum = from_fixed(jacobian_total, self.count_unit)
             jacobian = jacobian_sum / count
-            u, v, w = self.contact(i, u, v, w, friction)
-            v, w, u = self.contact(j, v, w, u, friction)
-            w, u, v = self.contact(k, w, u, v, friction)
+            velocity = momentum.xyz / count
+            weightless_speed = velocity.y
+            velocity.y = weightless_speed - self.gravity_gain
+            velocity = self.contact(i, 0, velocity, friction)
+            velocity = self.contact(j, 1, velocity, friction)
+            velocity = self.contact(k, 2, velocity, friction)
             mirrored_sum = self.mirrored_count(s, i, j, k)
             mirrored_count = from_fixed(mirrored_sum, self.count_unit)
             density = mirrored_count * particle_volume
-        state = ti.Vector([u, v, w, jacobian, density, 0.0, 0.0, 0.0])
+        state = ti.Vector.zero(f32, 8)
+        for axis in ti.static(_AXES):
+            component = velocity[axis]
+            state[axis] = component
+        state[3] = jacobian
+        state[4] = density
         self.node_state[s, node] = state
 
     @ti.func
     def contact(
-        self, index: i32, normal: f32, first: f32, second: f32, friction: f32
-    ) -> Value:
+        self, index: i32, axis: Template, velocity: vec3, friction: f32
+    ) -> vec3:
         """Return the velocity of a node after contact with one of two opposite walls.
 
         Args:
             index: place of the node along the normal of the walls.
-            normal: component of the velocity along the normal.
-            first: a tangential component.
-            second: the other one.
+            axis: that of the normal.
+            velocity: that of the node.
             friction: Coulomb's coefficient of the walls.
-
-        Returns:
-            The normal and the two tangential components.
         """
-        new_normal = normal
-        new_first = first
-        new_second = second
+        first_axis = ti.static((axis + 1) % 3)
+        second_axis = ti.static((axis + 2) % 3)
+        normal = velocity[axis]
+        first = velocity[first_axis]
+        second = velocity[second_axis]
+        new_velocity = velocity
         if self.is_outward(index, normal):
             impact_speed = ti.abs(normal)
-            sliding_speed = ti.sqrt(first * first + second * second)
+            first_square = first * first
+            second_square = second * second
+            sliding_square = first_square + second_square
+            sliding_speed = ti.sqrt(sliding_square)
             divisor = larger(sliding_speed, 1e-9)
-            loss = friction * impact_speed / divisor
+            lost_speed = friction * impact_speed
+            loss = lost_speed / divisor
             kept = larger(1.0 - loss, 0.0)
-            new_normal = 0.0
             new_first = first * kept
             new_second = second * kept
-        return new_normal, new_first, new_second
+            new_velocity[axis] = 0.0
+            new_velocity[first_axis] = new_first
+            new_velocity[second_axis] = new_second
+        return new_velocity
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32, k: i32) -> i64:
@@ -485,11 +570,14 @@ class ParticleStress3D(FreeSurfaceKernels):
         image_i = self.image(i)
         image_j = self.image(j)
         image_k = self.image(k)
+        places_i = [i, image_i]
+        places_j = [j, image_j]
+        places_k = [k, image_k]
         count = i64(0)
-        for a, b, c in ti.static(ti.ndrange(2, 2, 2)):
-            place_i = ti.select(a == 1, image_i, i)
-            place_j = ti.select(b == 1, image_j, j)
-            place_k = ti.select(c == 1, image_k, k)
+        for a, b, c in ti.static(_SIDES):
+            place_i = places_i[a]
+            place_j = places_j[b]
+            place_k = places_k[c]
             if place_i >= 0 and place_j >= 0 and place_k >= 0:
                 node = self.at(place_i, place_j, place_k)
                 weight_sum, _ = row_count(self.row_sums, s, node)
@@ -504,73 +592,108 @@ class ParticleStress3D(FreeSurfaceKernels):
         and the slopes along x and along y are one. :meth:`flow` separates them.
         """
         place = self.stencil_place[s, p]
-        lowest = node_number(place[3], self.node_count)
-        weight_x = self.weights[0][s, p]
-        weight_y = self.weights[1][s, p]
-        weight_z = self.weights[2][s, p]
+        number_bits = place[3]
+        lowest = node_number(number_bits, self.node_count)
+        weight_x = self.weight_x[s, p]
+        weight_y = self.weight_y[s, p]
+        weight_z = self.weight_z[s, p]
         state = ti.Vector.zero(f32, 8)
-        slopes_xy = ti.Vector.zero(f32, 8)
-        slope_z = vec4(0.0)
-        for i, j in ti.static(ti.ndrange(3, 3)):
-            across = weight_x[i] * weight_y[j]
-            row = lowest + (i * self.width + j) * self.width
-            distance_x = (i - 1.0) - place.x
-            distance_y = (j - 1.0) - place.y
-            for k in ti.static(range(3)):
-                weight = across * weight_z[k]
-                share = weight * self.node_state[s, row + k]
-                distance_z = (k - 1.0) - place.z
+        # first moments of v and Jbar about the particle [cells]: x, then y
+        moments_xy = ti.Vector.zero(f32, 8)
+        moments_z = vec4(0.0)
+        for i, j in ti.static(_ROWS):
+            along_x = weight_x[i]
+            along_y = weight_y[j]
+            across = along_x * along_y
+            start = self.row_start(lowest, i, j)
+            row_x = i - 1.0
+            row_y = j - 1.0
+            distance_x = row_x - place.x
+            distance_y = row_y - place.y
+            for k in ti.static(_NODES):
+                along_z = weight_z[k]
+                weight = across * along_z
+                node = start + k
+                node_state = self.node_state[s, node]
+                share = weight * node_state
+                node_z = k - 1.0
+                distance_z = node_z - place.z
                 state += share
-                for entry in ti.static(range(4)):
-                    slopes_xy[entry] += distance_x * share[entry]
-                for entry in ti.static(range(4)):
-                    slopes_xy[4 + entry] += distance_y * share[entry]
-                slope_z += distance_z * share[:4]
+                for entry in ti.static(_SLOPED):
+                    component = share[entry]
+                    moment = distance_x * component
+                    moments_xy[entry] += moment
+                for entry in ti.static(_SLOPED):
+                    component = share[entry]
+                    moment = distance_y * component
+                    moments_xy[4 + entry] += moment
+                sloped_share = share[:4]
+                moment_z = distance_z * sloped_share
+                moments_z += moment_z
         slope_factor = 4.0 * self.inv_dx
-        self.grid_slopes[s, p] = slope_factor * slopes_xy
-        self.slopes[2][s, p] = slope_factor * slope_z
+        slopes_xy = slope_factor * moments_xy
+        slope_z = slope_factor * moments_z
+        self.grid_slopes[s, p] = slopes_xy
+        self.slope_z[s, p] = slope_z
         self.grid_state[s, p] = state
 
     @ti.func
     def flow(self, s: i32, p: i32, solid: Template) -> None:
         """Move a particle with the grid's velocity, and update J of a liquid."""
         grid_state = self.grid_state[s, p]
-        velocity = vec3(grid_state[0], grid_state[1], grid_state[2])
+        u = grid_state[0]
+        v = grid_state[1]
+        w = grid_state[2]
+        velocity = vec3(u, v, w)
         grid_jacobian = grid_state[3]
         grid_density = grid_state[4]
-        old_x = self.x[s, p].xyz
-        x = old_x + self.dt * velocity
-        x = bounded(x, self.position_min, self.position_max)
-        self.x[s, p] = vec4(x, 0.0)
+        old_position = self.x[s, p]
+        old_x = old_position.xyz
+        step = self.dt * velocity
+        x = old_x + step
+        low = self.position_min
+        high = self.position_max
+        x = bounded(x, low, high)
+        position = vec4(x, 0.0)
+        self.x[s, p] = position
 
-        kind = self.matter[s, p][0]
-        old_ratio = self.matter[s, p][1]
+        matter = self.matter[s, p]
+        kind = matter[0]
+        old_ratio = matter[1]
         slopes_xy = self.grid_slopes[s, p]
         slope_x = slopes_xy[:4]
         slope_y = slopes_xy[4:]
-        slope_z = self.slopes[2][s, p]
-        self.slopes[0][s, p] = slope_x
-        self.slopes[1][s, p] = slope_y
-        divergence = slope_x[0] + slope_y[1] + slope_z[2]
-        j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
+        slope_z = self.slope_z[s, p]
+        self.slope_x[s, p] = slope_x
+        self.slope_y[s, p] = slope_y
+        strain_rate_x = slope_x[0]
+        strain_rate_y = slope_y[1]
+        strain_rate_z = slope_z[2]
+        divergence = strain_rate_x + strain_rate_y + strain_rate_z
+        jacobian = self.liquid_jacobian(
+            old_ratio, divergence, grid_jacobian, grid_density
+        )
         is_liquid = kind == LIQUID
-        ratio = j
-        spread_jacobian = j
+        ratio = jacobian
+        spread_jacobian = jacobian
         if ti.static(solid):
-            ratio = ti.select(is_liquid, j, old_ratio)
-            spread_jacobian = ti.select(is_liquid, j, 1.0)
-        self.particle_state[s, p] = vec4(velocity, spread_jacobian)
+            ratio = ti.select(is_liquid, jacobian, old_ratio)
+            spread_jacobian = ti.select(is_liquid, jacobian, 1.0)
+        particle_state = vec4(velocity, spread_jacobian)
+        self.particle_state[s, p] = particle_state
         self.store_ratio(s, p, ratio)
 
         extremes = self.extremes[s, p]
         speed = largest_component(velocity)
-        extremes[0] = larger(speed, extremes[0])
+        old_speed = extremes[0]
+        extremes[0] = larger(speed, old_speed)
         self.extremes[s, p] = extremes
-        kept_jacobian = j
+        kept_jacobian = jacobian
         if ti.static(solid):
             # det F of a solid is computed later. Until then the old minimum stands for
             # it, which changes neither extreme.
-            kept_jacobian = ti.select(is_liquid, j, extremes[1])
+            old_min = extremes[1]
+            kept_jacobian = ti.select(is_liquid, jacobian, old_min)
         self.keep_jacobian(s, p, kept_jacobian)
 
     @ti.func
@@ -578,16 +701,21 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Store J of a liquid or Jp of snow, and its extremes since the start."""
         matter = self.matter[s, p]
         old_min = matter[2]
+        old_max = matter[3]
+        is_smaller = ratio < old_min
+        new_min = ti.select(is_smaller, ratio, old_min)
+        new_max = larger(ratio, old_max)
         matter[1] = ratio
-        matter[2] = ti.select(ratio < old_min, ratio, old_min)
-        matter[3] = larger(ratio, matter[3])
+        matter[2] = new_min
+        matter[3] = new_max
         self.matter[s, p] = matter
 
     @ti.func
     def jacobian(self, s: i32, p: i32) -> f32:
         """Return J of a liquid or det F of a solid."""
-        kind = self.matter[s, p][0]
-        ratio = self.matter[s, p][1]
+        matter = self.matter[s, p]
+        kind = matter[0]
+        ratio = matter[1]
         f = self.deformation(s, p)
         rows = rows_of(f)
         solid_jacobian = determinant(rows)
@@ -599,8 +727,12 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Keep the smallest and largest J or det F of a particle in this advance."""
         extremes = self.extremes[s, p]
         old_min = extremes[1]
-        extremes[1] = ti.select(jacobian < old_min, jacobian, old_min)
-        extremes[2] = larger(jacobian, extremes[2])
+        old_max = extremes[2]
+        is_smaller = jacobian < old_min
+        new_min = ti.select(is_smaller, jacobian, old_min)
+        new_max = larger(jacobian, old_max)
+        extremes[1] = new_min
+        extremes[2] = new_max
         self.extremes[s, p] = extremes
 
     @ti.func
@@ -610,7 +742,8 @@ class ParticleStress3D(FreeSurfaceKernels):
         (I + dt C) F is the trial gradient. That of snow returns to its yield limits,
         and the change of volume that it loses goes into Jp.
         """
-        kind = self.matter[s, p][0]
+        matter = self.matter[s, p]
+        kind = matter[0]
         if kind != LIQUID:
             f = self.deformation(s, p)
             c = self.velocity_gradient(s, p)
@@ -632,8 +765,10 @@ class ParticleStress3D(FreeSurfaceKernels):
         """Multiply Jp of a snow particle by a factor, within its limits."""
         jp_min = self.parameters.snow_jp_min
         jp_max = self.parameters.snow_jp_max
-        old_jp = self.matter[s, p][1]
-        jp = bounded(old_jp * growth, jp_min, jp_max)
+        matter = self.matter[s, p]
+        old_jp = matter[1]
+        grown_jp = old_jp * growth
+        jp = bounded(grown_jp, jp_min, jp_max)
         self.store_ratio(s, p, jp)
 
     @ti.func
@@ -650,15 +785,19 @@ class ParticleStress3D(FreeSurfaceKernels):
 
         The last block may have other solids behind the snow. Their F stays as it is.
         """
+        low = self.yield_low
+        high = self.yield_high
         trial = load_rows(self.listed_gradient, block)
-        rows, growth = plastic_return(trial, self.yield_low, self.yield_high)
-        snow_lanes = snow_count - block * _LANES
-        for lane in ti.static(range(_LANES)):
+        rows, growth = plastic_return(trial, low, high)
+        first = block * _LANES
+        snow_lanes = snow_count - first
+        for lane in ti.static(_LANE_NUMBERS):
             is_snow = lane < snow_lanes
-            for row, column in ti.static(ti.ndrange(3, 3)):
+            for row, column in ti.static(_PLACES):
                 elastic = rows[row][column][lane]
                 old = trial[row][column][lane]
-                rows[row][column][lane] = ti.select(is_snow, elastic, old)
+                kept = ti.select(is_snow, elastic, old)
+                rows[row][column][lane] = kept
         store_rows(self.listed_gradient, block, rows)
         store_lanes(self.listed_growth, block, growth)
 
@@ -686,11 +825,13 @@ class ParticleStress3D(FreeSurfaceKernels):
     @ti.func
     def store_deformation(self, s: i32, p: i32, rows: Template) -> None:
         """Store F of a particle, column by column."""
+        x_row, y_row, z_row = rows
         for axis in ti.static(_AXES):
-            x = rows[0][axis]
-            y = rows[1][axis]
-            z = rows[2][axis]
-            self.deformation_columns[axis][s, p] = vec4(x, y, z, 0.0)
+            x = x_row[axis]
+            y = y_row[axis]
+            z = z_row[axis]
+            column = vec4(x, y, z, 0.0)
+            self.deformation_columns[axis][s, p] = column
 
     # The drivers run the same phases in the same order.
 
@@ -711,7 +852,7 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     def run_in_parallel(self) -> None:
         """Advance every scenario by one substep: one launch per phase."""
-        self._parallel_substep(self.particles, self.width, self.solid)
+        self._parallel_substep(self.particles, self.node_count, self.width, self.solid)
 
     @ti.kernel
     def _serial_substeps(
@@ -734,14 +875,17 @@ class ParticleStress3D(FreeSurfaceKernels):
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
             first, end = self.touched_nodes(particles)
-            for i in range(first[0], end[0]):
-                for j in range(first[1], end[1]):
-                    for k in range(first[2], end[2]):
+            first_i, first_j, first_k = first
+            end_i, end_j, end_k = end
+            # A row has the number of its last node. So the numbers of rows with a
+            # touched node are larger by at most two.
+            row_end_k = end_k + 2
+            for i in range(first_i, end_i):
+                for j in range(first_j, end_j):
+                    for k in range(first_k, end_k):
                         node = self.at(i, j, k)
                         self.clear(0, node)
-                    # A row has the number of its last node. So the numbers of rows with
-                    # a touched node are larger by at most two.
-                    for k in range(first[2], end[2] + 2):
+                    for k in range(first_k, row_end_k):
                         node = self.at(i, j, k)
                         self.clear_row(0, node)
             for p in range(particles):
@@ -758,9 +902,9 @@ class ParticleStress3D(FreeSurfaceKernels):
                 self.stress(0, p, solid)
             for p in range(particles):
                 self.p2g(0, p)
-            for i in range(first[0], end[0]):
-                for j in range(first[1], end[1]):
-                    for k in range(first[2], end[2]):
+            for i in range(first_i, end_i):
+                for j in range(first_j, end_j):
+                    for k in range(first_k, end_k):
                         self.update(0, i, j, k, particle_volume, friction)
             for p in range(particles):
                 self.g2p(0, p)
@@ -785,25 +929,29 @@ class ParticleStress3D(FreeSurfaceKernels):
                 self.copy_gradient_from_list(number)
 
     @ti.kernel
-    def _parallel_substep(self, particles: i32, width: i32, solid: Template) -> Nothing:
-        ti.loop_config(parallelize=self.threads)
-        for s, n in ti.ndrange(self.scenarios, width * width * width):
+    def _parallel_substep(
+        self, particles: i32, nodes: i32, width: i32, solid: Template
+    ) -> Nothing:
+        threads = ti.static(self.threads)
+        scenarios = ti.static(self.scenarios)
+        ti.loop_config(parallelize=threads)
+        for s, n in ti.ndrange(scenarios, nodes):
             self.clear(s, n)
             self.clear_row(s, n)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.locate(s, p)
             if ti.static(solid):
                 self.compute_elastic_stress(s, p)
             self.stress(s, p, solid)
             self.p2g(s, p)
-        ti.loop_config(parallelize=self.threads)
-        for s, i, j, k in ti.ndrange(self.scenarios, width, width, width):
+        ti.loop_config(parallelize=threads)
+        for s, i, j, k in ti.ndrange(scenarios, width, width, width):
             particle_volume = self.particle_volume[s]
             friction = self.friction[s]
             self.update(s, i, j, k, particle_volume, friction)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.g2p(s, p)
             self.flow(s, p, solid)
             if ti.static(solid):
@@ -815,12 +963,16 @@ class ParticleStress3D(FreeSurfaceKernels):
 
     @ti.kernel
     def _restart_extremes(self, particles: i32) -> Nothing:
-        ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, p in ti.ndrange(self.scenarios, particles):
-            velocity = self.particle_state[s, p].xyz
+        is_serial = ti.static(not self.atomic)
+        scenarios = ti.static(self.scenarios)
+        ti.loop_config(serialize=is_serial)
+        for s, p in ti.ndrange(scenarios, particles):
+            particle_state = self.particle_state[s, p]
+            velocity = particle_state.xyz
             jacobian = self.jacobian(s, p)
             speed = largest_component(velocity)
-            self.extremes[s, p] = vec4(speed, jacobian, jacobian, 0.0)
+            extremes = vec4(speed, jacobian, jacobian, 0.0)
+            self.extremes[s, p] = extremes
 
 
 @ti.func
@@ -828,8 +980,10 @@ def load_lanes(field: Template, block: i32) -> Value:
     """Read the numbers of a block of particles as one vector."""
     first = block * _LANES
     values = ti.Vector.zero(f32, _LANES)
-    for lane in ti.static(range(_LANES)):
-        values[lane] = field[first + lane]
+    for lane in ti.static(_LANE_NUMBERS):
+        number = first + lane
+        value = field[number]
+        values[lane] = value
     return values
 
 
@@ -852,25 +1006,38 @@ def load_row(fields: Template, block: i32) -> Value:
 
 
 @ti.func
+def store_matrix(fields: Template, number: i32, matrix: mat3) -> None:
+    """Write the matrix of one particle to its place in a list."""
+    for row, column in ti.static(_PLACES):
+        entry = matrix[row, column]
+        fields[row][column][number] = entry
+
+
+@ti.func
 def store_rows(fields: Template, block: i32, rows: Value) -> None:
     """Write the matrices of a block of particles."""
-    for row, column in ti.static(ti.ndrange(3, 3)):
+    for row, column in ti.static(_PLACES):
         field = ti.static(fields[row][column])
-        store_lanes(field, block, rows[row][column])
+        values = rows[row][column]
+        store_lanes(field, block, values)
 
 
 @ti.func
 def store_lanes(field: Template, block: i32, values: Value) -> None:
     """Write a vector to the numbers of a block of particles."""
     first = block * _LANES
-    for lane in ti.static(range(_LANES)):
-        field[first + lane] = values[lane]
+    for lane in ti.static(_LANE_NUMBERS):
+        number = first + lane
+        value = values[lane]
+        field[number] = value
 
 
 @ti.func
 def block_count(count: i32) -> i32:
     """Return how many blocks hold the particles of a list; the last may have gaps."""
-    return (count + _LANES - 1) // _LANES
+    last_lane = _LANES - 1
+    filled_up = count + last_lane
+    return filled_up // _LANES
 
 
 @ti.func
@@ -879,7 +1046,8 @@ def largest_component(velocity: vec3) -> f32:
     speed = ti.abs(velocity)
     largest = 0.0
     for axis in ti.static(_AXES):
-        component = finite(speed[axis])
+        axis_speed = speed[axis]
+        component = finite(axis_speed)
         largest = larger(component, largest)
     return largest
 
@@ -887,8 +1055,32 @@ def largest_component(velocity: vec3) -> f32:
 @ti.func
 def columns(first: vec4, second: vec4, third: vec4) -> mat3:
     """Return the matrix with these columns, without their fourth entries."""
-    return mat3(
-        [first.x, second.x, third.x],
-        [first.y, second.y, third.y],
-        [first.z, second.z, third.z],
-    )
+    x_row = [first.x, second.x, third.x]
+    y_row = [first.y, second.y, third.y]
+    z_row = [first.z, second.z, third.z]
+    return mat3(x_row, y_row, z_row)
+
+
+def _vector_fields() -> list[Any]:
+    """Return a field of vectors of four for each axis."""
+    return [vec4.field() for _ in _AXES]
+
+
+def _number_fields(count: int) -> list[Any]:
+    """Return some fields of numbers."""
+    return [ti.field(f32) for _ in range(count)]
+
+
+def _matrix_fields() -> list[list[Any]]:
+    """Return the rows of a matrix of fields of numbers."""
+    return [_number_fields(3) for _ in _AXES]
+
+
+def _wide_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of vectors of eight."""
+    return ti.Vector.field(8, f32)
+
+
+def _sum_field() -> Any:  # noqa: ANN401 (Taichi is untyped)
+    """Return a field of fixed-point sums of vectors of four."""
+    return ti.Vector.field(4, i64)

@@ -64,25 +64,33 @@ class Smooth:
         f = self.value[:, None]
         g = other.value[:, None]
         value = self.value * other.value
-        gradient = g * self.gradient + f * other.gradient
+        f_slope = g * self.gradient
+        g_slope = f * other.gradient
+        gradient = f_slope + g_slope
         # f'_i g'_j and its transpose, shape [point, axis, axis]
-        f_slope = self.gradient[:, :, None]
-        g_slope = other.gradient[:, None, :]
-        crossed = f_slope * g_slope
+        f_column = self.gradient[:, :, None]
+        g_row = other.gradient[:, None, :]
+        crossed = f_column * g_row
         transposed = crossed.transpose(0, 2, 1)
         both_crossed = crossed + transposed
-        f_curved = g[..., None] * self.hessian
-        g_curved = f[..., None] * other.hessian
-        hessian = f_curved + g_curved + both_crossed
+        f_factor = f[..., None]
+        g_factor = g[..., None]
+        f_curved = g_factor * self.hessian
+        g_curved = f_factor * other.hessian
+        both_curved = f_curved + g_curved
+        hessian = both_curved + both_crossed
         return Smooth(value, gradient, hessian)
 
     def scale(self, factor: Array | float) -> Smooth:
         """Multiply by numbers that do not depend on the point's coordinates."""
+        shape = self.value.shape
         exact = np.asarray(factor, np.float64)
-        factors = np.broadcast_to(exact, self.value.shape)
+        factors = np.broadcast_to(exact, shape)
+        of_gradient = factors[:, None]
+        of_hessian = factors[:, None, None]
         value = factors * self.value
-        gradient = factors[:, None] * self.gradient
-        hessian = factors[:, None, None] * self.hessian
+        gradient = of_gradient * self.gradient
+        hessian = of_hessian * self.hessian
         return Smooth(value, gradient, hessian)
 
     def shift(self, amount: Array | float) -> Smooth:
@@ -118,17 +126,30 @@ class Flow:
     @property
     def speed_rms(self) -> float:
         """Root mean square of the speed over the points [length/s]."""
-        components = self.velocity.ravel().tolist()
-        square_sum = math.fsum(component * component for component in components)
-        return math.sqrt(square_sum / len(self.velocity))
+        square_sum = _square_sum(self.velocity)
+        point_count = len(self.velocity)
+        mean_square = square_sum / point_count
+        return math.sqrt(mean_square)
+
+
+def _square_sum(values: Array) -> float:
+    """Return the sum of the squares of all numbers, rounded once."""
+    numbers = values.ravel()
+    squares = []
+    for number in numbers.tolist():
+        square = number * number
+        squares.append(square)
+    return math.fsum(squares)
 
 
 def coordinate(values: Array, axis: int, dimension: int) -> Smooth:
     """Return a coordinate, or it less a constant, as a function of the position."""
     point_count = len(values)
-    gradient = np.zeros((point_count, dimension))
+    gradient_shape = (point_count, dimension)
+    hessian_shape = (point_count, dimension, dimension)
+    gradient = np.zeros(gradient_shape)
     gradient[:, axis] = 1.0
-    hessian = np.zeros((point_count, dimension, dimension))
+    hessian = np.zeros(hessian_shape)
     return Smooth(values, gradient, hessian)
 
 
@@ -144,15 +165,17 @@ def constant(value: float, point_count: int, dimension: int) -> Smooth:
 
 def draw_direction(rng: RandomSource, dimension: int) -> Array:
     """Draw a unit vector, uniform over the circle or sphere, without sine or cosine."""
+    shape = (dimension,)
     # until a point of the cube lies in the unit ball, and not at its very centre
     while True:
-        unit = rng.random((dimension,))
-        vector = 2.0 * unit - 1.0
-        components = vector.tolist()
-        square = math.fsum(component * component for component in components)
+        unit = rng.random(shape)
+        doubled = 2.0 * unit
+        vector = doubled - 1.0
+        square = _square_sum(vector)
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
-            return np.asarray(vector / length)
+            direction = vector / length
+            return np.asarray(direction)
 
 
 def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
@@ -161,9 +184,14 @@ def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
     The shape is [frequency, ..., axis]: as many nodes as cells along each axis.
     """
     count = frequency**dimension
-    vectors = [draw_direction(rng, dimension) for _ in range(count)]
+    vectors = []
+    for _ in range(count):
+        direction = draw_direction(rng, dimension)
+        vectors.append(direction)
+    gradients = np.array(vectors)
     nodes = [frequency] * dimension
-    return np.array(vectors).reshape(*nodes, dimension)
+    shape = (*nodes, dimension)
+    return gradients.reshape(shape)
 
 
 def _fade(t: Smooth) -> Smooth:
@@ -182,38 +210,49 @@ def noise(position: Array, lattice: Array) -> Smooth:
         lattice: gradients, shape [node, ..., axis].
     """
     frequency = len(lattice)
+    per_length = float(frequency)
     point_count, dimension = position.shape
-    scaled = position * float(frequency)
-    cell = np.floor(scaled).astype(np.int64)
-    cell = np.minimum(cell, frequency - 1)
+    scaled = position * per_length
+    low_corner = np.floor(scaled)
+    cell = low_corner.astype(np.int64)
+    last_cell = frequency - 1
+    cell = np.minimum(cell, last_cell)
     # distances from the low corner of the cell, and the weights of the two corners
     along = []
     weights = []
     for axis in range(dimension):
-        low_corner = cell[:, axis].astype(np.float64)
-        distance = scaled[:, axis] - low_corner
+        axis_cell = cell[:, axis]
+        low = axis_cell.astype(np.float64)
+        distance = scaled[:, axis] - low
         t = coordinate(distance, axis, dimension)
         along.append(t)
         rising = _fade(t)
         minus_rising = rising.scale(-1.0)
         falling = minus_rising.shift(1.0)
-        weights.append((falling, rising))
+        sides = (falling, rising)
+        weights.append(sides)
 
     total = constant(0.0, point_count, dimension)
     for corner in itertools.product((0, 1), repeat=dimension):
-        node = (cell + np.array(corner)) % frequency  # shape [point, axis]
-        gradient = lattice[tuple(node.T)]
+        steps = np.array(corner)
+        unwrapped_node = cell + steps
+        node = unwrapped_node % frequency  # shape [point, axis]
+        node_of_axis = tuple(node.T)
+        gradient = lattice[node_of_axis]
         term = constant(0.0, point_count, dimension)
         for axis, side in enumerate(corner):
             slope = gradient[:, axis]
-            from_corner = along[axis].shift(-float(side))
-            term = term + from_corner.scale(slope)
+            from_low = along[axis]
+            minus_side = -float(side)
+            from_corner = from_low.shift(minus_side)
+            rise = from_corner.scale(slope)
+            term = term + rise
         for axis, side in enumerate(corner):
             weight = weights[axis][side]
             term = term * weight
         total = total + term
+
     # from derivatives per cell of the lattice to derivatives per length
-    per_length = float(frequency)
     per_square = per_length * per_length
     gradient = total.gradient * per_length
     hessian = total.hessian * per_square
@@ -226,17 +265,23 @@ def wrapped_offset(position: Array, centre: Array) -> Array:
     Each component lies in [-1/2, 1/2]: the nearest image of the centre counts.
     """
     way = position - centre
-    return np.asarray(way - np.rint(way))
+    periods = np.rint(way)
+    nearest = way - periods
+    return np.asarray(nearest)
 
 
 def rotated_gradient(psi: Smooth) -> Flow:
     """Return the flow u = dpsi/dy, v = -dpsi/dx."""
-    slope_x = psi.gradient[:, 0]
-    slope_y = psi.gradient[:, 1]
-    velocity = np.stack([slope_y, -slope_x], axis=1)
-    gradient_of_slope_x = psi.hessian[:, 0]
-    gradient_of_slope_y = psi.hessian[:, 1]
-    affine = np.stack([gradient_of_slope_y, -gradient_of_slope_x], axis=1)
+    slope = psi.gradient
+    u = slope[:, 1]
+    v = -slope[:, 0]
+    components = [u, v]
+    curvature = psi.hessian
+    u_gradient = curvature[:, 1]
+    v_gradient = -curvature[:, 0]
+    gradients = [u_gradient, v_gradient]
+    velocity = np.stack(components, axis=1)
+    affine = np.stack(gradients, axis=1)
     return Flow(velocity, affine)
 
 
@@ -251,10 +296,12 @@ def curl(potential: Sequence[Smooth]) -> Flow:
         b = potential[second]
         b_slope = b.gradient[:, first]
         a_slope = a.gradient[:, second]
+        component = b_slope - a_slope
+        components.append(component)
         b_curvature = b.hessian[:, first]
         a_curvature = a.hessian[:, second]
-        components.append(b_slope - a_slope)
-        gradients.append(b_curvature - a_curvature)
+        gradient = b_curvature - a_curvature
+        gradients.append(gradient)
     velocity = np.stack(components, axis=1)
     affine = np.stack(gradients, axis=1)
     return Flow(velocity, affine)
@@ -263,8 +310,10 @@ def curl(potential: Sequence[Smooth]) -> Flow:
 def scaled_to(flow: Flow, speed_rms: float) -> Flow:
     """Return a flow of another root mean square speed, as multiples of 2^-20."""
     factor = speed_rms / flow.speed_rms
-    velocity = quantise(factor * flow.velocity)
-    affine = quantise(factor * flow.affine)
+    exact_velocity = factor * flow.velocity
+    exact_affine = factor * flow.affine
+    velocity = quantise(exact_velocity)
+    affine = quantise(exact_affine)
     return Flow(velocity, affine)
 
 
@@ -290,12 +339,18 @@ def fill_box(
     """
     dimension = len(counts)
     indices = np.indices(tuple(counts))
-    cell = indices.reshape(dimension, -1).T
+    cell_by_axis = indices.reshape(dimension, -1)
+    cell = cell_by_axis.T
     unit = rng.random(cell.shape)
-    displacement = (unit - 0.5) * jitter
-    place = cell + 0.5 + displacement  # [cells]
-    share = place / np.asarray(counts)  # of the extent
+    centred = unit - 0.5
+    displacement = centred * jitter
+    middle = cell + 0.5
+    place = middle + displacement  # [cells]
+    spacings = np.asarray(counts)
+    share = place / spacings  # of the extent
     start = np.asarray(low, np.float64)
     end = np.asarray(high, np.float64)
     extent = end - start
-    return quantise(start + extent * share)
+    way = extent * share
+    position = start + way
+    return quantise(position)
