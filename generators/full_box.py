@@ -319,7 +319,7 @@ class FullBox(Driver[FullBoxParameters]):
         fringe_rate = self.parameters.fringe_rate
         if state.stream is None and not fringe_rate:
             return
-        if not self.parameters.fringe_rate:
+        if not fringe_rate:
             raise UsageError(
                 "a stream needs a fringe",
                 where=f"scenario {index}, stream; parameter fringe_rate of the split",
