@@ -68,9 +68,12 @@ def draft_entry(
         read_verified(folder)  # publishing may have to write it
     with errors:
         about = _describe(headers, meta, extended)
+    kind = meta.kind
+    if extended is not None:
+        kind = _fill_from_entry(meta, extended).kind
     with errors:
         weight_paths = require_weights(
-            weights, headers, rivals, folder=folder, place=place, kind=meta.kind
+            weights, headers, rivals, folder=folder, place=place, kind=kind
         )
     errors.raise_errors()
 

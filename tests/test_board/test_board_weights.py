@@ -37,6 +37,7 @@ from lagbench.errors import (
     UsageError,
     WorkFailedError,
 )
+from lagbench.references.predictor import Kind
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.submission import open_predictions
@@ -133,17 +134,22 @@ def submitted(
     *folders: Path,
     weights: tuple[Path, ...] | None = None,
     method: str | None = None,
+    kind: Kind | None = None,
     **options: Any,
 ) -> SubmitResult:
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
     if weights is None:
         weights = tuple(folder / "weights.pt" for folder in folders)
+    keys: dict[str, Any] = {}
+    if kind is not None:
+        keys["kind"] = kind
     meta = Meta(
         authors=("A. Author",),
         command="make",
         method=method,
         name=method,
+        **keys,
     )
     return submit(files, meta, weights=weights, **own.where, **options)
 
@@ -808,6 +814,16 @@ def test_weights_of_a_hybrid_are_not_those_of_a_learned_model(own: BoardBench) -
         submitted(own, run, weights=(hybrid,))
     assert str(caught.value.where).startswith("kind")
     assert own.state() == before
+
+
+def test_more_seeds_have_the_kind_of_their_entry(own: BoardBench) -> None:
+    """So weights of a hybrid are refused for what else is wrong with them."""
+    hybrid = WEIGHTS / "cavity/mini/hybrid-projection_0.pt"
+    submitted(own, trained(own, 0), weights=(), kind=Kind.HYBRID)
+    run = trained(own, 3)
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run, weights=(hybrid,), add=True)
+    assert caught.value.where == str(hybrid)
 
 
 Damage = Callable[[BoardBench], object]
