@@ -120,12 +120,10 @@ def base_node(rows: Template, s: i32, p: i32) -> Value:
 
     Both stand in its stencil, see :func:`stencil`.
     """
-    first = rows[0][s, p]
-    second = rows[1][s, p]
-    third = rows[2][s, p]
-    node_bits = first[3]
-    offset_x = second[3]
-    offset_y = third[3]
+    # Only these numbers: whole rows would be kept in registers that P2G needs.
+    node_bits = rows[0][s, p][3]
+    offset_x = rows[1][s, p][3]
+    offset_y = rows[2][s, p][3]
     base = ti.bit_cast(node_bits, i32)
     offset = vec2(offset_x, offset_y)
     return base, offset
