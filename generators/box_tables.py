@@ -120,7 +120,8 @@ class BoxTables:
         """Return the signs with which a wall across an axis mirrors (v, a scalar)."""
         tangential_sign = self._tangential_sign()
         sign = np.ones(LANES, np.int64)
-        sign[: self.dimension] = tangential_sign
+        dimension = self.dimension
+        sign[:dimension] = tangential_sign
         sign[axis] = -1
         return sign
 
@@ -129,7 +130,7 @@ class BoxTables:
         node = numbers.astype(np.int32)
         index = self.index[node]
         mirrored = np.clip(index, 1, self._last)
-        # one period on
+        # the node at the same place one period on
         from_first = index - 1
         wrapped_from_first = from_first % self._last
         wrapped = wrapped_from_first + 1
@@ -142,13 +143,14 @@ class BoxTables:
         ghost_count = len(node)
         sign_shape = (ghost_count, LANES)
         sign = np.ones(sign_shape, np.float32)
-        for axis in range(self.dimension):
+        dimension = self.dimension
+        for axis in range(dimension):
             is_axis_across = is_across[:, axis]
             is_mirrored = is_axis_across[:, None]
             reflection = self._reflection(axis)
             factor = np.where(is_mirrored, reflection, 1)
-            exact_factor = factor.astype(np.float32)
-            sign *= exact_factor
+            float_factor = factor.astype(np.float32)
+            sign *= float_factor
 
         # Only one wall moves a ghost; where two meet, none does.
         wall_count = is_across.sum(axis=1)
@@ -161,7 +163,7 @@ class BoxTables:
         nearest_wall = lower_wall + is_upper
         wall = np.where(is_single, nearest_wall, 0)
 
-        axes = np.arange(self.dimension)
+        axes = np.arange(dimension)
         ghost_normal = normal[:, None]
         has_one_wall = is_single[:, None]
         is_along_wall = axes != ghost_normal
@@ -196,22 +198,22 @@ class BoxTables:
         # index of the ghost that stands for a node: the next one across a wall, the
         # one beyond the other end along a periodic axis
         is_below = np.where(self._is_walled, is_low, is_high)
+        dimension = self.dimension
         beyond_last = self._last + 1
         beyond = np.where(is_below, 0, beyond_last)
-        axes = np.arange(self.dimension)
+        axes = np.arange(dimension)
         low_wall = 2 * axes
         wall_across = low_wall + is_high
 
         # whether an image crosses each axis, one array per image
         subsets = []
         choices = (False, True)
-        for crossed in itertools.product(choices, repeat=self.dimension):
+        for crossed in itertools.product(choices, repeat=dimension):
             if any(crossed):
                 subset = np.array(crossed)
                 subsets.append(subset)
         edge_count = len(node)
         image_count = len(subsets)
-        dimension = self.dimension
         image_shape = (edge_count, image_count)
         sign_shape = (image_count, LANES)
         wall_shape = (edge_count, image_count, dimension)
@@ -255,9 +257,11 @@ class BoxTables:
         ghost_count = len(ghosts.node)
         shape = (scenario_count, ghost_count, LANES)
         drive = np.zeros(shape, np.float32)
-        ghost_wall_velocity = wall_velocity[:, ghosts.wall]
+        wall = ghosts.wall
+        ghost_wall_velocity = wall_velocity[:, wall]
         velocity_gain = ghosts.drive * ghost_wall_velocity
-        drive[..., : self.dimension] = velocity_gain
+        dimension = self.dimension
+        drive[..., :dimension] = velocity_gain
         return drive
 
     def image_drag(self, wall_velocity: Singles) -> Singles:
@@ -277,9 +281,11 @@ class BoxTables:
         shape = (scenario_count, *image_shape, LANES)
         drag = np.zeros(shape, np.float32)
         zero = np.float32(0.0)
-        axes = np.arange(self.dimension)
-        twice_wall_velocity = np.float32(2.0) * wall_velocity
-        for normal in range(self.dimension):
+        two = np.float32(2.0)
+        twice_wall_velocity = two * wall_velocity
+        dimension = self.dimension
+        axes = np.arange(dimension)
+        for normal in range(dimension):
             wall = images.wall[..., normal]
             is_crossed = wall >= 0
             is_tangential = axes != normal
@@ -288,5 +294,5 @@ class BoxTables:
             is_image_across = is_crossed[..., None]
             counts = is_image_across & is_tangential
             momentum = np.where(counts, momentum, zero)
-            drag[..., : self.dimension] += momentum
+            drag[..., :dimension] += momentum
         return drag
