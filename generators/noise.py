@@ -109,10 +109,10 @@ class Jet:
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
+    x, y = position.T
     point_count = len(position)
     zero = np.zeros(point_count)
     one = np.ones(point_count)
-    x, y = position.T
     x_jet = Jet(x, one, zero, zero, zero, zero)
     y_jet = Jet(y, zero, one, zero, zero, zero)
     return x_jet, y_jet
@@ -146,8 +146,10 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     """
     node_count = len(lattice)
     last = node_count - 2
-    floor_x = np.floor(x.value)
-    floor_y = np.floor(y.value)
+    place_x = x.value
+    place_y = y.value
+    floor_x = np.floor(place_x)
+    floor_y = np.floor(place_y)
     column = floor_x.astype(np.int64)
     row = floor_y.astype(np.int64)
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
@@ -196,13 +198,14 @@ def ramp(t: Jet) -> Jet:
     """
     rising = t.polynomial(*_RAMP)
     is_rising = t.value < 1.0
+    value = np.where(is_rising, rising.value, 1.0)
 
     def kept(derivative: Array) -> Array:
         """Return a derivative where the ramp rises, and 0 beyond."""
         return np.where(is_rising, derivative, 0.0)
 
     return Jet(
-        value=np.where(is_rising, rising.value, 1.0),
+        value=value,
         x=kept(rising.x),
         y=kept(rising.y),
         xx=kept(rising.xx),
