@@ -74,32 +74,41 @@ class BoxTables:
         self.periodic = tuple(periodic)
         self.no_slip = no_slip
         # nodes along each axis, ghosts included
-        self.shape = tuple(count + 2 for count in cells)
+        shape = [count + 2 for count in cells]
+        self.shape = tuple(shape)
         self.node_count = math.prod(self.shape)
         # distance between the numbers of neighbours along each axis
         strides = []
         for axis in range(self.dimension):
-            later_axes = self.shape[axis + 1 :]
-            strides.append(math.prod(later_axes))
+            next_axis = axis + 1
+            later_axes = self.shape[next_axis:]
+            stride = math.prod(later_axes)
+            strides.append(stride)
         self.stride = tuple(strides)
         # the multi-index of each node, 0 and cells + 1 for ghosts, shape [node, axis]
         indices = np.indices(self.shape)
-        self.index = indices.reshape(self.dimension, -1).T
+        by_axis = indices.reshape(self.dimension, -1)
+        self.index = by_axis.T
         self._last = np.array(self.cells)
-        self._is_walled = ~np.array(self.periodic)
+        is_periodic = np.array(self.periodic)
+        self._is_walled = ~is_periodic
+        # whether a node lies beyond an end of each axis, shape [node, axis]
         is_below = self.index < 1
         is_above = self.index > self._last
         self._is_outside = is_below | is_above
+        self._is_ghost = self._is_outside.any(axis=1)
         # numbers of the interior nodes, shape [interior]
-        is_interior = ~self._is_outside.any(axis=1)
-        self.interior = np.flatnonzero(is_interior).astype(np.int32)
+        is_interior = ~self._is_ghost
+        interior = np.flatnonzero(is_interior)
+        self.interior = interior.astype(np.int32)
         self.ghosts = self._ghosts()
         self.images = self._images()
 
     def _number(self, index: NDArray[np.integer]) -> Integers:
         """Return the numbers of nodes with these multi-indices."""
         steps = index * self.stride
-        return np.asarray(steps.sum(axis=-1), np.int32)
+        number = steps.sum(axis=-1)
+        return np.asarray(number, np.int32)
 
     def _tangential_sign(self) -> int:
         """Return the sign with which a wall mirrors a tangential component."""
@@ -109,31 +118,39 @@ class BoxTables:
 
     def _reflection(self, axis: int) -> NDArray[np.int64]:
         """Return the signs with which a wall across an axis mirrors (v, a scalar)."""
+        tangential_sign = self._tangential_sign()
         sign = np.ones(LANES, np.int64)
-        sign[: self.dimension] = self._tangential_sign()
+        dimension = self.dimension
+        sign[:dimension] = tangential_sign
         sign[axis] = -1
         return sign
 
     def _ghosts(self) -> Ghosts:
-        is_ghost = self._is_outside.any(axis=1)
-        node = np.flatnonzero(is_ghost).astype(np.int32)
+        numbers = np.flatnonzero(self._is_ghost)
+        node = numbers.astype(np.int32)
         index = self.index[node]
         mirrored = np.clip(index, 1, self._last)
+        # the node at the same place one period on
         from_first = index - 1
-        wrapped = from_first % self._last + 1
+        wrapped_from_first = from_first % self._last
+        wrapped = wrapped_from_first + 1
         source_index = np.where(self._is_walled, mirrored, wrapped)
         source = self._number(source_index)
 
         # whether a wall lies between a ghost and its source, shape [ghost, axis]
-        is_across = self._is_outside[node] & self._is_walled
+        is_outside = self._is_outside[node]
+        is_across = is_outside & self._is_walled
         ghost_count = len(node)
         sign_shape = (ghost_count, LANES)
         sign = np.ones(sign_shape, np.float32)
-        for axis in range(self.dimension):
-            is_mirrored = is_across[:, axis, None]
+        dimension = self.dimension
+        for axis in range(dimension):
+            is_axis_across = is_across[:, axis]
+            is_mirrored = is_axis_across[:, None]
             reflection = self._reflection(axis)
             factor = np.where(is_mirrored, reflection, 1)
-            sign *= factor.astype(np.float32)
+            float_factor = factor.astype(np.float32)
+            sign *= float_factor
 
         # Only one wall moves a ghost; where two meet, none does.
         wall_count = is_across.sum(axis=1)
@@ -142,64 +159,86 @@ class BoxTables:
         ghosts = np.arange(ghost_count)
         index_along_normal = index[ghosts, normal]
         is_upper = index_along_normal > 1
-        nearest_wall = 2 * normal + is_upper
+        lower_wall = 2 * normal
+        nearest_wall = lower_wall + is_upper
         wall = np.where(is_single, nearest_wall, 0)
-        axes = np.arange(self.dimension)
-        is_along_wall = axes != normal[:, None]
-        is_tangential = is_single[:, None] & is_along_wall
+
+        axes = np.arange(dimension)
+        ghost_normal = normal[:, None]
+        has_one_wall = is_single[:, None]
+        is_along_wall = axes != ghost_normal
+        is_tangential = has_one_wall & is_along_wall
         # In the last cells before a wall that the motion runs into it is halved.
         is_first = index == 1
         is_last = index == self._last
-        is_before_wall = (is_first | is_last) & self._is_walled
+        is_end = is_first | is_last
+        is_before_wall = is_end & self._is_walled
         share = np.where(is_before_wall, 1.0, 2.0)
         drive = share * is_tangential
+        wall = wall.astype(np.int32)
+        drive = drive.astype(np.float32)
         return Ghosts(
             node=node,
             source=source,
             sign=sign,
-            wall=wall.astype(np.int32),
-            drive=drive.astype(np.float32),
+            wall=wall,
+            drive=drive,
         )
 
     def _images(self) -> Images:
         interior_index = self.index[self.interior]
-        is_low = interior_index == 1
-        is_high = interior_index == self._last
-        has_images = (is_low | is_high).any(axis=1)
+        is_first = interior_index == 1
+        is_last = interior_index == self._last
+        is_end = is_first | is_last
+        has_images = is_end.any(axis=1)
         node = self.interior[has_images]
         index = interior_index[has_images]
-        is_low = is_low[has_images]
-        is_high = is_high[has_images]
+        is_low = index == 1
+        is_high = index == self._last
         # index of the ghost that stands for a node: the next one across a wall, the
         # one beyond the other end along a periodic axis
         is_below = np.where(self._is_walled, is_low, is_high)
-        beyond = np.where(is_below, 0, self._last + 1)
-        low_wall = 2 * np.arange(self.dimension)
+        dimension = self.dimension
+        beyond_last = self._last + 1
+        beyond = np.where(is_below, 0, beyond_last)
+        axes = np.arange(dimension)
+        low_wall = 2 * axes
         wall_across = low_wall + is_high
 
+        # whether an image crosses each axis, one array per image
         subsets = []
-        for crossed in itertools.product((False, True), repeat=self.dimension):
+        choices = (False, True)
+        for crossed in itertools.product(choices, repeat=dimension):
             if any(crossed):
-                subsets.append(np.array(crossed))
+                subset = np.array(crossed)
+                subsets.append(subset)
         edge_count = len(node)
         image_count = len(subsets)
         image_shape = (edge_count, image_count)
         sign_shape = (image_count, LANES)
-        wall_shape = (edge_count, image_count, self.dimension)
+        wall_shape = (edge_count, image_count, dimension)
         ghost = np.full(image_shape, -1, np.int32)
         sign = np.ones(sign_shape, np.int64)
         wall = np.full(wall_shape, -1, np.int32)
+
         for image, subset in enumerate(subsets):
-            may_cross = is_low | is_high | ~subset
+            is_kept = ~subset
+            may_cross = is_low | is_high | is_kept
             exists = may_cross.all(axis=1)
             ghost_index = np.where(subset, beyond, index)
             number = self._number(ghost_index)
-            ghost[:, image] = np.where(exists, number, -1)
+            image_ghost = np.where(exists, number, -1)
+            ghost[:, image] = image_ghost
+
             walled_subset = subset & self._is_walled
-            crosses_wall = exists[:, None] & walled_subset
-            wall[:, image] = np.where(crosses_wall, wall_across, -1)
-            for axis in np.flatnonzero(walled_subset):
-                reflection = self._reflection(int(axis))
+            image_exists = exists[:, None]
+            crosses_wall = image_exists & walled_subset
+            image_wall = np.where(crosses_wall, wall_across, -1)
+            wall[:, image] = image_wall
+
+            walled_axes = np.flatnonzero(walled_subset)
+            for axis in walled_axes.tolist():
+                reflection = self._reflection(axis)
                 sign[image] *= reflection
         return Images(node=node, ghost=ghost, sign=sign, wall=wall)
 
@@ -214,10 +253,15 @@ class BoxTables:
             Shape [scenario, ghost, lane].
         """
         ghosts = self.ghosts
-        shape = (len(wall_velocity), len(ghosts.node), LANES)
+        scenario_count = len(wall_velocity)
+        ghost_count = len(ghosts.node)
+        shape = (scenario_count, ghost_count, LANES)
         drive = np.zeros(shape, np.float32)
-        moved = wall_velocity[:, ghosts.wall]
-        drive[..., : self.dimension] = ghosts.drive * moved
+        wall = ghosts.wall
+        ghost_wall_velocity = wall_velocity[:, wall]
+        velocity_gain = ghosts.drive * ghost_wall_velocity
+        dimension = self.dimension
+        drive[..., :dimension] = velocity_gain
         return drive
 
     def image_drag(self, wall_velocity: Singles) -> Singles:
@@ -232,17 +276,23 @@ class BoxTables:
             [length/s], shape [scenario, edge, image, lane].
         """
         images = self.images
-        shape = (len(wall_velocity), *images.ghost.shape, LANES)
+        scenario_count = len(wall_velocity)
+        image_shape = images.ghost.shape
+        shape = (scenario_count, *image_shape, LANES)
         drag = np.zeros(shape, np.float32)
-        axes = np.arange(self.dimension)
-        twice_wall_velocity = np.float32(2.0) * wall_velocity
-        for normal in range(self.dimension):
+        zero = np.float32(0.0)
+        two = np.float32(2.0)
+        twice_wall_velocity = two * wall_velocity
+        dimension = self.dimension
+        axes = np.arange(dimension)
+        for normal in range(dimension):
             wall = images.wall[..., normal]
             is_crossed = wall >= 0
             is_tangential = axes != normal
             some_wall = np.maximum(wall, 0)
             momentum = twice_wall_velocity[:, some_wall]
-            counts = is_crossed[..., None] & is_tangential
-            momentum = np.where(counts, momentum, np.float32(0.0))
-            drag[..., : self.dimension] += momentum
+            is_image_across = is_crossed[..., None]
+            counts = is_image_across & is_tangential
+            momentum = np.where(counts, momentum, zero)
+            drag[..., :dimension] += momentum
         return drag

@@ -42,9 +42,12 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
     (16.0, 16.0)
     """
     lateral = 1.0 + poisson
-    incompressibility = 1.0 - 2.0 * poisson
-    mu = young / (2.0 * lateral)
-    la = young * poisson / (lateral * incompressibility)
+    twice_poisson = 2.0 * poisson
+    incompressibility = 1.0 - twice_poisson
+    twice_lateral = 2.0 * lateral
+    divisor = lateral * incompressibility
+    mu = young / twice_lateral
+    la = young * poisson / divisor
     return mu, la
 
 
@@ -54,7 +57,8 @@ def larger(a: f32, b: f32) -> f32:
 
     This is one instruction, unlike max.
     """
-    return ti.select(a > b, a, b)
+    is_larger = a > b
+    return ti.select(is_larger, a, b)
 
 
 @ti.func
@@ -72,11 +76,15 @@ def exponential(z: f32) -> f32:
     t = z * 0.0625
     square = t * t
     # the polynomial in three groups: t^4 to t^6, t^2 and t^3, 1 and t
-    high = (1.0 / 24.0 + t * (1.0 / 120.0)) + square * (1.0 / 720.0)
-    mid = 0.5 + t * (1.0 / 6.0)
+    fifth = t * (1.0 / 120.0)
+    sixth = square * (1.0 / 720.0)
+    high = 1.0 / 24.0 + fifth + sixth
+    third = t * (1.0 / 6.0)
+    mid = 0.5 + third
     low = 1.0 + t
-    second_order = mid + square * high
-    e = low + square * second_order
+    from_fourth = square * high
+    from_second = mid + from_fourth
+    e = low + square * from_second
     for _ in ti.static(range(4)):
         e = e * e
     return e
@@ -160,14 +168,18 @@ def corotated_stress(f: mat2, mu: f32, la: f32) -> mat2:
     cosine, sine, q = rotation(f)
     h, k = shear_parts(f)
     r_square = h * h + k * k
-    jacobian = q * q - r_square
+    q_square = q * q
+    jacobian = q_square - r_square
     volume_change = jacobian - 1.0
     volumetric = la * volume_change * jacobian
 
     double_mu = 2.0 * mu
-    isotropic = q * (q - 1.0) + r_square
-    mean = double_mu * isotropic + volumetric
-    w_factor = double_mu * (2.0 * q - 1.0)
+    mean_strain = q - 1.0
+    isotropic = q * mean_strain + r_square
+    shear_mean = double_mu * isotropic
+    mean = shear_mean + volumetric
+    double_q = 2.0 * q
+    w_factor = double_mu * (double_q - 1.0)
     w_normal = cosine * h - sine * k
     w_shear = cosine * k + sine * h
     normal = w_factor * w_normal
@@ -184,9 +196,11 @@ def hardening(plastic: f32, exponent: f32, low: f32, high: f32) -> f32:
     Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
     is xi [1]. The caps lie within exp(-+EXPONENT_MAX).
     """
-    compaction = exponent * (1.0 - plastic)
-    z = bounded(compaction, -EXPONENT_MAX, EXPONENT_MAX)
-    return bounded(exponential(z), low, high)
+    compaction = 1.0 - plastic
+    z = exponent * compaction
+    z = bounded(z, -EXPONENT_MAX, EXPONENT_MAX)
+    factor = exponential(z)
+    return bounded(factor, low, high)
 
 
 @ti.func
@@ -208,8 +222,10 @@ def plastic_return(f: mat2, low: f32, high: f32) -> Value:
     trial_low = q - r
     new_high = bounded(trial_high, low, high)
     new_low = bounded(trial_low, low, high)
-    new_q = 0.5 * (new_high + new_low)
-    new_r = 0.5 * (new_high - new_low)
+    new_sum = new_high + new_low
+    new_difference = new_high - new_low
+    new_q = 0.5 * new_sum
+    new_r = 0.5 * new_difference
 
     r_ratio = 0.0
     if r > _SHEAR_EPSILON:

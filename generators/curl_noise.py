@@ -61,24 +61,37 @@ def stream_function(
 
     The velocity is u = psi.y and v = -psi.x.
     """
-    cell_count = float(len(lattice) - 1)
+    node_count = len(lattice)
+    last_node = node_count - 1
+    cell_count = float(last_node)
     width = high - low
     per_length = cell_count / width
     x, y = coordinates(position)
     minus_x = x.scale(-1.0)
     minus_y = y.scale(-1.0)
-    # distances from the walls in cells of the lattice; measured from its own wall, the
-    # ramp is exactly 0 there
-    from_left = x.shift(-low).scale(per_length)
-    from_bottom = y.shift(-low).scale(per_length)
-    from_right = minus_x.shift(high).scale(per_length)
-    from_top = minus_y.shift(high).scale(per_length)
+    # distances from the walls, in cells of the lattice at last; measured from its own
+    # wall, the ramp is exactly 0 there
+    left_distance = x.shift(-low)
+    bottom_distance = y.shift(-low)
+    right_distance = minus_x.shift(high)
+    top_distance = minus_y.shift(high)
+    from_left = left_distance.scale(per_length)
+    from_bottom = bottom_distance.scale(per_length)
+    from_right = right_distance.scale(per_length)
+    from_top = top_distance.scale(per_length)
 
     psi = noise(from_left, from_bottom, lattice)
     for distance in (from_left, from_bottom, from_right, from_top):
         half_cells = distance.scale(2.0)
-        psi = psi * ramp(half_cells)
-    return psi.scale(scale * width)
+        window = ramp(half_cells)
+        psi = psi * window
+    amplitude = scale * width
+    return psi.scale(amplitude)
+
+
+def _pairs(x: Array, y: Array) -> Array:
+    """Return vectors from their components, shape [point, 2]."""
+    return np.stack([x, y], axis=-1)
 
 
 def flow(psi: Jet) -> tuple[Array, Array]:
@@ -91,17 +104,24 @@ def flow(psi: Jet) -> tuple[Array, Array]:
     u_y = psi.yy
     v_x = -psi.xx
     v_y = -psi.xy
-    velocity = np.stack([u, v], axis=-1)
-    gradient_of_u = np.stack([u_x, u_y], axis=-1)
-    gradient_of_v = np.stack([v_x, v_y], axis=-1)
+    velocity = _pairs(u, v)
+    gradient_of_u = _pairs(u_x, u_y)
+    gradient_of_v = _pairs(v_x, v_y)
     affine = np.stack([gradient_of_u, gradient_of_v], axis=1)
     return quantise(velocity), quantise(affine)
 
 
 def _root_mean_square(values: Array) -> float:
-    flat = values.ravel().tolist()
-    square_sum = math.fsum(value * value for value in flat)
-    return math.sqrt(square_sum / len(flat))
+    square_sum = _sum_of_squares(values)
+    mean_square = square_sum / values.size
+    return math.sqrt(mean_square)
+
+
+def _sum_of_squares(values: Array) -> float:
+    """Return the sum of squares, rounded once."""
+    flat = values.ravel()
+    squares = [value * value for value in flat.tolist()]
+    return math.fsum(squares)
 
 
 def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
@@ -115,15 +135,20 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     wall = size.value("wall")
     first = wall + 1
     end = size.grid - wall
-    node = np.arange(first, end) / size.grid
+    indices = np.arange(first, end)
+    node = indices / size.grid
     node_count = len(node)
-    x, y = np.meshgrid(node, node, indexing="ij")
-    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    grid_x, grid_y = np.meshgrid(node, node, indexing="ij")
+    x = grid_x.ravel()
+    y = grid_y.ravel()
+    points = _pairs(x, y)
 
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
     grid_shape = (node_count, node_count)
-    u = psi.y.reshape(grid_shape)
-    v = -psi.x.reshape(grid_shape)
+    psi_x = psi.x.reshape(grid_shape)
+    psi_y = psi.y.reshape(grid_shape)
+    u = psi_y
+    v = -psi_x
 
     # neighbours of the inner nodes
     inner = slice(1, -1)
@@ -136,10 +161,12 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     per_difference = 0.5 * size.grid  # slope for a difference over two cells
     u_rise = u[east] - u[west]
     v_rise = v[east] - v[west]
-    divergence = u_rise + v[north] - v[south]
-    vorticity = v_rise - u[north] + u[south]
-    divergence_rms = _root_mean_square(divergence * per_difference)
-    vorticity_rms = _root_mean_square(vorticity * per_difference)
+    net_outflow = u_rise + v[north] - v[south]
+    circulation = v_rise - u[north] + u[south]
+    divergence = net_outflow * per_difference
+    vorticity = circulation * per_difference
+    divergence_rms = _root_mean_square(divergence)
+    vorticity_rms = _root_mean_square(vorticity)
     return divergence_rms, vorticity_rms
 
 
@@ -197,9 +224,9 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)
     divergence, vorticity = _grid_rates(lattice, size, scale)
-    components = velocity.ravel().tolist()
-    square_sum = math.fsum(component * component for component in components)
-    energy = 0.5 * square_sum / size.particles
+    square_sum = _sum_of_squares(velocity)
+    half_sum = 0.5 * square_sum
+    energy = half_sum / size.particles
     width = high - low
     return InitialState(
         position=position,

@@ -59,8 +59,10 @@ def lattice_counts(size: Size) -> tuple[int, int]:
     """Return the particles along each axis of the lattice that fills the channel."""
     per_length = int(size.value("lattice"))
     length, height = size.box.lengths.tolist()
-    columns = round(per_length * length)
-    rows = round(per_length * height)
+    exact_columns = per_length * length
+    exact_rows = per_length * height
+    columns = round(exact_columns)
+    rows = round(exact_rows)
     return columns, rows
 
 
@@ -71,19 +73,27 @@ def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
     every disc covers as many places of the lattice.
     """
     most_steps = int(size.value("offset_max"))
-    place_count = 2 * most_steps + 1
-    steps = choice(rng, place_count) - most_steps
-    x = float(size.value("obstacle_x"))
-    middle = float(size.box.centre[1])
+    twice_most_steps = 2 * most_steps
+    place_count = twice_most_steps + 1
+    place = choice(rng, place_count)
+    steps = place - most_steps
     offset = steps / size.value("lattice")
-    return x, middle + offset
+    _, middle = size.box.centre.tolist()
+    x = float(size.value("obstacle_x"))
+    y = middle + offset
+    return x, y
 
 
 def _square(vectors: Array) -> Array:
     """Return the squared length of vectors in the plane, shape [vector]."""
-    x = vectors[:, 0]
-    y = vectors[:, 1]
-    return np.asarray(x * x + y * y)
+    x, y = vectors.T
+    square = x * x + y * y
+    return np.asarray(square)
+
+
+def _pairs(x: Array, y: Array) -> Array:
+    """Return vectors, or rows of matrices, from their components: axis 1."""
+    return np.stack([x, y], axis=1)
 
 
 def moved_out(position: Array, centre: Array, radius: float) -> Array:
@@ -92,9 +102,11 @@ def moved_out(position: Array, centre: Array, radius: float) -> Array:
     square = _square(way)
     distance = np.sqrt(square)
     is_in = distance < radius
-    stretch = np.where(is_in, radius / distance, 1.0)
+    stretch_to_rim = radius / distance
+    stretch = np.where(is_in, stretch_to_rim, 1.0)
     stretched_way = stretch[:, None] * way
-    return quantise(centre + stretched_way)
+    moved = centre + stretched_way
+    return quantise(moved)
 
 
 def potential_flow(
@@ -120,21 +132,26 @@ def potential_flow(
     way = position - centre
     x, y = way.T
     square = _square(way)
+    fourth_power = square * square
     moment = speed * radius * radius
-    dipole = moment / (square * square)
-    difference = x * x - y * y
-    u = speed - dipole * difference
+    dipole = moment / fourth_power
+    x_square = x * x
+    y_square = y * y
+    difference = x_square - y_square
+    loss = dipole * difference
+    u = speed - loss
     v = -2.0 * dipole * x * y
-    velocity = np.stack([u, v], axis=1)
+    velocity = _pairs(u, v)
+
     # The flow is harmonic: two numbers make the gradient.
-    real_part = x * x - 3.0 * y * y  # of (x + iy)^3, over x
-    imaginary_part = 3.0 * x * x - y * y  # of (x + iy)^3, over y
+    real_part = x_square - 3.0 * y * y  # of (x + iy)^3, over x
+    imaginary_part = 3.0 * x * x - y_square  # of (x + iy)^3, over y
     double_dipole = 2.0 * dipole
     stretch = double_dipole * x * real_part / square
     shear = double_dipole * y * imaginary_part / square
-    gradient_of_u = np.stack([stretch, shear], axis=1)
-    gradient_of_v = np.stack([shear, -stretch], axis=1)
-    gradient = np.stack([gradient_of_u, gradient_of_v], axis=1)
+    gradient_of_u = _pairs(stretch, shear)
+    gradient_of_v = _pairs(shear, -stretch)
+    gradient = _pairs(gradient_of_u, gradient_of_v)
     return velocity, gradient
 
 
@@ -156,25 +173,29 @@ def eddy(
         radius: R [length].
         speed: U', positive for a turn against the clock [length/s].
     """
-    way = (position - centre) / radius
+    from_centre = position - centre
+    way = from_centre / radius
     square = _square(way)
     is_inside_eddy = square < 1.0
-    rest = np.where(is_inside_eddy, 1.0 - square, 0.0)
+    rest = 1.0 - square
+    rest = np.where(is_inside_eddy, rest, 0.0)
     rate = 3.5 * speed * rest * rest
     x, y = way.T
     u = -rate * y
     v = rate * x
-    velocity = np.stack([u, v], axis=1)
+    velocity = _pairs(u, v)
+
     # derivative of the rate with respect to the square, times 2
     slope = -14.0 * speed * rest
     u_x = -slope * x * y
     u_y = -slope * y * y - rate
     v_x = slope * x * x + rate
     v_y = slope * x * y
-    gradient_of_u = np.stack([u_x, u_y], axis=1)
-    gradient_of_v = np.stack([v_x, v_y], axis=1)
-    gradient = np.stack([gradient_of_u, gradient_of_v], axis=1)
-    return velocity, gradient / radius
+    gradient_of_u = _pairs(u_x, u_y)
+    gradient_of_v = _pairs(v_x, v_y)
+    gradient = _pairs(gradient_of_u, gradient_of_v)
+    gradient = gradient / radius
+    return velocity, gradient
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
@@ -194,13 +215,16 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         jitter=size.value("jitter"),
     )
     indices = np.indices(counts)
-    cell = indices.reshape(2, -1).T
+    indices_by_axis = indices.reshape(2, -1)
+    cell = indices_by_axis.T
     middle = cell + 0.5
     from_corner = middle / size.value("lattice")
-    places = quantise(np.array(box.low) + from_corner)
+    corner = np.array(box.low)
+    places = quantise(corner + from_corner)
+    place_count = len(places)
     is_solid = is_inside(places, (x, y), radius)
     solid_count = int(is_solid.sum())
-    _check_counts(size, solid_count, len(places))
+    _check_counts(size, solid_count, place_count)
     obstacle = Obstacle(
         centre=(x, y),
         radius=radius,
@@ -212,14 +236,19 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     # compresses the fluid.
     diameters_behind = uniform(rng, 2.0, 2.5)
     diameters_above = uniform(rng, -0.5, 0.5)
-    way = np.array([diameters_behind, diameters_above])
-    eddy_radius = uniform(rng, 0.75, 1.0) * diameter
-    eddy_speed = uniform(rng, 0.5, 1.0) * speed
+    diameters = np.array([diameters_behind, diameters_above])
+    way = diameter * diameters
+    eddy_centre = centre + way
+    radius_share = uniform(rng, 0.75, 1.0)
+    speed_share = uniform(rng, 0.5, 1.0)
+    eddy_radius = radius_share * diameter
+    eddy_speed = speed_share * speed
     if choice(rng, 2):
         eddy_speed = -eddy_speed
+
     is_fluid = ~is_solid
-    fluid = moved_out(position[is_fluid], centre, radius)
-    eddy_centre = centre + diameter * way
+    fluid = position[is_fluid]
+    fluid = moved_out(fluid, centre, radius)
     velocity, affine = eddy(fluid, eddy_centre, radius=eddy_radius, speed=eddy_speed)
     past, past_affine = potential_flow(fluid, centre, radius=radius, speed=speed)
     velocity += past
@@ -228,12 +257,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     least_reynolds, most_reynolds = interval(size, "reynolds")
     reynolds = log_uniform(rng, least_reynolds, most_reynolds)
     viscosity = speed * diameter / reynolds
+    area = box.volume * size.particles / place_count
     return InitialState(
         position=fluid,
         velocity=quantise(velocity),
         affine=quantise(affine),
         material=liquid(size.particles),
-        area=box.volume * size.particles / len(places),
+        area=area,
         viscosity=viscosity,
         obstacle=obstacle,
         stream=np.array([speed, 0.0]),

@@ -70,8 +70,10 @@ def entropy(
             words.append(word)
         return (*words, scenario)
     name = f"{split}/{size}"
-    digest = hashlib.sha256(name.encode()).digest()
-    word = int.from_bytes(digest[:8], "big")
+    name_hash = hashlib.sha256(name.encode())
+    digest = name_hash.digest()
+    eight_bytes = digest[:8]
+    word = int.from_bytes(eight_bytes, "big")
     return word, major, scenario
 
 
@@ -116,7 +118,9 @@ def quantise(values: ArrayLike) -> Array:
             got=float(np.max(magnitude)),
             fix="check the ranges and scales in the file of the split",
         )
-    rounded = np.rint(exact / QUANTUM) * QUANTUM
+    quanta = exact / QUANTUM
+    whole_quanta = np.rint(quanta)
+    rounded = whole_quanta * QUANTUM
     # rint keeps the sign of -0.0, the addition of zero does not
     return np.asarray(rounded + 0.0, dtype=np.float64)
 
@@ -163,12 +167,14 @@ def log_uniform(rng: RandomSource, low: float, high: float) -> float:
             got=(low, high),
             fix="check the ranges in the file of the split",
         )
-    ratio = _PRECISE.divide(Decimal(high), Decimal(low))
+    exact_low = Decimal(low)
+    exact_high = Decimal(high)
+    ratio = _PRECISE.divide(exact_high, exact_low)
     span = _PRECISE.ln(ratio)
     share = Decimal(_draw_unit(rng))
     exponent = _PRECISE.multiply(span, share)
     growth = _PRECISE.exp(exponent)
-    value = _PRECISE.multiply(Decimal(low), growth)
+    value = _PRECISE.multiply(exact_low, growth)
     return float(value)
 
 
@@ -180,7 +186,8 @@ def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> Array
     """
     total = np.full(shape, -6.0)
     for _ in range(12):
-        total = total + rng.random(shape)
+        unit = rng.random(shape)
+        total = total + unit
     return deviation * total
 
 
@@ -248,7 +255,8 @@ def draw_program(
     start = 0
     start_value = uniform(rng, -amplitude, amplitude)
     while start < frame_count:
-        end = start + draw_integer(rng, *knot_gap)
+        gap = draw_integer(rng, *knot_gap)
+        end = start + gap
         end_value = uniform(rng, 0.0, amplitude)
         if start_value > 0.0:
             end_value = -end_value
@@ -257,7 +265,8 @@ def draw_program(
         s = frames / (end - start)
         rise = s * s * (3.0 - 2.0 * s)
         difference = end_value - start_value
-        values[start:end] = start_value + difference * rise
+        gain = difference * rise
+        values[start:end] = start_value + gain
         start = end
         start_value = end_value
     return quantise(values)
@@ -324,17 +333,22 @@ def _fill_columns(
     column_sizes = np.diff(ends)
     column_count = len(column_sizes)
     # column and row of each particle's cell, shape [particle]
-    column = np.repeat(np.arange(column_count), column_sizes)
-    column_start = np.repeat(ends[:-1], column_sizes)
-    row = np.arange(len(column)) - column_start
+    columns = np.arange(column_count)
+    starts = ends[:-1]
+    column = np.repeat(columns, column_sizes)
+    column_start = np.repeat(starts, column_sizes)
+    particle_count = len(column)
+    particles = np.arange(particle_count)
+    row = particles - column_start
     cell = np.stack([column, row], axis=-1)
     # cells across the square each way, shape [particle, 2]
-    columns_across = np.full(len(column), column_count)
+    columns_across = np.full(particle_count, column_count)
     rows_across = np.repeat(column_sizes, column_sizes)
     cell_counts = np.stack([columns_across, rows_across], axis=-1)
 
     unit = rng.random(cell.shape)
-    displacement = (unit - 0.5) * jitter
+    centred = unit - 0.5
+    displacement = centred * jitter
     middle = cell + 0.5
     place = middle + displacement  # [cells]
     side = high - low

@@ -33,6 +33,10 @@ Array = NDArray[np.float64]
 _LARGEST = 1e30  # extremes beyond this stand for what is not a number
 
 
+def _exact(values: Singles) -> Array:
+    return values.astype(np.float64)
+
+
 def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     """Return the acoustic Courant number c dt / dx of each material at rest [1].
 
@@ -43,8 +47,10 @@ def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     for material, sound_speed in sound_speeds(p).items():
         fastest = sound_speed
         if material is Material.SNOW:
-            fastest = sound_speed * math.sqrt(p.snow_hardening_max)
-        numbers[material] = fastest * p.dt * p.grid
+            stiffening = math.sqrt(p.snow_hardening_max)
+            fastest = sound_speed * stiffening
+        way = fastest * p.dt
+        numbers[material] = way * p.grid
     return numbers
 
 
@@ -103,20 +109,26 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             )
 
     def _start(self, states: Sequence[InitialState]) -> None:
-        shape = (self.scenarios, self.parameters.particles)
         kernels = self._kernels
+        scenarios = self.scenarios
+        particles = self.parameters.particles
         # Material of each particle, shape [scenario, particle]
-        self._material = stack(states, "material").astype(np.int32)
+        material = stack(states, "material")
+        self._material = material.astype(np.int32)
         kernels.sort_by_material(self._material)
-        matter_shape = (*shape, 4)
+
+        matter_shape = (scenarios, particles, 4)
         matter = np.ones(matter_shape, np.float32)
-        matter[:, :, 0] = self._material
+        matter[..., 0] = self._material
         kernels.matter.from_numpy(matter)
-        identity = np.eye(self.dimension, dtype=np.float32)
-        gradient_shape = (*shape, *identity.shape)
+
+        dimension = self.dimension
+        identity = np.eye(dimension, dtype=np.float32)
+        gradient_shape = (scenarios, particles, dimension, dimension)
         gradients = np.empty(gradient_shape, np.float32)
         gradients[...] = identity
         self._set_deformation(gradients)
+
         frictions = [state.friction for state in states]
         friction = np.array(frictions, np.float32)
         kernels.friction.from_numpy(friction)
@@ -128,19 +140,25 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         """
         extremes = self._read(self._kernels.extremes)
         # largest abs(v) + abs(A o) of each scenario
-        self._reach = extremes[:, :, 3].max(axis=1)
+        reach = extremes[..., 3]
+        self._reach = reach.max(axis=1)
         # The kernels keep a huge number where they saw something that is none.
-        is_number = np.abs(extremes) < _LARGEST
+        magnitude = np.abs(extremes)
+        is_number = magnitude < _LARGEST
         extremes = np.where(is_number, extremes, np.nan)
         healths = []
         for extreme in extremes:
             speed, jacobian_min, jacobian_max, _ = extreme.T
             is_finite = np.isfinite(extreme)
+            all_finite = is_finite.all()
+            fastest = speed.max()
+            least_jacobian = jacobian_min.min()
+            greatest_jacobian = jacobian_max.max()
             health = Health(
-                finite=bool(is_finite.all()),
-                max_speed=float(speed.max()),
-                jacobian_min=float(jacobian_min.min()),
-                jacobian_max=float(jacobian_max.max()),
+                finite=bool(all_finite),
+                max_speed=float(fastest),
+                jacobian_min=float(least_jacobian),
+                jacobian_max=float(greatest_jacobian),
             )
             healths.append(health)
         return healths
@@ -159,7 +177,8 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         columns = []
         for field in self._kernels.slopes:
             slope = field.to_numpy()
-            columns.append(slope[..., : self.dimension])
+            column = slope[..., : self.dimension]
+            columns.append(column)
         return np.stack(columns, axis=-1)
 
     def volume_ratio(self) -> Singles:
@@ -176,60 +195,83 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
         since the start [1], each of shape [scenario, particle].
         """
         matter = self._read(self._kernels.matter)
-        return matter[..., 2], matter[..., 3]
+        least = matter[..., 2]
+        greatest = matter[..., 3]
+        return least, greatest
 
     def jacobian(self) -> Singles:
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario,
         particle].
         """
-        determinant = np.linalg.det(self.deformation())
+        deformation = self.deformation()
+        determinant = np.linalg.det(deformation)
+        ratio = self.volume_ratio()
         is_liquid = self._material == Material.LIQUID
-        return np.where(is_liquid, self.volume_ratio(), determinant)
+        return np.where(is_liquid, ratio, determinant)
 
     def energy(self) -> Energy:
         """Return the energy of each scenario, in float64 from the particles."""
         p = self.parameters
         mass = p.density * self._volume  # of a particle, shape [scenario]
         weight = p.gravity * mass
-        position = self.position().astype(np.float64)
-        velocity = self.velocity().astype(np.float64)
-        affine = self.affine().astype(np.float64)
-        height = position[..., 1] - self._kernels.position_min
-        velocity_square = np.square(velocity).sum(axis=-1)
-        affine_square = np.square(affine).sum(axis=(-2, -1))
-        spin = affine_square / (4.0 * p.grid**2)
+        position = _exact(self.position())
+        velocity = _exact(self.velocity())
+        affine = _exact(self.affine())
+
+        # abs(v)^2 + dx^2/4 abs(C)^2 of each particle, shape [scenario, particle]
+        velocity_squares = np.square(velocity)
+        affine_squares = np.square(affine)
+        velocity_square = velocity_squares.sum(axis=-1)
+        affine_square = affine_squares.sum(axis=(-2, -1))
+        divisor = 4.0 * p.grid**2
+        spin = affine_square / divisor
         motion = velocity_square + spin
-        elastic_density = self._elastic_density()
         motion_sum = motion.sum(axis=-1)
+        half_mass = 0.5 * mass
+        kinetic = half_mass * motion_sum
+
+        y = position[..., 1]
+        floor = self._kernels.position_min
+        height = y - floor
         height_sum = height.sum(axis=-1)
+        gravitational = weight * height_sum
+
+        elastic_density = self._elastic_density()
         elastic_sum = elastic_density.sum(axis=-1)
+        elastic = self._volume * elastic_sum
         return Energy(
-            kinetic=0.5 * mass * motion_sum,
-            gravitational=weight * height_sum,
-            elastic=self._volume * elastic_sum,
+            kinetic=kinetic,
+            gravitational=gravitational,
+            elastic=elastic,
         )
 
     def _elastic_density(self) -> Array:
         """Return psi of each particle [mass/s^2], shape [scenario, particle]."""
         p = self.parameters
         kernels = self._kernels
-        f = self.deformation().astype(np.float64)
-        ratio = self.volume_ratio().astype(np.float64)
+        f = _exact(self.deformation())
+        ratio = _exact(self.volume_ratio())
         # abs(F - R)^2 is the sum of (stretch - 1)^2; where F inverts, the least stretch
         # is negative.
         stretches = np.linalg.svd(f, compute_uv=False)
         jacobian = np.linalg.det(f)
-        stretches[..., -1] *= np.sign(jacobian)
+        sign = np.sign(jacobian)
+        stretches[..., -1] *= sign
         strains = stretches - 1.0
-        shear = np.square(strains).sum(axis=-1)
+        strain_squares = np.square(strains)
+        shear = strain_squares.sum(axis=-1)
         volume_change = jacobian - 1.0
         bulk = 0.5 * volume_change**2
+
         compaction = 1.0 - ratio
         exponent = p.snow_hardening * compaction
         hardening = np.exp(exponent)
-        hardening = np.clip(hardening, p.snow_hardening_min, p.snow_hardening_max)
+        least_hardening = p.snow_hardening_min
+        greatest_hardening = p.snow_hardening_max
+        hardening = np.clip(hardening, least_hardening, greatest_hardening)
 
-        compression = ratio - 1.0 - np.log(ratio)
+        logarithm = np.log(ratio)
+        compression = ratio - 1.0 - logarithm
         density = p.liquid_modulus * compression
         moduli = {
             Material.JELLY: kernels.jelly,
@@ -237,7 +279,9 @@ class FreeSurfaceDriver(Driver[FreeSurfaceParameters]):
             Material.SNOW: kernels.snow,
         }
         for material, (mu, la) in moduli.items():
-            psi = mu * shear + la * bulk
+            shear_energy = mu * shear
+            bulk_energy = la * bulk
+            psi = shear_energy + bulk_energy
             if material is Material.SNOW:
                 psi = psi * hardening
             is_material = self._material == material
@@ -259,7 +303,8 @@ class FreeSurface(FreeSurfaceDriver):
         """Deformation gradients F, elastic in snow, I in liquid [1], shape [scenario,
         particle, 2, 2].
         """
-        return np.asarray(self._kernels.deformation.to_numpy())
+        gradients = self._kernels.deformation.to_numpy()
+        return np.asarray(gradients)
 
     def _set_deformation(self, gradients: Singles) -> None:
         self._kernels.deformation.from_numpy(gradients)

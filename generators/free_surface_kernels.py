@@ -58,8 +58,10 @@ class FreeSurfaceKernels:
         self.low = p.wall
         self.high = p.grid - p.wall
         # smallest and largest coordinate of a particle
-        self.position_min = (self.low + _INSET) * self.dx
-        self.position_max = (self.high - _INSET) * self.dx
+        lowest_place = self.low + _INSET  # [cells]
+        highest_place = self.high - _INSET
+        self.position_min = lowest_place * self.dx
+        self.position_max = highest_place * self.dx
         self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
         # of abs(v) + abs(A o), what sums have room for
         self.reach_bound = self.reach * self.speed_bound
@@ -68,7 +70,9 @@ class FreeSurfaceKernels:
         self.count_scale = fixed_point_scale(p.particles, jacobian_bound)
         self.velocity_unit = 1.0 / self.velocity_scale
         self.count_unit = 1.0 / self.count_scale
-        self.stress_factor = 4.0 * p.dt * p.grid / p.density  # 4 dt / (rho dx)
+        four_dt = 4.0 * p.dt
+        four_dt_per_cell = four_dt * p.grid  # 4 dt / dx
+        self.stress_factor = four_dt_per_cell / p.density  # 4 dt / (rho dx)
         self.gravity_gain = p.gravity * p.dt  # dt g
         self.liquid_viscosity = p.density * p.liquid_viscosity
         self.solid_viscosity = p.density * p.elastic_damping
@@ -104,7 +108,8 @@ class FreeSurfaceKernels:
         particle_shape = (self.scenarios, self.particles)
         node_shape = (self.scenarios, self.node_count)
         # Two more: a node counts the rows of the two nodes before it as well.
-        row_shape = (self.scenarios, self.node_count + 2)
+        row_count = self.node_count + 2
+        row_shape = (self.scenarios, row_count)
         particle_fields = (
             self.x,
             self.particle_state,
@@ -128,7 +133,9 @@ class FreeSurfaceKernels:
         Args:
             material: Material of each particle, shape [scenario, particle].
         """
-        self.solid = bool((material != LIQUID).any())
+        is_solid = material != LIQUID
+        any_solid = is_solid.any()
+        self.solid = bool(any_solid)
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that
@@ -168,25 +175,37 @@ class FreeSurfaceKernels:
         for p in range(particles):
             x = self.x[0, p]
             for axis in ti.static(range(self.dimension)):
-                scaled = x[axis] * self.inv_dx
-                base = ti.cast(scaled - 0.5, i32)
+                coordinate = x[axis]
+                scaled = coordinate * self.inv_dx
+                shifted_place = scaled - 0.5
+                base = ti.cast(shifted_place, i32)
                 particle_end = base + 3
-                first[axis] = ti.min(first[axis], base)
-                end[axis] = ti.max(end[axis], particle_end)
+                old_first = first[axis]
+                old_end = end[axis]
+                first[axis] = ti.min(old_first, base)
+                end[axis] = ti.max(old_end, particle_end)
+
+        low_image = self.low - 1
+        next_to_low = self.low + 1
+        high_end = self.high + 2
         for axis in ti.static(range(self.dimension)):
-            if first[axis] <= self.low + 1:
-                first[axis] = self.low - 1
-            if end[axis] >= self.high:
-                end[axis] = self.high + 2
+            axis_first = first[axis]
+            axis_end = end[axis]
+            if axis_first <= next_to_low:
+                first[axis] = low_image
+            if axis_end >= self.high:
+                end[axis] = high_end
         return first, end
 
     @ti.func
     def image(self, index: i32) -> i32:
         """Return the mirror image of a node within a cell of a wall, else -1."""
         mirrored = -1
-        if index <= self.low + 1:
+        next_to_low = self.low + 1
+        next_to_high = self.high - 1
+        if index <= next_to_low:
             mirrored = 2 * self.low - index
-        if index >= self.high - 1:
+        if index >= next_to_high:
             mirrored = 2 * self.high - index
         return mirrored
 
@@ -203,11 +222,18 @@ class FreeSurfaceKernels:
         It follows the flow, and is drawn towards J and the density of the grid.
         """
         density = larger(grid_density, 1.0)
-        jacobian = old_jacobian + self.dt * divergence * old_jacobian
+        volume = 1.0 / density
+        expansion = self.dt * divergence
+        growth = expansion * old_jacobian
+        jacobian = old_jacobian + growth
+
         lag = grid_jacobian - old_jacobian
-        jacobian += self.parameters.jacobian_relaxation * lag
-        compression = 1.0 / density - jacobian
-        jacobian += self.parameters.density_coupling * compression
+        relaxation = self.parameters.jacobian_relaxation * lag
+        jacobian += relaxation
+
+        compression = volume - jacobian
+        coupling = self.parameters.density_coupling * compression
+        jacobian += coupling
         jacobian_min = self.parameters.jacobian_min
         jacobian_max = self.parameters.jacobian_max
         return bounded(jacobian, jacobian_min, jacobian_max)
@@ -223,7 +249,8 @@ class FreeSurfaceKernels:
 @ti.func
 def finite(value: f32) -> f32:
     """Return a positive value, or :data:`_HUGE` if it is not a finite number."""
-    return ti.select(value < _HUGE, value, _HUGE)
+    is_number = value < _HUGE
+    return ti.select(is_number, value, _HUGE)
 
 
 @ti.func
@@ -232,4 +259,6 @@ def largest_of(a: f32, b: f32) -> f32:
 
     It is :data:`_HUGE` if either is not a number.
     """
-    return larger(finite(a), finite(b))
+    finite_a = finite(a)
+    finite_b = finite(b)
+    return larger(finite_a, finite_b)

@@ -117,7 +117,10 @@ def _draw_shape(
         length = draw_between(rng, size, "rope_length")
         return kinds.rope(rng, size, length)
     measure = draw_between(rng, size, kinds.measure)
-    if material is Material.JELLY or choice(rng, 2) == 1:
+    if material is Material.JELLY:
+        return kinds.ball(measure)
+    is_ball = choice(rng, 2) == 1
+    if is_ball:
         return kinds.ball(measure)
     return kinds.block(rng, size, measure)
 
@@ -131,7 +134,10 @@ def _probe_nodes(shape: Shape, cell_count: int) -> Array:
     unit_axis = from_middle / cell_count  # from -1 to 1
     axes = [unit_axis * reach for reach in shape.reach]
     coordinates = np.meshgrid(*axes)
-    columns = [along.ravel() for along in coordinates]
+    columns = []
+    for along in coordinates:
+        column = along.ravel()
+        columns.append(column)
     return np.stack(columns, axis=-1)
 
 
@@ -155,10 +161,12 @@ def _keeps_gap(
 
 def _are_apart(bodies: Sequence[Body], offsets: Sequence[Array], gap: float) -> bool:
     """Tell whether all bodies keep a gap [length] from one another."""
-    for i, j in combinations(range(len(bodies)), 2):
+    numbers = range(len(bodies))
+    for i, j in combinations(numbers, 2):
         first = bodies[i]
         second = bodies[j]
-        if not _keeps_gap(first, second, offsets[j], gap):
+        second_offsets = offsets[j]
+        if not _keeps_gap(first, second, second_offsets, gap):
             return False
     return True
 
@@ -171,11 +179,16 @@ def _place_apart(rng: RandomSource, size: Size, shapes: Sequence[Shape]) -> list
     """
     low, high = free_surface_walls(size)
     margin = size.value("margin")
-    inner = (low + margin, high - margin)
+    inner_low = low + margin
+    inner_high = high - margin
+    inner = (inner_low, inner_high)
     region = size.dimension * [inner]
     gap = float(size.value("gap"))
     cell_count = int(size.value("gap_cells"))
-    offsets = [_probe_nodes(shape, cell_count) for shape in shapes]
+    offsets = []
+    for shape in shapes:
+        shape_offsets = _probe_nodes(shape, cell_count)
+        offsets.append(shape_offsets)
 
     for _ in range(_ATTEMPTS):
         bodies = [place(rng, shape, region) for shape in shapes]
@@ -202,13 +215,16 @@ def _body_parameters(
     measure_name = "volume"
     if len(velocity) == 2:
         measure_name = "area"
+    shape_class = type(body.shape)
+    shape_name = shape_class.__name__.lower()
     parameters: dict[str, int | float | str] = {
-        f"{name}_shape": type(body.shape).__name__.lower(),
+        f"{name}_shape": shape_name,
         f"{name}_{measure_name}": measure,
     }
     vectors = {"centre": body.centre, "velocity": velocity}
     for quantity, vector in vectors.items():
-        for axis, component in zip("xyz", vector.tolist(), strict=False):
+        components = vector.tolist()
+        for axis, component in zip("xyz", components, strict=False):
             parameters[f"{name}_{quantity}_{axis}"] = component
     return parameters
 
@@ -219,9 +235,11 @@ def _share_particles(particle_count: int, measures: Sequence[float]) -> list[int
     counts = []
     for body_area in measures[:-1]:
         share = particle_count * body_area / area
-        count = math.floor(share + 0.5)
+        raised_share = share + 0.5
+        count = math.floor(raised_share)
         counts.append(count)
-    last_count = particle_count - sum(counts)
+    count_so_far = sum(counts)
+    last_count = particle_count - count_so_far
     counts.append(last_count)
     return counts
 
@@ -230,8 +248,10 @@ def _materials(size: Size, scenario: int) -> tuple[Material, ...]:
     """Return the materials of the bodies of a scenario."""
     number = shift_number(size, scenario)
     if number is None:
-        return PAIRS[scenario % len(PAIRS)]
-    return TRIPLES[number % len(TRIPLES)]
+        pair = scenario % len(PAIRS)
+        return PAIRS[pair]
+    triple = number % len(TRIPLES)
+    return TRIPLES[triple]
 
 
 def _draw_attractor(rng: RandomSource, size: Size) -> Array:
@@ -263,7 +283,10 @@ def draw_bodies(
         WorkFailedError: the bodies find no places apart from one another.
     """
     materials = _materials(size, scenario)
-    shapes = [_draw_shape(rng, material, size, kinds) for material in materials]
+    shapes = []
+    for material in materials:
+        shape = _draw_shape(rng, material, size, kinds)
+        shapes.append(shape)
     bodies = _place_apart(rng, size, shapes)
     measures = [shape.measure for shape in shapes]
     counts = _share_particles(size.particles, measures)
@@ -274,7 +297,8 @@ def draw_bodies(
     velocities = []
     for body in bodies:
         way = point - body.centre
-        velocity = quantise(rate * way)
+        exact_velocity = rate * way
+        velocity = quantise(exact_velocity)
         velocities.append(velocity)
 
     friction = 0.0

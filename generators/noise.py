@@ -23,6 +23,10 @@ __all__ = ["Jet", "coordinates", "gradients", "noise", "ramp"]
 
 Array = NDArray[np.float64]
 
+# coefficients of 1, t, t^2 and so on
+_FADE = (0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
+_RAMP = (0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
+
 
 @dataclass(frozen=True)
 class Jet:
@@ -48,7 +52,8 @@ class Jet:
 
     def __sub__(self, other: Jet) -> Jet:
         """Subtract term by term."""
-        return self + other.scale(-1.0)
+        opposite = other.scale(-1.0)
+        return self + opposite
 
     def __mul__(self, other: Jet) -> Jet:
         """Multiply by the product rule."""
@@ -58,19 +63,24 @@ class Jet:
         f_y = self.y
         g_x = other.x
         g_y = other.y
-        crossed_xx = 2.0 * (f_x * g_x)
-        crossed_yy = 2.0 * (f_y * g_y)
-        xx = self.xx * g + crossed_xx + f * other.xx
-        xy = self.xy * g + f_x * g_y + f_y * g_x + f * other.xy
-        yy = self.yy * g + crossed_yy + f * other.yy
-        return Jet(
-            value=f * g,
-            x=f_x * g + f * g_x,
-            y=f_y * g + f * g_y,
-            xx=xx,
-            xy=xy,
-            yy=yy,
-        )
+        f_xx = self.xx
+        f_xy = self.xy
+        f_yy = self.yy
+        g_xx = other.xx
+        g_xy = other.xy
+        g_yy = other.yy
+
+        value = f * g
+        x = f_x * g + f * g_x
+        y = f_y * g + f * g_y
+        product_x = f_x * g_x
+        product_y = f_y * g_y
+        crossed_xx = 2.0 * product_x
+        crossed_yy = 2.0 * product_y
+        xx = f_xx * g + crossed_xx + f * g_xx
+        xy = f_xy * g + f_x * g_y + f_y * g_x + f * g_xy
+        yy = f_yy * g + crossed_yy + f * g_yy
+        return Jet(value, x, y, xx, xy, yy)
 
     def scale(self, factor: Array | float) -> Jet:
         """Multiply by numbers that do not depend on the point's coordinates."""
@@ -99,10 +109,10 @@ class Jet:
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
+    x, y = position.T
     point_count = len(position)
     zero = np.zeros(point_count)
     one = np.ones(point_count)
-    x, y = position.T
     x_jet = Jet(x, one, zero, zero, zero, zero)
     y_jet = Jet(y, zero, one, zero, zero, zero)
     return x_jet, y_jet
@@ -112,15 +122,20 @@ def gradients(rng: RandomSource, frequency: int) -> Array:
     """Draw the unit gradients of a lattice, shape [frequency + 1, frequency + 1, 2]."""
     side = frequency + 1
     node_count = side * side
-    vectors = [direction(rng) for _ in range(node_count)]
-    return np.array(vectors).reshape(side, side, 2)
+    vectors = []
+    for _ in range(node_count):
+        vector = direction(rng)
+        vectors.append(vector)
+    lattice = np.array(vectors)
+    shape = (side, side, 2)
+    return lattice.reshape(shape)
 
 
 def fade(t: Jet) -> Jet:
     """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3; slope and curvature vanish at 0 and
     1.
     """
-    return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
+    return t.polynomial(*_FADE)
 
 
 def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
@@ -129,9 +144,14 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     Eqs. 5.40 and 5.41 of the thesis. It is 0 at every node and its slope there is the
     node's gradient. The lattice has the shape [node, node, 2].
     """
-    last = len(lattice) - 2
-    column = np.floor(x.value).astype(np.int64)
-    row = np.floor(y.value).astype(np.int64)
+    node_count = len(lattice)
+    last = node_count - 2
+    place_x = x.value
+    place_y = y.value
+    floor_x = np.floor(place_x)
+    floor_y = np.floor(place_y)
+    column = floor_x.astype(np.int64)
+    row = floor_y.astype(np.int64)
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
     i = np.minimum(column, last)
     j = np.minimum(row, last)
@@ -143,10 +163,14 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
 
     def corner(k: int, m: int) -> Jet:
         """Return the ramp along the gradient of one corner of the cell."""
-        gradient = lattice[i + k, j + m]
+        node_i = i + k
+        node_j = j + m
+        gradient = lattice[node_i, node_j]
         slope_x, slope_y = gradient.T
-        from_corner_x = p.shift(-float(k))
-        from_corner_y = q.shift(-float(m))
+        corner_p = float(k)
+        corner_q = float(m)
+        from_corner_x = p.shift(-corner_p)
+        from_corner_y = q.shift(-corner_q)
         ramp_x = from_corner_x.scale(slope_x)
         ramp_y = from_corner_y.scale(slope_y)
         return ramp_x + ramp_y
@@ -159,23 +183,32 @@ def noise(x: Jet, y: Jet, lattice: Array) -> Jet:
     high_right = corner(1, 1)
     low_rise = low_right - low_left
     high_rise = high_right - high_left
-    low = low_left + u * low_rise
-    high = high_left + u * high_rise
+    low_gain = u * low_rise
+    high_gain = u * high_rise
+    low = low_left + low_gain
+    high = high_left + high_gain
     rise = high - low
-    return low + w * rise
+    gain = w * rise
+    return low + gain
 
 
 def ramp(t: Jet) -> Jet:
     """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two
     derivatives, then 1.
     """
-    rising = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
-    below = t.value < 1.0
+    rising = t.polynomial(*_RAMP)
+    is_rising = t.value < 1.0
+    value = np.where(is_rising, rising.value, 1.0)
+
+    def kept(derivative: Array) -> Array:
+        """Return a derivative where the ramp rises, and 0 beyond."""
+        return np.where(is_rising, derivative, 0.0)
+
     return Jet(
-        np.where(below, rising.value, 1.0),
-        np.where(below, rising.x, 0.0),
-        np.where(below, rising.y, 0.0),
-        np.where(below, rising.xx, 0.0),
-        np.where(below, rising.xy, 0.0),
-        np.where(below, rising.yy, 0.0),
+        value=value,
+        x=kept(rising.x),
+        y=kept(rising.y),
+        xx=kept(rising.xx),
+        xy=kept(rising.xy),
+        yy=kept(rising.yy),
     )

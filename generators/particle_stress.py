@@ -71,7 +71,10 @@ class ParticleStress(FreeSurfaceKernels):
         # of each particle: the deformation gradient of a solid [1]
         self.deformation = mat2.field()
         # rows of its stencil
-        self.weight_rows = [vec4.field() for _ in range(3)]
+        self.first_row = vec4.field()
+        self.second_row = vec4.field()
+        self.third_row = vec4.field()
+        self.weight_rows = [self.first_row, self.second_row, self.third_row]
         # first column of A, scaled, and two zeros
         self.momentum_slope_x = vec4.field()
         # second column
@@ -100,11 +103,16 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def stress(self, s: i32, p: i32, c: mat2, solid: Template) -> mat2:
         """Return the Kirchhoff stress tau of a particle."""
-        kind = self.matter[s, p][0]
-        ratio = self.matter[s, p][1]
+        matter = self.matter[s, p]
+        kind = matter[0]
+        ratio = matter[1]
+
+        # as if it were liquid
         modulus = self.parameters.liquid_modulus
         isotropic = liquid_stress(ratio, modulus)
-        tau = mat2([isotropic, 0.0], [0.0, isotropic])
+        first_row = vec2(isotropic, 0.0)
+        second_row = vec2(0.0, isotropic)
+        tau = mat2(first_row, second_row)
         viscosity = self.liquid_viscosity
         if ti.static(solid):
             mu, la = self.jelly
@@ -112,12 +120,10 @@ class ParticleStress(FreeSurfaceKernels):
             if kind == ROPE:
                 mu, la = self.rope
             if kind == SNOW:
-                factor = hardening(
-                    ratio,
-                    self.parameters.snow_hardening,
-                    self.parameters.snow_hardening_min,
-                    self.parameters.snow_hardening_max,
-                )
+                exponent = self.parameters.snow_hardening
+                least_factor = self.parameters.snow_hardening_min
+                greatest_factor = self.parameters.snow_hardening_max
+                factor = hardening(ratio, exponent, least_factor, greatest_factor)
                 snow_mu, snow_la = self.snow
                 mu = snow_mu * factor
                 la = snow_la * factor
@@ -127,15 +133,20 @@ class ParticleStress(FreeSurfaceKernels):
             is_liquid = kind == LIQUID
             tau = ti.select(is_liquid, tau, elastic)
             viscosity = ti.select(is_liquid, viscosity, damping)
-        return tau + viscous_stress(c, viscosity)
+        viscous = viscous_stress(c, viscosity)
+        return tau + viscous
 
     @ti.func
     def velocity_gradient(self, s: i32, p: i32) -> mat2:
         """Return C of a particle."""
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
-        gradient_of_u = vec2(slope_x.x, slope_y.x)
-        gradient_of_v = vec2(slope_x.y, slope_y.y)
+        u_x = slope_x.x
+        u_y = slope_y.x
+        v_x = slope_x.y
+        v_y = slope_y.y
+        gradient_of_u = vec2(u_x, u_y)
+        gradient_of_v = vec2(v_x, v_y)
         return mat2(gradient_of_u, gradient_of_v)
 
     @ti.func
@@ -144,66 +155,90 @@ class ParticleStress(FreeSurfaceKernels):
         self.locate(s, p)
         c = self.velocity_gradient(s, p)
         tau = self.stress(s, p, c, solid)
-        a = self.dx * c - self.stress_factor * tau
+        affine_part = self.dx * c
+        stress_part = self.stress_factor * tau
+        a = affine_part - stress_part
         self.keep_reach(s, p, a)
+
         scaled = self.velocity_scale * a
         first_column = scaled[:, 0]
         second_column = scaled[:, 1]
-        self.momentum_slope_x[s, p] = vec4(first_column, 0.0, 0.0)
-        self.momentum_slope_y[s, p] = vec4(second_column, 0.0, 0.0)
+        slope_x = vec4(first_column, 0.0, 0.0)
+        slope_y = vec4(second_column, 0.0, 0.0)
+        self.momentum_slope_x[s, p] = slope_x
+        self.momentum_slope_y[s, p] = slope_y
 
     @ti.func
     def locate(self, s: i32, p: i32) -> None:
         """Keep for P2G and G2P which nodes a particle touches, and the weights."""
-        x = self.x[s, p]
-        first, second, third = stencil(x, self.inv_dx, self.width)
-        self.weight_rows[0][s, p] = first
-        self.weight_rows[1][s, p] = second
-        self.weight_rows[2][s, p] = third
+        position = self.x[s, p]
+        first, second, third = stencil(position, self.inv_dx, self.width)
+        self.first_row[s, p] = first
+        self.second_row[s, p] = second
+        self.third_row[s, p] = third
 
     @ti.func
     def keep_reach(self, s: i32, p: i32, a: mat2) -> None:
         """Keep the largest abs(v) + abs(A o) of a particle in this advance."""
         # A node lies within 1.5 cells per axis.
-        velocity = self.particle_state[s, p].xy
+        state = self.particle_state[s, p]
+        velocity = state.xy
         speed = ti.abs(velocity)
         slope = ti.abs(a)
-        slope_of_x = slope[0, 0] + slope[0, 1]
-        slope_of_y = slope[1, 0] + slope[1, 1]
-        reach_x = speed.x + 1.5 * slope_of_x
-        reach_y = speed.y + 1.5 * slope_of_y
+        xx = slope[0, 0]
+        xy = slope[0, 1]
+        yx = slope[1, 0]
+        yy = slope[1, 1]
+        slope_of_x = xx + xy
+        slope_of_y = yx + yy
+        gain_x = 1.5 * slope_of_x
+        gain_y = 1.5 * slope_of_y
+        reach_x = speed.x + gain_x
+        reach_y = speed.y + gain_y
         reach = largest_of(reach_x, reach_y)
+
         extremes = self.extremes[s, p]
-        extremes[3] = larger(reach, extremes[3])
+        old_reach = extremes[3]
+        extremes[3] = larger(reach, old_reach)
         self.extremes[s, p] = extremes
 
     @ti.func
     def p2g(self, s: i32, p: i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
-        base, offset = base_node(self.weight_rows, s, p)
         scale = vec4(
             self.velocity_scale,
             self.velocity_scale,
             self.count_scale,
             self.count_scale,
         )
+        state = self.particle_state[s, p]
+        at_particle = scale * state
+        # what is added from one node to the next, along x and along y
         step_x = self.momentum_slope_x[s, p]
         step_y = self.momentum_slope_y[s, p]
-        at_middle = scale * self.particle_state[s, p]
-        at_middle = at_middle - offset.x * step_x
-        at_middle = at_middle - offset.y * step_y
-        for i, j in ti.static(ti.ndrange(3, 3)):
+
+        base, offset = base_node(self.weight_rows, s, p)
+        change_x = offset.x * step_x
+        change_y = offset.y * step_y
+        at_middle = at_particle - change_x
+        at_middle = at_middle - change_y
+
+        for i in ti.static(range(3)):
+            column = base + i * self.width
             at_column = stepped(at_middle, step_x, i - 1)
-            at_node = stepped(at_column, step_y, j - 1)
-            node = base + i * self.width + j
-            weight = self.weight_rows[i][s, p][j]
-            share = weight * at_node
-            accumulate(self.sums, s, node, share, self.atomic)
+            for j in ti.static(range(3)):
+                at_node = stepped(at_column, step_y, j - 1)
+                node = column + j
+                # A weight at a time: a name for the row makes this loop slower.
+                weight = self.weight_rows[i][s, p][j]
+                share = weight * at_node
+                accumulate(self.sums, s, node, share, self.atomic)
 
     @ti.func
     def at(self, i: i32, j: i32) -> i32:
         """Return the number of a node."""
-        return i * self.width + j
+        column = i * self.width
+        return column + j
 
     @ti.func
     def clear(self, s: i32, i: i32, j: i32) -> None:
@@ -222,20 +257,25 @@ class ParticleStress(FreeSurfaceKernels):
         u = 0.0
         v = 0.0
         jacobian = 1.0
+        momentum_sum = total.xy
         count_sum = total[2]
+        jacobian_sum = total[3]
         if count_sum > 0:
-            momentum = from_fixed(total.xy, self.velocity_unit)
+            momentum = from_fixed(momentum_sum, self.velocity_unit)
             count = from_fixed(count_sum, self.count_unit)
-            jacobian_sum = from_fixed(total[3], self.count_unit)
+            count_times_jacobian = from_fixed(jacobian_sum, self.count_unit)
+            jacobian = count_times_jacobian / count
             u = momentum.x / count
-            v = momentum.y / count - self.gravity_gain
-            jacobian = jacobian_sum / count
+            v = momentum.y / count
+            v = v - self.gravity_gain
             u, v = self.contact(i, u, v, friction)
             v, u = self.contact(j, v, u, friction)
+
         mirrored_sum = self.mirrored_count(s, i, j)
         mirrored_count = from_fixed(mirrored_sum, self.count_unit)
         density = mirrored_count * particle_volume
-        self.node_state[s, node] = vec4(u, v, density, jacobian)
+        state = vec4(u, v, density, jacobian)
+        self.node_state[s, node] = state
 
     @ti.func
     def contact(self, index: i32, normal: f32, tangential: f32, friction: f32) -> Value:
@@ -249,8 +289,10 @@ class ParticleStress(FreeSurfaceKernels):
             impact_speed = ti.abs(normal)
             sliding_speed = ti.abs(tangential)
             divisor = larger(sliding_speed, 1e-9)
-            loss = friction * impact_speed / divisor
-            kept = larger(1.0 - loss, 0.0)
+            friction_loss = friction * impact_speed
+            lost = friction_loss / divisor
+            kept = 1.0 - lost
+            kept = larger(kept, 0.0)
             new_normal = 0.0
             new_tangential = tangential * kept
         return new_normal, new_tangential
@@ -259,7 +301,8 @@ class ParticleStress(FreeSurfaceKernels):
     def count_at(self, s: i32, i: i32, j: i32) -> i64:
         """Return n of a node, without its mirror images."""
         node = self.at(i, j)
-        return self.sums[s, node][2]
+        total = self.sums[s, node]
+        return total[2]
 
     @ti.func
     def mirrored_count(self, s: i32, i: i32, j: i32) -> i64:
@@ -283,24 +326,34 @@ class ParticleStress(FreeSurfaceKernels):
     @ti.func
     def g2p(self, s: i32, p: i32) -> None:
         """Gather (v, r, Jbar) and their slopes."""
+        state = vec4(0.0)
+        # sums of w q o, along x and along y
+        moment_x = vec4(0.0)
+        moment_y = vec4(0.0)
+
         lowest, offset = base_node(self.weight_rows, s, p)
         base = masked(lowest, self.node_count)
-        state = vec4(0.0)
-        slope_x = vec4(0.0)
-        slope_y = vec4(0.0)
-        for i, j in ti.static(ti.ndrange(3, 3)):
-            node = base + i * self.width + j
-            weight = self.weight_rows[i][s, p][j]
-            node_state = self.node_state[s, node]
-            share = weight * node_state
+        for i in ti.static(range(3)):
+            weights = self.weight_rows[i][s, p]
+            column = base + i * self.width
             distance_x = (i - 1.0) - offset.x
-            distance_y = (j - 1.0) - offset.y
-            state += share
-            slope_x += distance_x * share
-            slope_y += distance_y * share
+            for j in ti.static(range(3)):
+                node = column + j
+                weight = weights[j]
+                node_state = self.node_state[s, node]
+                share = weight * node_state
+                distance_y = (j - 1.0) - offset.y
+                share_x = distance_x * share
+                share_y = distance_y * share
+                state += share
+                moment_x += share_x
+                moment_y += share_y
+
         slope_factor = 4.0 * self.inv_dx
-        self.slope_x[s, p] = slope_factor * slope_x
-        self.slope_y[s, p] = slope_factor * slope_y
+        slope_x = slope_factor * moment_x
+        slope_y = slope_factor * moment_y
+        self.slope_x[s, p] = slope_x
+        self.slope_y[s, p] = slope_y
         self.grid_state[s, p] = state
 
     @ti.func
@@ -310,16 +363,21 @@ class ParticleStress(FreeSurfaceKernels):
         grid_density = grid_state[2]
         grid_jacobian = grid_state[3]
         velocity = grid_state.xy
-        old_x = self.x[s, p].xy
-        x = old_x + self.dt * velocity
-        x = bounded(x, self.position_min, self.position_max)
-        self.x[s, p] = vec4(x, 0.0, 0.0)
+        old_x = self.x[s, p]
+        step = self.dt * velocity
+        old_position = old_x.xy
+        moved = old_position + step
+        inside = bounded(moved, self.position_min, self.position_max)
+        x = vec4(inside, 0.0, 0.0)
+        self.x[s, p] = x
 
         matter = self.matter[s, p]
         kind = matter[0]
         old_ratio = matter[1]
         c = self.velocity_gradient(s, p)
-        divergence = c[0, 0] + c[1, 1]
+        stretch_rate_x = c[0, 0]
+        stretch_rate_y = c[1, 1]
+        divergence = stretch_rate_x + stretch_rate_y
         j = self.liquid_jacobian(old_ratio, divergence, grid_jacobian, grid_density)
         ratio = j
         jacobian = j
@@ -330,26 +388,33 @@ class ParticleStress(FreeSurfaceKernels):
             is_liquid = kind == LIQUID
             old_f = self.deformation[s, p]
             rate = c @ old_f
-            trial = old_f + self.dt * rate
-            yielded, growth = plastic_return(trial, self.yield_low, self.yield_high)
+            change = self.dt * rate
+            trial = old_f + change
+            least_stretch = self.yield_low
+            greatest_stretch = self.yield_high
+            yielded, growth = plastic_return(trial, least_stretch, greatest_stretch)
             solid_f = ti.select(is_snow, yielded, trial)
             f = ti.select(is_liquid, old_f, solid_f)
             self.deformation[s, p] = f
 
             jp_min = self.parameters.snow_jp_min
             jp_max = self.parameters.snow_jp_max
-            jp = bounded(old_ratio * growth, jp_min, jp_max)
+            jp = old_ratio * growth
+            jp = bounded(jp, jp_min, jp_max)
             solid_ratio = ti.select(is_snow, jp, old_ratio)
             ratio = ti.select(is_liquid, j, solid_ratio)
-            jacobian = ti.select(is_liquid, j, determinant(f))
+            solid_jacobian = determinant(f)
+            jacobian = ti.select(is_liquid, j, solid_jacobian)
             spread_jacobian = ti.select(is_liquid, j, 1.0)
-        self.particle_state[s, p] = vec4(velocity, 1.0, spread_jacobian)
+        state = vec4(velocity, 1.0, spread_jacobian)
+        self.particle_state[s, p] = state
 
         old_min = matter[2]
         old_max = matter[3]
         ratio_min = smaller(ratio, old_min)
         ratio_max = larger(ratio, old_max)
-        self.matter[s, p] = vec4(kind, ratio, ratio_min, ratio_max)
+        new_matter = vec4(kind, ratio, ratio_min, ratio_max)
+        self.matter[s, p] = new_matter
         speed = ti.abs(velocity)
         self.keep_extremes(s, p, speed, jacobian)
 
@@ -357,10 +422,13 @@ class ParticleStress(FreeSurfaceKernels):
     def keep_extremes(self, s: i32, p: i32, speed: vec2, jacobian: f32) -> None:
         """Keep the largest speed and the extremes of J in this advance."""
         extremes = self.extremes[s, p]
+        old_speed = extremes[0]
+        old_least = extremes[1]
+        old_greatest = extremes[2]
         fastest = largest_of(speed.x, speed.y)
-        extremes[0] = larger(fastest, extremes[0])
-        extremes[1] = smaller(jacobian, extremes[1])
-        extremes[2] = larger(jacobian, extremes[2])
+        extremes[0] = larger(fastest, old_speed)
+        extremes[1] = smaller(jacobian, old_least)
+        extremes[2] = larger(jacobian, old_greatest)
         self.extremes[s, p] = extremes
 
     # The drivers: the same phases in the same order.
@@ -377,48 +445,56 @@ class ParticleStress(FreeSurfaceKernels):
 
     @ti.kernel
     def _serial_substeps(self, substeps: i32, solid: Template) -> Nothing:
+        particles = ti.static(self.particles)
         ti.loop_config(serialize=True)
         for _ in range(substeps):
             # Read here: an address of a field inside the loops would keep them from
             # being vectorised.
             particle_volume = self.particle_volume[0]
             friction = self.friction[0]
-            first, end = self.touched_nodes(self.particles)
-            for i in range(first[0], end[0]):
-                for j in range(first[1], end[1]):
+            first, end = self.touched_nodes(particles)
+            first_i = first[0]
+            first_j = first[1]
+            end_i = end[0]
+            end_j = end[1]
+            for i in range(first_i, end_i):
+                for j in range(first_j, end_j):
                     self.clear(0, i, j)
-            for p in range(self.particles):
+            for p in range(particles):
                 self.prepare(0, p, solid)
-            for p in range(self.particles):
+            for p in range(particles):
                 self.p2g(0, p)
-            for i in range(first[0], end[0]):
-                for j in range(first[1], end[1]):
+            for i in range(first_i, end_i):
+                for j in range(first_j, end_j):
                     self.update(0, i, j, particle_volume, friction)
-            for p in range(self.particles):
+            for p in range(particles):
                 self.g2p(0, p)
-            for p in range(self.particles):
+            for p in range(particles):
                 self.flow(0, p, solid)
 
     @ti.kernel
     def _parallel_substep(self, solid: Template) -> Nothing:
+        threads = ti.static(self.threads)
+        scenarios = ti.static(self.scenarios)
+        particles = ti.static(self.particles)
         # with the nodes behind the walls
         first_node = ti.static(self.low - 1)
         end_node = ti.static(self.high + 2)
         nodes = ti.static((first_node, end_node))
-        ti.loop_config(parallelize=self.threads)
-        for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
+        ti.loop_config(parallelize=threads)
+        for s, i, j in ti.ndrange(scenarios, nodes, nodes):
             self.clear(s, i, j)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.prepare(s, p, solid)
             self.p2g(s, p)
-        ti.loop_config(parallelize=self.threads)
-        for s, i, j in ti.ndrange(self.scenarios, nodes, nodes):
+        ti.loop_config(parallelize=threads)
+        for s, i, j in ti.ndrange(scenarios, nodes, nodes):
             particle_volume = self.particle_volume[s]
             friction = self.friction[s]
             self.update(s, i, j, particle_volume, friction)
-        ti.loop_config(parallelize=self.threads)
-        for s, p in ti.ndrange(self.scenarios, self.particles):
+        ti.loop_config(parallelize=threads)
+        for s, p in ti.ndrange(scenarios, particles):
             self.g2p(s, p)
             self.flow(s, p, solid)
 
@@ -429,13 +505,21 @@ class ParticleStress(FreeSurfaceKernels):
         They are the speed, the least J and the largest J of a particle. Its reach, the
         fourth one, is 0 until it moves.
         """
-        ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, p in ti.ndrange(self.scenarios, self.particles):
+        scenarios = ti.static(self.scenarios)
+        particles = ti.static(self.particles)
+        is_serial = ti.static(not self.atomic)
+        ti.loop_config(serialize=is_serial)
+        for s, p in ti.ndrange(scenarios, particles):
             state = self.particle_state[s, p]
+            matter = self.matter[s, p]
+            kind = matter[0]
             f = self.deformation[s, p]
             jacobian = determinant(f)
-            if self.matter[s, p][0] == LIQUID:
+            if kind == LIQUID:
                 jacobian = state[3]
-            speed = ti.abs(state.xy)
-            speed_max = largest_of(speed.x, speed.y)
-            self.extremes[s, p] = vec4(speed_max, jacobian, jacobian, 0.0)
+
+            velocity = state.xy
+            speed = ti.abs(velocity)
+            fastest = largest_of(speed.x, speed.y)
+            extremes = vec4(fastest, jacobian, jacobian, 0.0)
+            self.extremes[s, p] = extremes

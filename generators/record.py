@@ -43,8 +43,12 @@ def measured_values(manifest: Manifest) -> Measured:
     Raises:
         DataError: a scenario, or the predictability limit of one of test, is missing.
     """
-    limits = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
-    if not manifest.complete or manifest.dataset_sha256 is None or not all(limits):
+    limits = []
+    for entry in manifest.files:
+        if entry.subset == "test":
+            limits.append(entry.twin_floor)
+    dataset_hash = manifest.dataset_sha256
+    if not manifest.complete or dataset_hash is None or not all(limits):
         raise DataError(
             "the data set is incomplete",
             where=f"{manifest.split} {manifest.size}",
@@ -56,9 +60,10 @@ def measured_values(manifest: Manifest) -> Measured:
         )
     hashes: dict[int, str] = {}
     for entry in manifest.files:
-        hashes[entry.scenario] = entry.content_sha256[:_SHORT]
+        content_hash = entry.content_sha256
+        hashes[entry.scenario] = content_hash[:_SHORT]
     return Measured(
-        dataset_sha256=manifest.dataset_sha256,
+        dataset_sha256=dataset_hash,
         subset_sha256=manifest.subset_sha256,
         scenario_sha256=hashes,
         statistics=manifest.statistics,
@@ -74,7 +79,8 @@ def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
         for size, values in sorted(sizes.items()):
             lines.append(f"    {size}:")
             lines += _render_size(values)
-    return "\n".join(lines) + "\n"
+    text = "\n".join(lines)
+    return f"{text}\n"
 
 
 def _render_size(values: Measured) -> list[str]:
@@ -90,15 +96,19 @@ def _render_size(values: Measured) -> list[str]:
 
     lines.append("      statistics:")
     for name, row in values.statistics.items():
-        numbers = ", ".join(map(_format_number, row))
+        texts = map(_format_number, row)
+        numbers = ", ".join(texts)
         lines.append(f"        {name}: [{numbers}]")
 
     limits = [_format_number(value) for value in values.twin_floor]
     rows = []
     for start in range(0, len(limits), _PER_LINE):
-        rows.append(", ".join(limits[start : start + _PER_LINE]))
+        end = start + _PER_LINE
+        line = ", ".join(limits[start:end])
+        rows.append(line)
+    listing = ",\n         ".join(rows)
     lines.append("      twin_floor:")
-    lines.append("        [" + ",\n         ".join(rows) + "]")
+    lines.append(f"        [{listing}]")
     return lines
 
 
@@ -109,8 +119,11 @@ def _format_number(value: float) -> str:
 
 def replace_measured(text: str, measured: Mapping[str, Mapping[str, Measured]]) -> str:
     """Return the text of a datasets.yaml with another measured block."""
-    by_hand = text.split(MARKER)[0].replace(_NOTICE, "").rstrip("\n")
-    return f"{by_hand}\n\n{render(measured)}"
+    by_hand, _, _ = text.partition(MARKER)
+    by_hand = by_hand.replace(_NOTICE, "")
+    by_hand = by_hand.rstrip("\n")
+    block = render(measured)
+    return f"{by_hand}\n\n{block}"
 
 
 def released_name(size: Size) -> str:
@@ -146,7 +159,8 @@ def record(
     if released is not None and released.exists():
         released_hashes = json.loads(released.read_text())
 
-    old_hash = released_hashes.get(released_name(size))
+    name = released_name(size)
+    old_hash = released_hashes.get(name)
     if not old_hash and size.measured:
         old_hash = size.measured.dataset_sha256
     if old_hash not in (None, values.dataset_sha256) and not allow:
@@ -158,15 +172,18 @@ def record(
             fix="raise MAJOR of the split, or pass --allow-change before a release",
         )
 
-    measured = load(registry).measured
-    sizes = {**measured.get(size.split, {}), size.name: values}
+    old_measured = load(registry).measured
+    old_sizes = old_measured.get(size.split, {})
+    sizes = {**old_sizes, size.name: values}
+    measured = {**old_measured, size.split: sizes}
     old_text = registry.read_text(encoding="utf-8")
-    text = replace_measured(old_text, {**measured, size.split: sizes})
+    text = replace_measured(old_text, measured)
     write_atomically(registry, text.encode())
     if released is not None:
-        released_hashes[released_name(size)] = values.dataset_sha256
-        listing = json.dumps(released_hashes, indent=1, sort_keys=True) + "\n"
-        write_atomically(released, listing.encode())
+        released_hashes[name] = values.dataset_sha256
+        listing = json.dumps(released_hashes, indent=1, sort_keys=True)
+        text = f"{listing}\n"
+        write_atomically(released, text.encode())
     return values
 
 
@@ -174,8 +191,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of this module; return its exit code."""
     options = _parse(arguments)
     try:
-        size = load(options.registry).size(options.split, options.size)
-        manifest = _checked_manifest(size, resolve_root(options.root))
+        registry = load(options.registry)
+        size = registry.size(options.split, options.size)
+        root = resolve_root(options.root)
+        manifest = _checked_manifest(size, root)
         released = options.released
         checkout = options.registry.parent / "tests"
         if released is None and checkout.is_dir():

@@ -53,14 +53,16 @@ class Ball:
     @property
     def reach(self) -> tuple[float, float, float]:
         """The radius, three times."""
-        return self.radius, self.radius, self.radius
+        r = self.radius
+        return r, r, r
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         x, y, z = position.T
         square = x * x + y * y + z * z
         from_centre = np.sqrt(square)
-        return np.asarray(from_centre - self.radius)
+        distance = from_centre - self.radius
+        return np.asarray(distance)
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ class Block:
         its height [1].
         """
         along_x, along_z = aspects
-        height_cubed = volume / (along_x * along_z)
+        relative_area = along_x * along_z
+        height_cubed = volume / relative_area
         height = cube_root(height_cubed)
         width = along_x * height
         depth = along_z * height
@@ -91,19 +94,24 @@ class Block:
     def reach(self) -> tuple[float, float, float]:
         """Half the sides."""
         width, height, depth = self.sides
-        return 0.5 * width, 0.5 * height, 0.5 * depth
+        reach_x = 0.5 * width
+        reach_y = 0.5 * height
+        reach_z = 0.5 * depth
+        return reach_x, reach_y, reach_z
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
         reach = np.array(self.reach)
-        beyond = np.abs(position) - reach
+        from_middle = np.abs(position)
+        beyond = from_middle - reach
         nearest_face = beyond.max(axis=1)
         inside = np.minimum(nearest_face, 0.0)
         way_outside = np.maximum(beyond, 0.0)
         x, y, z = way_outside.T
         square = x * x + y * y + z * z
         outside = np.sqrt(square)
-        return np.asarray(outside + inside)
+        distance = outside + inside
+        return np.asarray(distance)
 
 
 @dataclass(frozen=True)
@@ -117,7 +125,9 @@ class Rod:
     @property
     def measure(self) -> float:
         """Pi times the radius squared times the length."""
-        return math.pi * self.radius * self.radius * self.length
+        r = self.radius
+        cross_section = math.pi * r * r
+        return cross_section * self.length
 
     @property
     def reach(self) -> tuple[float, float, float]:
@@ -129,10 +139,14 @@ class Rod:
         return reach_x, reach_y, reach_z
 
     def _reach_along(self, component: float) -> float:
-        square_sine = 1.0 - component * component
-        sine = math.sqrt(max(0.0, square_sine))
-        half_length = 0.5 * self.length * abs(component)
-        return half_length + self.radius * sine
+        square_cosine = component * component
+        square_sine = 1.0 - square_cosine
+        square_sine = max(0.0, square_sine)
+        sine = math.sqrt(square_sine)
+        half_length = 0.5 * self.length
+        reach_of_axis = half_length * abs(component)
+        reach_of_disc = self.radius * sine
+        return reach_of_axis + reach_of_disc
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
@@ -140,10 +154,13 @@ class Rod:
         a, b, c = self.axis
         height = a * x + b * y + c * z
         square_from_centre = x * x + y * y + z * z
-        square = square_from_centre - height * height
+        square_height = height * height
+        square = square_from_centre - square_height
         square = np.maximum(square, 0.0)
         # distances beyond the ends and beyond the side, negative between them
-        along = np.abs(height) - 0.5 * self.length
+        half_length = 0.5 * self.length
+        from_middle = np.abs(height)
+        along = from_middle - half_length
         from_axis = np.sqrt(square)
         across = from_axis - self.radius
         farther = np.maximum(along, across)
@@ -152,7 +169,8 @@ class Rod:
         across = np.maximum(across, 0.0)
         square_outside = along * along + across * across
         outside = np.sqrt(square_outside)
-        return np.asarray(outside + inside)
+        distance = outside + inside
+        return np.asarray(distance)
 
 
 def cube_root(value: float) -> float:

@@ -67,16 +67,19 @@ def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     }
     speeds = {}
     for material, modulus in moduli.items():
-        speeds[material] = math.sqrt(modulus / p.density)
+        square_speed = modulus / p.density
+        speeds[material] = math.sqrt(square_speed)
     return speeds
 
 
 def wave_modulus(young: float, poisson: float) -> float:
     """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)), in the unit of E."""
     lateral = 1.0 + poisson
-    incompressibility = 1.0 - 2.0 * poisson
+    twice_poisson = 2.0 * poisson
+    incompressibility = 1.0 - twice_poisson
     divisor = lateral * incompressibility
-    return young * (1.0 - poisson) / divisor
+    axial = 1.0 - poisson
+    return young * axial / divisor
 
 
 class SoundnessRecorder:
@@ -92,10 +95,13 @@ class SoundnessRecorder:
         self._parameters = parameters
         self._is_liquid = material == Material.LIQUID
         self._is_snow = material == Material.SNOW
-        speeds = sound_speeds(parameters)
+        speed_of_kind = sound_speeds(parameters)
+        particle_speeds = []
+        for kind in material:
+            sound_speed = speed_of_kind[Material(kind)]
+            particle_speeds.append(sound_speed)
         # of each particle [length/s], shape [particle]
-        sound_speeds_of_particles = [speeds[Material(kind)] for kind in material]
-        self._sound_speed = np.array(sound_speeds_of_particles)
+        self._sound_speed = np.array(particle_speeds)
         self._mach_counts = np.zeros(_BIN_COUNT, np.int64)
         self._mach_max = 0.0
         self._jacobian_counts = np.zeros(_BIN_COUNT, np.int64)
@@ -108,14 +114,18 @@ class SoundnessRecorder:
             ratio: J of liquid [1], shape [particle]; of others it is not read.
         """
         squares = np.square(velocity, dtype=np.float64)
-        speed = np.sqrt(squares.sum(axis=-1))
+        square_speed = squares.sum(axis=-1)
+        speed = np.sqrt(square_speed)
         mach = speed / self._sound_speed
         frame_max = float(mach.max())
         self._mach_max = max(self._mach_max, frame_max)
-        self._mach_counts += _count_bins(mach)
+        mach_counts = _count_bins(mach)
+        self._mach_counts += mach_counts
+
         liquid_jacobian = ratio[self._is_liquid]
         exact_jacobian = liquid_jacobian.astype(np.float64)
-        self._jacobian_counts += _count_bins(exact_jacobian)
+        jacobian_counts = _count_bins(exact_jacobian)
+        self._jacobian_counts += jacobian_counts
 
     def summary(self, least: Singles, greatest: Singles) -> FreeSurfaceSoundness:
         """Return what the frames and substeps so far have shown.
@@ -152,8 +162,10 @@ class SoundnessRecorder:
         # Exponents xi (1 - Jp) are compared, because exp may overflow.
         exact_least = least.astype(np.float64)
         exact_greatest = greatest.astype(np.float64)
-        largest_exponent = p.snow_hardening * (1.0 - exact_least)
-        smallest_exponent = p.snow_hardening * (1.0 - exact_greatest)
+        most_compaction = 1.0 - exact_least
+        least_compaction = 1.0 - exact_greatest
+        largest_exponent = p.snow_hardening * most_compaction
+        smallest_exponent = p.snow_hardening * least_compaction
         exponent_max = math.log(p.snow_hardening_max)
         exponent_min = math.log(p.snow_hardening_min)
         is_hard = largest_exponent >= exponent_max
@@ -172,7 +184,9 @@ class SoundnessRecorder:
 
 def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return how many values lie in each bin; the last one holds all that is beyond."""
-    place = np.minimum(values / BIN, _BIN_COUNT - 1)
+    last_bin = _BIN_COUNT - 1
+    place = values / BIN
+    place = np.minimum(place, last_bin)
     index = place.astype(np.int64)
     return np.bincount(index, minlength=_BIN_COUNT)
 
@@ -181,7 +195,8 @@ def _quantile(counts: NDArray[np.int64], share: float) -> float:
     """Return the end of the first bin up to which a share of the values lies."""
     cumulative = np.cumsum(counts)
     total = cumulative[-1]
-    first_bin = np.searchsorted(cumulative, share * total)
+    count_below = share * total
+    first_bin = np.searchsorted(cumulative, count_below)
     end = int(first_bin) + 1  # [bins]
     return end * BIN
 

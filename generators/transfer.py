@@ -51,13 +51,16 @@ def fixed_point_scale(particles: int, bound: float) -> float:
     >>> fixed_point_scale(8192, 8.0) == 2.0**46
     True
     """
-    count_bits = (particles - 1).bit_length()
-    bits = min(50, 62 - count_bits)
+    last_particle = particles - 1
+    count_bits = last_particle.bit_length()
+    room = 62 - count_bits  # for one contribution [bits]
+    bits = min(50, room)
     mantissa, exponent = math.frexp(bound)
     is_power_of_two = mantissa == 0.5
     if is_power_of_two:
         exponent -= 1
-    return math.ldexp(1.0, bits - exponent)
+    power = bits - exponent
+    return math.ldexp(1.0, power)
 
 
 @ti.func
@@ -69,9 +72,12 @@ def spline_weights(f: Value) -> Value:
     to_low = 1.5 - f
     to_mid = f - 1.0
     to_high = f - 0.5
-    low = 0.5 * (to_low * to_low)
-    mid = 0.75 - to_mid * to_mid
-    high = 0.5 * (to_high * to_high)
+    low_square = to_low * to_low
+    mid_square = to_mid * to_mid
+    high_square = to_high * to_high
+    low = 0.5 * low_square
+    mid = 0.75 - mid_square
+    high = 0.5 * high_square
     return low, mid, high
 
 
@@ -82,23 +88,30 @@ def stencil(x: vec4, inv_dx: f32, width: i32) -> Value:
     The fourth numbers are what else a transfer needs: the bits of the base node's index
     i width + j, and the offset f - 1 along x and along y.
     """
-    scaled = x.xy * inv_dx
-    base = ti.cast(scaled - 0.5, i32)
+    position = x.xy
+    scaled = position * inv_dx
+    shifted_place = scaled - 0.5
+    base = ti.cast(shifted_place, i32)
     base_place = ti.cast(base, f32)  # [cells]
     f = scaled - base_place
     offset = f - 1.0
-    node = base.x * width + base.y
+    column = base.x * width
+    node = column + base.y
     node_bits = ti.bit_cast(node, f32)
+
     low, mid, high = spline_weights(f)
-    along_y = vec3(low.y, mid.y, high.y)
-    first = low.x * along_y
-    second = mid.x * along_y
-    third = high.x * along_y
-    return (
-        vec4(first, node_bits),
-        vec4(second, offset.x),
-        vec4(third, offset.y),
-    )
+    low_y = low.y
+    mid_y = mid.y
+    high_y = high.y
+    along_y = vec3(low_y, mid_y, high_y)
+    low_weights = low.x * along_y
+    mid_weights = mid.x * along_y
+    high_weights = high.x * along_y
+
+    first_row = vec4(low_weights, node_bits)
+    second_row = vec4(mid_weights, offset.x)
+    third_row = vec4(high_weights, offset.y)
+    return first_row, second_row, third_row
 
 
 @ti.func
@@ -107,11 +120,13 @@ def base_node(rows: Template, s: i32, p: i32) -> Value:
 
     Both stand in its stencil, see :func:`stencil`.
     """
+    # Only these numbers: whole rows would be kept in registers that P2G needs.
     node_bits = rows[0][s, p][3]
     offset_x = rows[1][s, p][3]
     offset_y = rows[2][s, p][3]
     base = ti.bit_cast(node_bits, i32)
-    return base, vec2(offset_x, offset_y)
+    offset = vec2(offset_x, offset_y)
+    return base, offset
 
 
 @ti.func
@@ -135,7 +150,9 @@ def masked(number: i32, node_count: Template) -> Value:
     surfaces in two dimensions has no mask: on processors without AVX it is slower with
     one.
     """
-    mask = ti.static((1 << node_count.bit_length()) - 1)
+    bit_count = ti.static(node_count.bit_length())
+    end = ti.static(1 << bit_count)
+    mask = ti.static(end - 1)
     return number & mask
 
 
@@ -146,7 +163,9 @@ def to_fixed(scaled: Value) -> Value:
     NaN and larger values give some integer, never a trap: the float's bits are only
     read.
     """
-    return shifted(scaled) - i64(_SHIFT_BITS)
+    with_shift = shifted(scaled)
+    shift = i64(_SHIFT_BITS)
+    return with_shift - shift
 
 
 @ti.func
@@ -180,8 +199,11 @@ def accumulate(
     else:
         # The shift comes off the sum: off the contribution, LLVM finds vectors for two
         # lanes only.
-        reduced = sums[s, node] - i64(_SHIFT_BITS)
-        sums[s, node] = reduced + shifted(scaled)
+        total = sums[s, node]
+        shift = i64(_SHIFT_BITS)
+        reduced = total - shift
+        contribution = shifted(scaled)
+        sums[s, node] = reduced + contribution
 
 
 @ti.func
@@ -193,11 +215,13 @@ def add_shifted(
     The reader of the sums subtracts the shifts. This saves a subtraction at each node
     of each particle.
     """
+    contribution = shifted(scaled)
     if ti.static(atomic):
-        ti.atomic_add(sums[s, node], shifted(scaled))
+        ti.atomic_add(sums[s, node], contribution)
     else:
         # Even in serial code `+=` is an atomic.
-        sums[s, node] = sums[s, node] + shifted(scaled)
+        total = sums[s, node]
+        sums[s, node] = total + contribution
 
 
 @ti.func
@@ -213,9 +237,17 @@ def row_count(rows: Template, s: i32, n: i32) -> Value:
     first = rows[s, n + 2]
     second = rows[s, n + 1]
     third = rows[s, n]
-    shifts = first[3] + second[3] + third[3]
-    shifted_sum = first[0] + second[1] + third[2]
-    return shifted_sum - shifts, shifts
+    first_shift = first[3]
+    second_shift = second[3]
+    third_shift = third[3]
+    shifts = first_shift + second_shift + third_shift
+
+    first_weights = first[0]
+    second_weights = second[1]
+    third_weights = third[2]
+    shifted_count = first_weights + second_weights + third_weights
+    count = shifted_count - shifts
+    return count, shifts
 
 
 @ti.func
@@ -232,11 +264,14 @@ def stepped(value: Value, step: Value, count: Template) -> Value:
 @ti.func
 def bounded(value: Value, low: f32, high: f32) -> Value:
     """Return the value kept in [low, high]; NaN becomes low."""
-    raised = ti.select(value > low, value, low)
-    return ti.select(raised < high, raised, high)
+    is_above = value > low
+    raised = ti.select(is_above, value, low)
+    is_below = raised < high
+    return ti.select(is_below, raised, high)
 
 
 @ti.func
 def largest(value: Value, so_far: Value) -> Value:
     """Return the larger one; a value that is NaN wins, so that it is seen."""
-    return ti.select(value <= so_far, so_far, value)
+    is_no_larger = value <= so_far
+    return ti.select(is_no_larger, so_far, value)
