@@ -187,15 +187,15 @@ def main() -> int:
         lines.append(["", "exponent", *exponents])
     caption = (
         "## Time of a predicted frame for more and more particles\n\n"
-        "The table shows the processor time [ms] of one predicted frame on one core, "
-        f"as a mean over a rollout of {FRAMES} frames. The models are a graph "
+        "The table shows the processor time [ms] of one predicted frame on one core "
+        f"(mean of {FRAMES} frames). The models are a graph "
         "network (`gns`), a network with all particles of a frame as one input "
         "(`mlp`), and `neuralmpm`. The models are untrained, because weights do not "
         f"change the time. The options come from the recipes for {SPLIT} {SIZE}.\n\n"
-        f"The box holds {PARTICLES:,} q^2 particles. The grid of `neuralmpm` has q "
-        "times as many cells along each axis. The connectivity radius of `gns` is "
-        "divided by q, so a particle keeps its number of neighbours. In the last row "
-        "time ~ (number of particles)^exponent."
+        f"The box holds {PARTICLES:,} q^2 particles. Compared with q = 1, the grid of "
+        "`neuralmpm` has q times as many cells along each axis. The connectivity "
+        "radius of `gns` is divided by q, so a particle keeps its number of "
+        "neighbours. In the last row time ~ (number of particles)^exponent."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)

@@ -249,8 +249,8 @@ With one seed on each side, the test compares two sets of weights
 the other set, although the method is the same. So the leaderboard speaks of "these
 weights" if one side has only one seed.
 
-The rows *middling* and *large* are equal. In *large* all three deviations are twice as
-large, and a common factor does not change the test.
+The rows *middling* and *large* are equal. All deviations of *large* are twice those of
+*middling*, and a common factor does not change the test.
 
 The score files of size mini have {pair_count} pairs of two seeds of the same method:
 {pairs_by_split}. The test finds a difference in {differing_count} of these pairs. The

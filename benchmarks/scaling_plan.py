@@ -337,8 +337,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     statistics = 0.8 * frame_hours * p.statistics
     checking = frame_hours * p.check
     perturbed_runs = (
-        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all), "
-        f"up to frame {HORIZON_END}"
+        f"perturbed runs of the test scenarios ({100 * TESTS:.0f} % of all)"
     )
     train_statistics = "statistics of the train scenarios (80 % of all)"
     rows = {
@@ -354,8 +353,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     return [
         f"The plan is for {SCENARIOS:,} scenarios, with the times of q = {measured_q}. "
         f"A scenario has {n:,} particles, {frames} frames of {row.substeps} "
-        f"substeps, and a grid of {row.grid} x {row.grid} cells. The perturbed runs "
-        "end with the horizon, as in fluid full:",
+        f"substeps, and a grid of {row.grid} x {row.grid} cells. The horizon and "
+        f"the perturbed runs end at frame {HORIZON_END}, as in fluid full:",
         "",
         "| part | size or time |",
         "|---|--:|",

@@ -210,7 +210,7 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     clock = "as wall-clock time in milliseconds"
     if device == Device.CPU:
         clock = "as processor time in milliseconds"
-    consequence = "On a CPU the copy is often shorter than the noise."
+    consequence = "On a CPU a copy takes little time."
     if device == Device.CUDA:
         consequence = "On a GPU a copy takes long."
     return [
@@ -218,11 +218,11 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "",
         f"The table compares our solver, run {ours}, with the solver of the thesis. "
         "The solver of the thesis ran on the GPU of its author. (`lagbench cite "
-        "cavity` names the thesis.) The rows have the particles, the grid and the "
-        "substeps of Table 3.1 of the thesis.",
+        "cavity` names the thesis.) Row q has the particles, grid and substeps "
+        "of row q in Table 3.1 of the thesis.",
         "",
         f"Our times are the shortest of {repeats} runs, {clock}. t/frame is the time "
-        "of all substeps of a frame. fps is the number of frames per second. "
+        "of all substeps of a frame. fps means frames per second. "
         f"t/substep is the time of {FIXED} substeps, divided by {FIXED}. Each measured "
         f"time includes one copy of all positions, so t/substep has 1/{FIXED} of a "
         f"copy. {consequence}",

@@ -73,20 +73,20 @@ The next table has the best learned model and the best hybrid of each data set. 
 of the thesis and notes on the trainings."""
 
 SUMMARY_NOTE = """\
-- Scores are errors, so lower is better.
+- Scores are errors ([metrics](scoring.md#metrics)), so lower is better.
 - A *naive* predictor learns nothing and integrates no equations. A *classical* solver
   integrates the equations. Both are [reference predictors](references.md): nobody
   trains them.
-- A *learned* model contains no solver. A *hybrid* is a classical solver with a learned
-  part. Some data sets have no hybrid.
+- A *learned* [model](baselines.md) contains no solver. A *hybrid* is a classical solver
+  with a learned part. Some data sets have no hybrid.
 - The time in brackets is the processor time of one frame on one core, as a mean over
-  the first ten frames. Compare only times of one data set. They come from one run on
-  one machine.
+  the first ten frames. Compare only times of one data set. One run on one machine
+  measured the times of a data set.
 - `skill` is 1 - (score of the model) / (score of the best naive predictor). Skill 1 is
   perfect. Skill 0 is as good as that predictor.
 - `against_classical` is (score of the model) / (score of a classical solver). The
   solver is the best one that costs no more per frame than the model. The brackets
-  contain the 95 % interval. The name of the solver follows.
+  contain the 95 % interval.
 - If every solver costs more than the model, the ratio uses the cheapest solver. Then
   the cell says "which costs more".
 - *Learning pays* on a data set if the whole interval of `against_classical` is below 1.
@@ -126,11 +126,11 @@ vorticity.
 - If a training started from other weights, its hours include the earlier trainings.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries, the
-score files and the records of the trainings. Do not edit the page."""
+score files and the records of the trainings."""
 
 CLAIMS_NOTE = """\
-The next table explains the answers to the questions below. Some questions test a claim
-of the thesis on our data. The answers use the ranking metric and the level of 5 %:
+The questions below concern the splits of the thesis. Some test a claim of the thesis
+on our data. The answers use the ranking metric and the level of 5 %:
 
 | answer | meaning |
 | --- | --- |
@@ -139,7 +139,7 @@ of the thesis on our data. The answers use the ranking metric and the level of 5
 | open | the test finds no difference from the other model |
 | better than 4, worse than 0, open: 1 | better than four models, open for one |
 | 3 of 5 compared | two of the five other models have no usable entry |
-| these weights | a model has fewer than three seeds, so the answer may change |
+| these weights | a model has fewer than three seeds. More seeds may change the answer |
 | - | no usable entries to compare |
 
 A usable entry is active and fails no [gate](baselines.md#gates). Graph networks are
@@ -160,7 +160,7 @@ The next tables have the comparisons behind the answers:
 - `p (Holm)` is corrected for the number of other models. If both models have one seed,
   p comes from the sign-flip test. Otherwise p comes from a t-test over scenarios and
   seeds ([tests](scoring.md#comparing-two-methods)).
-- Some tables have rows for a second metric. The answers do not use them."""
+- Some tables have rows for a second metric. The answers do not use these rows."""
 
 LEADING_NOTE = """\
 The table lists the metrics in which a reference predictor has a better mean than every
@@ -168,11 +168,11 @@ learned or hybrid model."""
 
 TRAINING_NOTE = """\
 All rows are of the first seed. The columns *validation at* show the lowest validation
-error until then: after a quarter of the steps, after half of them, and at the end.
+error in the first quarter of the steps, in the first half, and in all steps.
 `validated` is the metric of this error (`rmse` is the position error).
 
-The last column shows how much the error decreased in the second half. A training with a
-decrease of more than 2 % has not converged.
+The last column shows how much this error decreased in the second half. A training with
+a decrease of more than 2 % has not converged.
 
 The third column has the steps and the windows per step. An epoch is one pass over all
 windows of train. VAR and the hybrids are fitted, without steps. If a training started
@@ -189,12 +189,11 @@ lagbench score predictions.nc
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
-figures of the thesis, and trains the models that they need. After an interruption the
-same command continues.
+figures of the thesis, and trains the models for them.
 
 A mirror-averaged model has the weights of the model without averaging. Predict with
 `lagbench predict --set model.average=true`. The other variants need these options of
-`lagbench train`:"""
+`lagbench train`, and the options in the column `changed`:"""
 
 MISSING_NOTE = """\
 These models have no active entry, so this page does not show them. The command in a
