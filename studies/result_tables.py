@@ -72,6 +72,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
     simulator.
     """
     pays = []
+    pays_at_less_cost = []  # those of `pays` where every solver costs more
     time_ratios = []  # time of a frame over the simulator's, where learning pays
     open_sets = []
     without_interval = []
@@ -92,6 +93,8 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             no_verdict.append(sentence)
         elif verdict is LearningVerdict.PAYS:
             pays.append(results.where)
+            if against.solver_costs_more:
+                pays_at_less_cost.append(results.where)
             time_ratios.append(time_over_simulator(results, model))
         elif verdict is LearningVerdict.DOES_NOT_PAY:
             does_not_pay.append(results.where)
@@ -105,6 +108,12 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             f"Learning pays on {_join(pays)}. There the best learned or hybrid model is"
             " more accurate than every classical solver that costs no more per frame."
         )
+        if pays_at_less_cost:
+            sentences.append(
+                f"On {_join(pays_at_less_cost)} every classical solver costs more than"
+                " the best model, and the model is more accurate than the cheapest"
+                " solver."
+            )
         sentences += slower_than_simulator(time_ratios)
     if open_sets:
         sentences.append(
