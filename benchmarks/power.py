@@ -197,7 +197,7 @@ PAGE = """\
 `lagbench.metrics.differ`. After this page you know:
 
 - how small a difference the test can find;
-- how often it finds a difference between two trainings of the same method.
+- how often the test finds a difference between two trainings of the same method.
 
 This command writes the page:
 
@@ -227,9 +227,9 @@ A scenario may be harder for both methods. We left out this effect, because it n
 cancels.
 
 **Rows.** The first three rows use assumed values. The other rows use values from the
-score files of size mini. A pair of methods counts if the means differ by less than a
-factor of two, and one method has several seeds. A split may have only one such pair, so
-these values are rough. A split without such a pair has no row.
+score files of size mini. We used pairs of methods whose means differ by less than a
+factor of two. In each pair at least one method has several seeds. A split may have only
+one such pair, so these values are rough. A split without such a pair has no row.
 
 More scenarios do not remove the scatter between seeds. Train more seeds if two methods
 differ by less than this scatter.
@@ -237,8 +237,8 @@ differ by less than this scatter.
 ## Differences between equal methods
 
 In this table both sides have seeds of the same method. With several seeds on each side
-the test should find a difference in at most 5 % of the draws. The 95 % interval of a
-share of 5 % is 3.6 to 6.4 %.
+the test should find a difference in at most 5 % of the draws. With {draws} draws, a
+rate of 5 % gives a share between 3.6 and 6.4 % (95 % interval).
 
 | case | 1 seed each | 1 against {seeds} seeds | 2 each | 3 each | 5 each |
 |---|---|---|---|---|---|

@@ -255,9 +255,9 @@ def markdown(
         )
     lines += [
         "",
-        "The next table shows how the times grow. The row `t/frame against q^2` has "
-        "the exponent p in t/frame ~ (q^2)^p, from a least-squares fit. *Same rows* "
-        "are the rows of the table above. *All rows* are the nine rows of the thesis.",
+        "The next table shows how the times grow. A row `a against b` has the "
+        "exponent p in a ~ b^p, from a least-squares fit. *Same rows* are the rows of "
+        "the table above. *All rows* are the nine rows of the thesis.",
         "",
         "| exponent p | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
