@@ -123,8 +123,8 @@ vorticity.
 
 - `changed` lists the options that differ from the recipe. A slash separates different
   values of the seeds.
-- The CPU hours are a mean over the seeds. The hours include validations only for the
-  first seed of NeuralMPM on cavity mini.
+- The CPU hours are a mean over the seeds, without hours on a GPU. The hours include
+  validations only for the first seed of NeuralMPM on cavity mini.
 - If a training started from other weights, its hours include the earlier trainings.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries, the
@@ -328,9 +328,9 @@ def _thesis_vorticity(results: SplitResults) -> Iterator[str]:
         return
     yield (
         "**Table 5.4 of the thesis.** [Metrics](scoring.md#metrics) of the vorticity "
-        f"at frame {key_frame(results.size)}. Our cells have the mean over the test scenarios, "
-        "and in brackets the value of the first test scenario. Table 5.4 has only one "
-        "test scenario, which corresponds to our first one."
+        f"at frame {key_frame(results.size)}. Our cells have the mean over the test "
+        "scenarios, and in brackets the value of the first test scenario. Table 5.4 has "
+        "only one test scenario, which corresponds to our first one."
     )
     yield table
     tau = order_agreement(results)
