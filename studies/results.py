@@ -329,8 +329,8 @@ def _thesis_vorticity(results: SplitResults) -> Iterator[str]:
     yield (
         "**Table 5.4 of the thesis.** [Metrics](scoring.md#metrics) of the vorticity "
         f"at frame {key_frame(results.size)}. Our cells have the mean over the test "
-        "scenarios, and in brackets the value of the first test scenario. Table 5.4 has "
-        "only one test scenario, which corresponds to our first one."
+        "scenarios, and in brackets the value of the first test scenario. Table 5.4 "
+        "has only one test scenario, which corresponds to our first one."
     )
     yield table
     tau = order_agreement(results)
