@@ -91,7 +91,7 @@ SUMMARY_NOTE = """\
   the cell says "which costs more".
 - *Learning pays* on a data set if the whole interval of `against_classical` is below 1.
   The best learned or hybrid model decides.
-- If every solver costs more, there is a verdict only for an interval below 1."""
+- If every solver costs more, the only possible verdict is that learning pays."""
 
 VERDICT = "## Verdict"
 
@@ -109,6 +109,8 @@ Each chapter has three tables. Cavity mini also has Table 5.4 of the
   seeds. The leaderboard resamples seeds too, so the leaderboard has wider intervals.
 - A dash means that there is no value.
 - `readme-network` is the network of the program in the README.
+- A [mirror-averaged](baselines.md#mirror-averaging) model has the weights of the model
+  without averaging.
 - The times and `against_classical` mean the same as in the first table.
 
 **Other metrics.** The table has means over scenarios and frames. [Scoring](scoring.md)
@@ -119,10 +121,10 @@ vorticity.
 
 **Trainings.**
 
-- `changed` lists the options that differ from the recipe. If seeds differ, slashes
-  separate their values.
-- Hours are processor hours, without hours on a GPU and without validations. Only the
-  hours of the first seed of NeuralMPM on cavity mini include validations.
+- `changed` lists the options that differ from the recipe. A slash separates different
+  values of the seeds.
+- The CPU hours are a mean over the seeds, without hours on a GPU. The hours include
+  validations only for the first seed of NeuralMPM on cavity mini.
 - If a training started from other weights, its hours include the earlier trainings.
 
 `python -m studies.results -o docs/results.md` writes this page from the entries, the
@@ -134,17 +136,17 @@ on our data. The answers use the ranking metric and the level of 5 %:
 
 | answer | meaning |
 | --- | --- |
-| yes | significantly better than every other model |
-| no | significantly worse than the only other model |
-| open | the test finds no difference from the other model |
+| yes | significantly better than every compared model |
+| no | significantly worse than the only compared model |
+| open | the test finds no difference from the only compared model |
 | better than 4, worse than 0, open: 1 | better than four models, open for one |
 | 3 of 5 compared | two of the five other models have no usable entry |
 | these weights | a model has fewer than three seeds. More seeds may change the answer |
 | - | no usable entries to compare |
 
 A usable entry is active and fails no [gate](baselines.md#gates). Graph networks are
-named after their [operator](glossary.md). In the first two questions a model named
-", pushforward" stands for its operator.
+named after their [operator](glossary.md). In the first two questions a graph network
+with "pushforward" in its name stands for its operator.
 
 Do not compare the errors of the thesis with ours directly. The thesis trained on its
 own data, at the size `full`. Each value of the thesis comes from one scenario."""
@@ -157,9 +159,9 @@ The next tables have the comparisons behind the answers:
   seeds.
 - `lead` is the difference of the means, positive if the first model is better.
 - `won` counts the scenarios in which the first model is better.
-- `p (Holm)` is corrected for the number of other models. If both models have one seed,
-  p comes from the sign-flip test. Otherwise p comes from a t-test over scenarios and
-  seeds ([tests](scoring.md#comparing-two-methods)).
+- `p (Holm)` is corrected for the number of compared models. If both models have one
+  seed, p comes from the sign-flip test. Otherwise p comes from a t-test over scenarios
+  and seeds ([tests](scoring.md#comparing-two-methods)).
 - Some tables have rows for a second metric. The answers do not use these rows."""
 
 LEADING_NOTE = """\
@@ -189,16 +191,17 @@ lagbench score predictions.nc
 ```
 
 `python -m studies.thesis --size mini --root DATA --runs runs` makes the tables and
-figures of the thesis, and trains the models for them.
+figures of the thesis, and trains the models for them. DATA is your
+[root folder](glossary.md).
 
-A mirror-averaged model has the weights of the model without averaging. Predict with
-`lagbench predict --set model.average=true`. The other variants need these options of
-`lagbench train`, and the options in the column `changed`:"""
+For a mirror-averaged model predict with `lagbench predict --set model.average=true`.
+The other variants need these options of `lagbench train`, and the options in the column
+`changed`:"""
 
 MISSING_NOTE = """\
-These models have no active entry, so this page does not show them. The command in a
-line trains the models of the line that have a recipe. Semicolons separate the names of
-the models."""
+These models have no active entry, so the tables do not show them. Semicolons separate
+the names of the models. The command in a line trains the models of this line, but
+leaves out models without a recipe."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -233,9 +236,11 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     if studies:
         parts += ["## MLPs from frame to frame", *studies]
 
+    named = {name for results in summarised for name in results.methods}
+    named.update(*EXPECTED.values())
     variants = []
     for model in ROSTER.values():
-        if model.variant_of and not model.weights_of:
+        if model.variant_of and not model.weights_of and model.name in named:
             variants.append(_variant_line(model))
     missing = [line for results in thesis_results for line in _missing_lines(results)]
     parts += [COMMANDS, "\n".join(variants), "## Missing"]
@@ -265,19 +270,11 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
     yield claims_overview(rows_by_claim, [results.where for results in learned])
     yield COMPARISONS_NOTE
 
-    unanswered_count = 0
     for claim, rows_by_place in rows_by_claim.items():
         all_rows = [row for rows in rows_by_place.values() for row in rows]
         if all_rows:
             yield f"### {claim.question}"
             yield table_markdown(comparison_table(all_rows))
-        else:
-            unanswered_count += 1
-    if unanswered_count:
-        yield (
-            f"{unanswered_count} more questions in `studies/thesis/claims.py` have no "
-            "answer: no data set has usable entries of the models that they compare."
-        )
 
 
 def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
@@ -330,10 +327,10 @@ def _thesis_vorticity(results: SplitResults) -> Iterator[str]:
     if not table:
         return
     yield (
-        f"**Table 5.4 of the thesis.** Measures of the vorticity at frame "
-        f"{key_frame(results.size)}. Our cells have the mean over the test scenarios, "
-        "and in brackets the value of the first test scenario. Table 5.4 has only one "
-        "test scenario, which corresponds to our first one."
+        "**Table 5.4 of the thesis.** [Metrics](scoring.md#metrics) of the vorticity "
+        f"at frame {key_frame(results.size)}. Our cells have the mean over the test "
+        "scenarios, and in brackets the value of the first test scenario. Table 5.4 "
+        "has only one test scenario, which corresponds to our first one."
     )
     yield table
     tau = order_agreement(results)
