@@ -208,14 +208,21 @@ class ParticleGrid(nn.Module):
         return corner, s - corner
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
-        """Return sums at the nodes, shape [layer, channel, x node, y node].
+        """Return the weighted sums of the particles' values at the nodes (P2G).
 
-        ``value`` has shape [particle, channel]. In three dimensions the last axis is
-        that of the z nodes.
+        Args:
+            stencil: nodes around each particle, and their weights.
+            value: of the particles, shape [particle, channel].
+            layers: number of separate grids, such as one per window and material;
+                particles of two layers do not mix.
+
+        Returns:
+            Shape [layer, channel, x node, y node]; in three dimensions the z nodes are
+            a last axis.
         """
         weight = stencil.weight[:, :, None]
         contributions = weight * value[:, None]
-        contributions = contributions.flatten(0, 1)  # [particle * 9, channel]
+        contributions = contributions.flatten(0, 1)  # [particle * node, channel]
 
         shape = self.shape
         channels = value.shape[1]

@@ -512,9 +512,10 @@ def _make_loader(
 
 
 def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
-    """Fit a model to every scenario; return the log and its one step.
+    """Fit a model to scenarios of train; return the log and the number of steps, 1.
 
-    :class:`Baseline` describes what the method ``fit`` of the model gets and returns.
+    A fit that was finished before is not repeated. :class:`Baseline` describes what the
+    method ``fit`` of the model gets and returns.
     """
     log = job.start_log()
     if job.earlier is not None:

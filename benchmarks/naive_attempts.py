@@ -117,8 +117,12 @@ class AnalogCase:
         """Return how many frames after the last given one a frame is."""
         return frame - self.given.size.task.input_frames + 1
 
-    def flown(self, steps: int) -> tuple[Floats, Floats]:
-        """Return positions and velocities after free flight, thinned."""
+    def fly(self, steps: int) -> tuple[Floats, Floats]:
+        """Return positions [length] and velocities [length/frame] in free flight.
+
+        They are those of every ``thinning``-th particle, so many frames after the last
+        given one.
+        """
         given = self.given
         position = given.last
         before = given.position[-2]
@@ -327,7 +331,7 @@ class Predictors:
     ) -> tuple[list[State], list[float]]:
         """Return the analogs of the state after some frames of flight."""
         weight = float(choice.get("velocity_weight", 20.0))
-        position, velocity = case.flown(steps)
+        position, velocity = case.fly(steps)
         is_exact = kinds == self._kinds(case)
         states = self.library.states(kinds, weight, is_exact=is_exact)
         if states is None:
@@ -370,7 +374,7 @@ class Predictors:
     def _after_flight(
         self,
         case: AnalogCase,
-        flown: int,
+        flight_steps: int,
         follow: PartnerPath,
     ) -> Clouds:
         """Return free flight, then what a function of the frames since then gives."""
@@ -378,15 +382,15 @@ class Predictors:
         clouds = {}
         for frame in case.frames:
             steps = case.steps(frame)
-            if steps <= flown:
-                position, _ = case.flown(steps)
+            if steps <= flight_steps:
+                position, _ = case.fly(steps)
                 clouds[frame] = position
                 continue
-            position = follow(steps - flown)
+            position = follow(steps - flight_steps)
             clouds[frame] = box.inside(position)
         return clouds
 
-    def _flown(self, case: AnalogCase, choice: Choice) -> int:
+    def _flight_steps(self, case: AnalogCase, choice: Choice) -> int:
         """Return the frames of free flight: until the first contact, and ``lag`` more.
 
         Analogs take over then.
@@ -397,10 +401,10 @@ class Predictors:
 
     def shared(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Our own: the particles share the nearest states."""
-        flown = self._flown(case, choice)
-        position, _ = case.flown(flown)
+        flight_steps = self._flight_steps(case, choice)
+        position, _ = case.fly(flight_steps)
         kinds = self._kinds(case)
-        states, _ = self._compare(case, flown, choice, kinds)
+        states, _ = self._compare(case, flight_steps, choice, kinds)
         followers = []
         everybody = np.arange(len(position))
         for number, state in enumerate(states):
@@ -417,14 +421,14 @@ class Predictors:
 
         if not followers:
             return self._fly(case)
-        return self._after_flight(case, flown, follow)
+        return self._after_flight(case, flight_steps, follow)
 
     def weighted(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Nearer states get more particles: shares fall with the distance."""
-        flown = self._flown(case, choice)
-        position, _ = case.flown(flown)
+        flight_steps = self._flight_steps(case, choice)
+        position, _ = case.fly(flight_steps)
         kinds = self._kinds(case)
-        states, distances = self._compare(case, flown, choice, kinds)
+        states, distances = self._compare(case, flight_steps, choice, kinds)
         if not states:
             return self._fly(case)
         sharpness = float(choice["sharpness"])
@@ -449,16 +453,16 @@ class Predictors:
                 cloud[members] = path(frames_on)
             return cloud
 
-        return self._after_flight(case, flown, follow)
+        return self._after_flight(case, flight_steps, follow)
 
     def barycentre(self, case: AnalogCase, choice: Choice) -> Clouds:
         """The mean cloud of the nearest states: matched anew at every frame, then
         averaged with weights that fall with the distance.
         """
-        flown = self._flown(case, choice)
-        position, _ = case.flown(flown)
+        flight_steps = self._flight_steps(case, choice)
+        position, _ = case.fly(flight_steps)
         kinds = self._kinds(case)
-        states, distances = self._compare(case, flown, choice, kinds)
+        states, distances = self._compare(case, flight_steps, choice, kinds)
         if not states:
             return self._fly(case)
         sharpness = float(choice["sharpness"])
@@ -480,20 +484,20 @@ class Predictors:
                 total = total + weight * matched
             return np.asarray(total)
 
-        return self._after_flight(case, flown, follow)
+        return self._after_flight(case, flight_steps, follow)
 
     def per_material(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Every material has analogs of its own.
 
         They may have other materials too, unless the case has one material only.
         """
-        flown = self._flown(case, choice)
-        position, _ = case.flown(flown)
+        flight_steps = self._flight_steps(case, choice)
+        position, _ = case.fly(flight_steps)
         followers = []
         for kind in self._kinds(case):
             kinds = (kind,)
             of_kind = np.flatnonzero(case.material == kind)
-            states, _ = self._compare(case, flown, choice, kinds)
+            states, _ = self._compare(case, flight_steps, choice, kinds)
             for number, state in enumerate(states):
                 members = of_kind[number :: len(states)]
                 path = self._paths(case, state, position, members)
@@ -507,27 +511,27 @@ class Predictors:
                 cloud[members] = path(frames_on)
             return cloud
 
-        return self._after_flight(case, flown, follow)
+        return self._after_flight(case, flight_steps, follow)
 
     def windows(self, case: AnalogCase, choice: Choice) -> Clouds:
         """Analogs are sought anew after every window, from the predicted state."""
-        flown = self._flown(case, choice)
+        flight_steps = self._flight_steps(case, choice)
         weight = 20.0
         kinds = self._kinds(case)
         states = self.library.states(kinds, weight, is_exact=True)
         if states is None:
             return self._fly(case)
         window = int(choice["window"])
-        position, velocity = case.flown(flown)
+        position, velocity = case.fly(flight_steps)
         everybody = np.arange(len(position))
-        start = flown
+        start = flight_steps
         path: PartnerPath | None = None
         box = case.given.box
         clouds = {}
         for frame in case.frames:
             steps = case.steps(frame)
-            if steps <= flown:
-                clouds[frame], _ = case.flown(steps)
+            if steps <= flight_steps:
+                clouds[frame], _ = case.fly(steps)
                 continue
             while path is None or steps - start > window:
                 if path is not None:
@@ -564,7 +568,7 @@ class Predictors:
                 rows.append(row)
         starts = States(tuple(first_states), states.features[rows])
 
-        position, velocity = case.flown(0)
+        position, velocity = case.fly(0)
         feature = describe(position, velocity, case.material, kinds, weight)
         count = int(choice["analogs"])
         chosen, _ = find_nearest_states(
@@ -597,7 +601,7 @@ class Predictors:
         high = given.box.upper_walls
         friction = float(choice["friction"])
         bounce = float(choice["bounce"])
-        position, velocity = case.flown(0)
+        position, velocity = case.fly(0)
         position = position.copy()
         clouds = {}
         wanted = set(case.frames)
@@ -676,7 +680,7 @@ class Predictors:
         clouds = {}
         for frame in case.frames:
             steps = case.steps(frame)
-            clouds[frame], _ = case.flown(steps)
+            clouds[frame], _ = case.fly(steps)
         return clouds
 
 

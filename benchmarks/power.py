@@ -224,12 +224,13 @@ terms:
 - *rest*: e_si changes the score of one seed in one scenario.
 
 A scenario may be harder for both methods. We left out this effect, because it nearly
-cancels.
+cancels in the difference of the two methods.
 
 **Rows.** The first three rows use assumed values. The other rows use values from the
-score files of size mini. We used pairs of methods whose means differ by less than a
-factor of two. In each pair at least one method has several seeds. A split may have only
-one such pair, so these values are rough. A split without such a pair has no row.
+score files of size mini. *Seed* and *rest* come from all methods with several seeds.
+*Method in scenario* comes from pairs of methods whose means differ by less than a
+factor of two. A split may have only one such pair, so these values are rough. A split
+without such a pair has no row.
 
 More scenarios do not remove the scatter between seeds. Train more seeds if two methods
 differ by less than this scatter.

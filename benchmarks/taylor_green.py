@@ -36,7 +36,7 @@ FINE_SIDE = 2000  # particles along a side where only the error of the grid is l
 
 
 def velocity(position: Floats) -> Floats:
-    """Return the flow at positions, shape [particle, 2]."""
+    """Return the velocity of the Taylor-Green flow at positions, [particle, 2]."""
     phase_x = WAVE * position[:, 0]
     phase_y = WAVE * position[:, 1]
     velocity_x = np.sin(phase_x) * np.cos(phase_y)

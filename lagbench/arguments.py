@@ -449,7 +449,10 @@ def _suggest_value(name: str, value: object, kinds: Sequence[ArgumentKind]) -> s
 
 
 def _read_number(text: str, *, whole: bool) -> str:
-    """Return the number of a text as it is typed; empty where there is none."""
+    """Return the number in a text, spelled as in Python.
+
+    It is empty where the text is no number, and with ``whole`` where it has a fraction.
+    """
     if len(text) > MAX_TYPED or not _NUMBER.fullmatch(text):
         return ""
     if re.fullmatch("-?[0-9]+", text):

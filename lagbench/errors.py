@@ -101,16 +101,19 @@ class LagbenchError(Exception):
         got: object = None,
         fix: str | None = None,
     ) -> None:
+        # users and passwords of addresses are hidden in all texts
         # what is wrong, one clause without a full stop
-        self.what = hide_user(what)
+        self.what = hide_credentials(what)
         # file, key, variable or flag concerned
-        self.where = None if where is None else hide_user(where)
+        self.where = None if where is None else hide_credentials(where)
         # what would have been right
-        self.expected = hide_user(expected) if isinstance(expected, str) else expected
+        self.expected = (
+            hide_credentials(expected) if isinstance(expected, str) else expected
+        )
         # the value that is wrong
-        self.got = hide_user(got) if isinstance(got, str) else got
+        self.got = hide_credentials(got) if isinstance(got, str) else got
         # what the user can do about it
-        self.fix = None if fix is None else hide_user(fix)
+        self.fix = None if fix is None else hide_credentials(fix)
         super().__init__(self._compose())
 
     def _compose(self) -> str:
@@ -121,11 +124,11 @@ class LagbenchError(Exception):
             got=self.got,
             fix=self.fix,
         )
-        return hide_user(message)
+        return hide_credentials(message)
 
     def add_note(self, note: str, /) -> None:
         """Add a place to ``where``; our messages do not show Python's own notes."""
-        note = hide_user(note)
+        note = hide_credentials(note)
         if self.where is None:
             self.where = note
         else:
@@ -145,7 +148,7 @@ class LagbenchError(Exception):
         return _rebuild, state
 
 
-def hide_user(text: str, mark: str = "...@") -> str:
+def hide_credentials(text: str, mark: str = "...@") -> str:
     """Return a text with a mark for the users and passwords of the addresses in it.
 
     Messages are printed, logged and sent to others. A password may hold any characters
@@ -154,19 +157,19 @@ def hide_user(text: str, mark: str = "...@") -> str:
     and the first slash is a port, as every reader of addresses takes it: an ``@``
     behind it belongs to the path. Those of stores, such as s3, have no port.
 
-    >>> hide_user("ftp://ann:se/cret@host/data does not answer")
+    >>> hide_credentials("ftp://ann:se/cret@host/data does not answer")
     'ftp://...@host/data does not answer'
-    >>> hide_user("http://nas:8000/data@v2 does not answer")
+    >>> hide_credentials("http://nas:8000/data@v2 does not answer")
     'http://nas:8000/data@v2 does not answer'
-    >>> hide_user("s3://KEY:1/secret@bucket does not answer")
+    >>> hide_credentials("s3://KEY:1/secret@bucket does not answer")
     's3://...@bucket does not answer'
     """
     if "@" not in text:
         return text
-    return _WORD.sub(lambda word: _hide_user_in_word(word[0], mark), text)
+    return _WORD.sub(lambda word: _hide_credentials_in_word(word[0], mark), text)
 
 
-def _hide_user_in_word(word: str, mark: str) -> str:
+def _hide_credentials_in_word(word: str, mark: str) -> str:
     """Return a text without blanks with a mark for the users of its addresses.
 
     Each character is looked at a few times only, however long the text is.

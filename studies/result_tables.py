@@ -104,16 +104,7 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
             open_sets.append(results.where)
     sentences = []
     if pays:
-        sentences.append(
-            f"Learning pays on {_join(pays)}. There the best learned or hybrid model is"
-            " more accurate than every classical solver that costs no more per frame."
-        )
-        if pays_at_less_cost:
-            sentences.append(
-                f"On {_join(pays_at_less_cost)} every classical solver costs more than"
-                " the best model, and the model is more accurate than the cheapest"
-                " solver."
-            )
+        sentences += _where_learning_pays(pays, pays_at_less_cost)
         sentences += slower_than_simulator(time_ratios)
     if open_sets:
         sentences.append(
@@ -133,6 +124,33 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         )
     sentences += no_verdict
     return " ".join(sentences)
+
+
+def _where_learning_pays(
+    places: Sequence[str], at_less_cost: Sequence[str]
+) -> list[str]:
+    """Return sentences on the data sets where learning pays.
+
+    Args:
+        places: the data sets.
+        at_less_cost: those of them where every classical solver costs more.
+    """
+    place = "There"
+    count = len(places) - len(at_less_cost)
+    if at_less_cost:
+        place = f"On {count} of these {len(places)} data sets"
+    sentences = [f"Learning pays on {_join(places)}."]
+    if count:
+        sentences.append(
+            f"{place} the best learned or hybrid model is more accurate than every"
+            " classical solver that costs no more per frame."
+        )
+    if at_less_cost:
+        sentences.append(
+            f"On {_join(at_less_cost)} every classical solver costs more than the best"
+            " model. There the model is more accurate than the cheapest solver."
+        )
+    return sentences
 
 
 def deciding_model(results: SplitResults) -> str | None:

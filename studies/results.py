@@ -41,9 +41,7 @@ from .thesis.plan import TABLES, read_study_results, study_name, study_rows
 from .thesis.roster import (
     EXPECTED,
     NEWER_SPLITS,
-    ROSTER,
     SIZES,
-    RosterModel,
     label,
 )
 from .thesis.split_results import (
@@ -80,8 +78,8 @@ SUMMARY_NOTE = """\
 - A *learned* [model](baselines.md) contains no solver. A *hybrid* is a classical solver
   with a learned part. Some data sets have no hybrid.
 - The time in brackets is the processor time of one frame on one core, as a mean over
-  the first ten frames. Compare only times of one data set. One run on one machine
-  measured the times of a data set.
+  the first ten frames. All times of one data set come from one run on one machine. So
+  compare times only within a data set.
 - `skill` is 1 - (score of the model) / (score of the best naive predictor). Skill 1 is
   perfect. Skill 0 is as good as that predictor.
 - `against_classical` is (score of the model) / (score of a classical solver). The
@@ -91,7 +89,8 @@ SUMMARY_NOTE = """\
   the cell says "which costs more".
 - *Learning pays* on a data set if the whole interval of `against_classical` is below 1.
   The best learned or hybrid model decides.
-- If every solver costs more, the only possible verdict is that learning pays."""
+- If every solver costs more and the interval is not below 1 as a whole, there is no
+  verdict."""
 
 VERDICT = "## Verdict"
 
@@ -121,8 +120,8 @@ vorticity.
 
 **Trainings.**
 
-- `changed` lists the options that differ from the recipe. A slash separates different
-  values of the seeds.
+- `changed` lists the options that differ from the recipe. If the seeds of a model
+  differ in an option, a slash separates the options of the seeds.
 - The CPU hours are a mean over the seeds, without hours on a GPU. The hours include
   validations only for the first seed of NeuralMPM on cavity mini.
 - If a training started from other weights, its hours include the earlier trainings.
@@ -141,12 +140,13 @@ on our data. The answers use the ranking metric and the level of 5 %:
 | open | the test finds no difference from the only compared model |
 | better than 4, worse than 0, open: 1 | better than four models, open for one |
 | 3 of 5 compared | two of the five other models have no usable entry |
-| these weights | a model has fewer than three seeds. More seeds may change the answer |
+| these weights | a model that has random training has fewer than three seeds |
 | - | no usable entries to compare |
 
 A usable entry is active and fails no [gate](baselines.md#gates). Graph networks are
 named after their [operator](glossary.md). In the first two questions a graph network
-with "pushforward" in its name stands for its operator.
+with "pushforward" in its name stands for its operator. The compared networks may also
+differ in size and training, see the tables of trainings.
 
 Do not compare the errors of the thesis with ours directly. The thesis trained on its
 own data, at the size `full`. Each value of the thesis comes from one scenario."""
@@ -194,9 +194,8 @@ lagbench score predictions.nc
 figures of the thesis, and trains the models for them. DATA is your
 [root folder](glossary.md).
 
-For a mirror-averaged model predict with `lagbench predict --set model.average=true`.
-The other variants need these options of `lagbench train`, and the options in the column
-`changed`:"""
+The file `leaderboard/submissions/SPLIT/SIZE/METHOD.yaml` states under `command` how
+each model was made."""
 
 MISSING_NOTE = """\
 These models have no active entry, so the tables do not show them. Semicolons separate
@@ -236,14 +235,8 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     if studies:
         parts += ["## MLPs from frame to frame", *studies]
 
-    named = {name for results in summarised for name in results.methods}
-    named.update(*EXPECTED.values())
-    variants = []
-    for model in ROSTER.values():
-        if model.variant_of and not model.weights_of and model.name in named:
-            variants.append(_variant_line(model))
     missing = [line for results in thesis_results for line in _missing_lines(results)]
-    parts += [COMMANDS, "\n".join(variants), "## Missing"]
+    parts += [COMMANDS, "## Missing"]
     if missing:
         parts += [MISSING_NOTE, "\n".join(missing)]
     else:
@@ -366,13 +359,6 @@ def _studies(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
             row_names = {study_name(study) for study in study_rows(name)}
             if row_names & studies.keys():
                 yield studies_beside_thesis(name, size, studies).text
-
-
-def _variant_line(model: RosterModel) -> str:
-    """Return how a variant of a reference model is trained."""
-    settings = "".join(f" --set {setting}" for setting in model.settings)
-    recipe = f" --recipe {model.recipe}" if model.recipe else ""
-    return f"- {model.label}: `--baseline {model.baseline}{recipe}{settings}`"
 
 
 def _missing_lines(results: SplitResults) -> Iterator[str]:

@@ -124,19 +124,27 @@ class Rescoring:
                 card.predictions_sha256,
                 expected="an entry with these predictions, or of this method and seed",
             )
+        issues = []
+        agrees_with_one = False
         for file in files:
             if file.score_path not in self.readable_score_files:
                 continue
             stored = read_score_file(self.folder.path / file.score_path).scores
-            reproduction = compare(
-                file.entry.score.ranking_metric,
-                stored.tallies,
-                card.tallies[SUBMISSION],
-                seed=file.prediction.seed,
-                model=card.predictions_sha256,
-                of=len(stored.tallies),
-            )
+            try:
+                reproduction = compare(
+                    file.entry.score.ranking_metric,
+                    stored.tallies,
+                    card.tallies[SUBMISSION],
+                    seed=file.prediction.seed,
+                    model=card.predictions_sha256,
+                    of=len(stored.tallies),
+                )
+            except ChecksFailedError as error:
+                got = f"{error.what}: {error.got}"
+                issues.append(make_issue("rescored", path, got))
+                continue
             if reproduction.agrees:
+                agrees_with_one = True
                 confirmation = Confirmation(
                     path,
                     file.entry.yaml_path,
@@ -146,13 +154,17 @@ class Rescoring:
                 )
                 self.confirmations.append(confirmation)
                 continue
-            yield make_issue(
+            issue = make_issue(
                 "rescored",
                 path,
                 f"{reproduction.metric} {reproduction.reproduced}",
                 expected=f"{reproduction.submitted} of {file.score_path}, within "
                 f"{reproduction.tolerance:.1%}",
             )
+            issues.append(issue)
+        # an entry that is replaced may have the name of the one that agrees
+        if not agrees_with_one:
+            yield from issues
 
     def _files_of_method(self, header: Header) -> list[EntryFile]:
         """Return the files of entries that have the method and seed of a header."""

@@ -153,7 +153,10 @@ def _split_bibtex(
 
 
 def _format_bibtex(kind: str, key: str, fields: Mapping[str, str]) -> str:
-    """Return a BibTeX entry; characters that TeX would read as commands are escaped."""
+    """Return a BibTeX entry; characters that TeX would read as commands are replaced.
+
+    The author is kept as it is, in braces.
+    """
     escapes = str.maketrans(TEX_ESCAPES)
 
     lines = [f"@{kind}{{{key},"]

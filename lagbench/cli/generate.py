@@ -10,7 +10,7 @@ from typing import Annotated
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Registry, load
-from lagbench.errors import UsageError, format_count, hide_user
+from lagbench.errors import UsageError, format_count, hide_credentials
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.inventory import recording_hint
 from lagbench.scoring.boards import find_board
@@ -242,7 +242,7 @@ def _describe_result(result: GenerationResult) -> list[str]:
     url = url_of(result.root)
     if url is not None:
         folder = result.folder.relative_to(result.root).as_posix()
-        lines.append(f"  store   {hide_user(url)}/{folder}")
+        lines.append(f"  store   {hide_credentials(url)}/{folder}")
     if result.missing:
         missing_ids = format_ids(result.missing)
         lines.append(f"  missing {missing_ids}: the data set is incomplete")

@@ -19,7 +19,7 @@ from lagbench.data.layout import (
 )
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size, Split, load
-from lagbench.errors import LagbenchError, escape_line, hide_user
+from lagbench.errors import LagbenchError, escape_line, hide_credentials
 from lagbench.make.inventory import Overview, overview
 
 from .options import JsonFlag, RootOption, accept_split, choose_split, option
@@ -87,7 +87,9 @@ def list_command(
         print_line(line)
     for line in _describe_times(overviews):
         print_line(line)
-    print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
+    print_line(
+        f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
+    )
 
 
 def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
@@ -112,7 +114,9 @@ def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
     print_line("")
     print_references(sizes, references)
     print_line(f"all parameters: lagbench info {split}")
-    print_line(f"folder of all data sets: {hide_user(url_of(folder) or str(folder))}")
+    print_line(
+        f"folder of all data sets: {hide_credentials(url_of(folder) or str(folder))}"
+    )
 
 
 def _print_title(name: str, entry: Split) -> None:

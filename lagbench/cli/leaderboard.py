@@ -377,7 +377,7 @@ def _time_solver(split: str, size: str) -> float | None:
 def _describe_reproduced(
     result: ReproduceResult, *, with_scores: bool, with_costs: bool
 ) -> Iterator[str]:
-    """Yield a text line for each seed and each cost, then the totals.
+    """Yield a text line for each seed and each cost, fixes, then the totals.
 
     Args:
         result: what was run, and what was recorded before.

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import platformdirs
 
-from lagbench.errors import DataError, UsageError, hide_user
+from lagbench.errors import DataError, UsageError, hide_credentials
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable for the folder of working copies and of measured speeds."""
@@ -84,7 +84,7 @@ def working_copy_of(url: str) -> Path:
     >>> working_copy_of("s3://bucket/data").name
     's3-bucket-data-397b84d8'
     """
-    address = hide_user(url, mark="")
+    address = hide_credentials(url, mark="")
     words = re.sub(r"[^A-Za-z0-9._]+", "-", address).strip("-.")[:60]
     digest = hashlib.sha256(url.encode()).hexdigest()
     try:
@@ -388,5 +388,5 @@ def quote_root(root: str | Path) -> str:
     """Return a root as an option's value for a shell: its URL, or its absolute path."""
     url = url_of(Path(root))
     if url is not None:
-        return shlex.quote(hide_user(url))
+        return shlex.quote(hide_credentials(url))
     return shlex.quote(os.path.abspath(root))

@@ -30,7 +30,7 @@ from lagbench.data.manifest import (
     write_manifest,
 )
 from lagbench.data.registry import Registry, Size, Split
-from lagbench.errors import DataError, UsageError, WorkFailedError, hide_user
+from lagbench.errors import DataError, UsageError, WorkFailedError, hide_credentials
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
 from lagbench.make.inventory import (
@@ -493,7 +493,7 @@ class DownloadJob:
             entry = entry.model_copy(update=update)
         self._entries.append(entry)
         self.downloaded.append(scenario)
-        self.url = hide_user(url)
+        self.url = hide_credentials(url)
         self._meter.count(scenarios=1)
 
     def _count_bytes(self, byte_count: int) -> None:

@@ -133,19 +133,21 @@ def export(
 
     frames_by_subset = _frames_by_subset(tier, data_root)
     statistics, dataset_sha256 = _recorded_statistics(tier, data_root)
-    spacing, has_moving_walls = _inspect_scenario(
+    spacing, has_wall_velocity = _inspect_scenario(
         next(iter(frames_by_subset["train"])), tier
     )
     if from_walls is None:
         is_measured_from_walls = (
-            tier.is_full_box or has_moving_walls or tier.box.is_periodic
+            tier.is_full_box or has_wall_velocity or tier.box.is_periodic
         )
     else:
         is_measured_from_walls = from_walls
     walls = None
     if wall_particles:
         has_unit_box = from_walls is False and file_format is Format.LAGRANGEBENCH_H5
-        _check_walls(tier, has_moving_walls=has_moving_walls, has_unit_box=has_unit_box)
+        _check_walls(
+            tier, has_wall_velocity=has_wall_velocity, has_unit_box=has_unit_box
+        )
         walls = WallParticles(tier.bounds, spacing)
     wall_thickness = None
     if walls is not None:
@@ -190,7 +192,7 @@ def export(
         written,
         frames_by_subset,
         shapes,
-        loses_wall_motion=has_moving_walls and not wall_particles,
+        loses_wall_motion=has_wall_velocity and not wall_particles,
     )
 
 
@@ -296,9 +298,9 @@ def _check_target(folder: Path, files: Sequence[Path], *, overwrite: bool) -> No
             )
 
 
-def _check_walls(size: Size, *, has_moving_walls: bool, has_unit_box: bool) -> None:
+def _check_walls(size: Size, *, has_wall_velocity: bool, has_unit_box: bool) -> None:
     """Refuse wall particles where no wall can move, or where they have no room."""
-    if not has_moving_walls or size.box.is_periodic or size.dimension != 2:
+    if not has_wall_velocity or size.box.is_periodic or size.dimension != 2:
         raise UsageError(
             "wall particles need a box of two dimensions with four walls",
             where="--wall-particles",
@@ -320,11 +322,11 @@ def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
     """Return the spacing of particles [length], and whether walls may move."""
     with read_scenario(path) as file:
         mass = file.read_particle_mass()
-        has_moving_walls = "wall_velocity" in file.variables
+        has_wall_velocity = "wall_velocity" in file.variables
     volume = mass / float(size.value("density"))
     if size.dimension == 2:
-        return math.sqrt(volume), has_moving_walls
-    return math.cbrt(volume), has_moving_walls
+        return math.sqrt(volume), has_wall_velocity
+    return math.cbrt(volume), has_wall_velocity
 
 
 def _is_free_slip(size: Size) -> bool:

@@ -243,12 +243,13 @@ def _no_own_metric(value: object) -> UsageError:
 
 
 def _check_statistics(own: Metric, table: Mapping[str, Metric]) -> None:
-    """Refuse a metric that follows from statistics which no metric measures."""
+    """Refuse a metric of a user that follows from what no metric measures."""
     for name in own.of:
         if name not in table or table[name].statistic is None:
-            statistics = [
-                name for name, metric in table.items() if metric.statistic is not None
-            ]
+            statistics = []
+            for known_name, metric in table.items():
+                if metric.statistic is not None:
+                    statistics.append(known_name)
             raise UsageError(
                 f"metric {own.name!r} follows from what no metric measures",
                 where="of",

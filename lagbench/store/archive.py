@@ -22,7 +22,7 @@ from pathlib import Path
 
 from lagbench.addresses import ARCHIVES
 from lagbench.atomic import atomic_path
-from lagbench.data.layout import MANIFEST_NAME
+from lagbench.data.layout import MANIFEST_NAME, format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import (
     MANIFEST_LIMIT,
@@ -128,24 +128,39 @@ def write_archive(
 
 def _read_complete_manifest(size: Size, root: Path) -> Manifest:
     """Return the manifest of a data set with all scenarios and the recorded hash."""
+    where = str(size.folder(root))
+    repair = suggest_repair(size, root=root)
     manifest = read_manifest(root, size.split, size.name, size.major)
-    recorded_hash = None
-    if size.measured is not None:
-        recorded_hash = size.measured.dataset_sha256
-    dataset_hash = "no manifest"
+    present = set()
     if manifest is not None:
-        dataset_hash = str(manifest.dataset_sha256)
-        scenarios = [entry.scenario for entry in manifest.files]
-        is_complete = scenarios == list(size.scenarios)
-        if is_complete and manifest.dataset_sha256 == recorded_hash:
-            return manifest
-    raise DataError(
-        "the data set is not complete, or of another hash",
-        where=str(size.folder(root)),
-        expected=f"data set hash {recorded_hash}",
-        got=dataset_hash,
-        fix=suggest_repair(size, root=root),
-    )
+        present = {entry.scenario for entry in manifest.files}
+    missing = [scenario for scenario in size.scenarios if scenario not in present]
+    if manifest is None or missing:
+        raise DataError(
+            "the data set is not complete",
+            where=where,
+            expected=f"a manifest with scenarios {format_ids(size.scenarios)}",
+            got=f"missing: {format_ids(missing)}",
+            fix=repair,
+        )
+    if size.measured is None:
+        raise DataError(
+            "the hash of the data set is not recorded",
+            where=f"{size.record_name}, {size.split} {size.name}",
+            expected="a data set hash",
+            got="none",
+            fix="record the data set first: docs/extending.md",
+        )
+    recorded_hash = size.measured.dataset_sha256
+    if manifest.dataset_sha256 != recorded_hash:
+        raise DataError(
+            "the data set has another hash",
+            where=where,
+            expected=f"data set hash {recorded_hash}",
+            got=manifest.dataset_sha256,
+            fix=repair,
+        )
+    return manifest
 
 
 def fetch_archive(

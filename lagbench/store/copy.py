@@ -40,7 +40,7 @@ from lagbench.errors import (
     DataError,
     UsageError,
     format_count,
-    hide_user,
+    hide_credentials,
     suggest_name,
 )
 from lagbench.work.machine import may_differ
@@ -621,7 +621,7 @@ class _TransferDisplay:
     """Prints on a terminal how much has been fetched."""
 
     def __init__(self, url: str, object_count: int, total_bytes: int) -> None:
-        self._url = hide_user(url)
+        self._url = hide_credentials(url)
         self._object_count = object_count
         self._total_bytes = total_bytes
         self.finished_objects = 0

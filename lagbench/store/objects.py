@@ -28,7 +28,7 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     WorkFailedError,
-    hide_user,
+    hide_credentials,
     require,
 )
 
@@ -222,14 +222,14 @@ def _short_address(url: str) -> str:
     """Return an address for a message: its beginning, without user and password."""
     # a blank would end the address
     whole_address = re.sub(r"\s", "%20", url)
-    if hide_user(whole_address) == whole_address:
+    if hide_credentials(whole_address) == whole_address:
         return url[:LONGEST_SHOWN]
-    return hide_user(whole_address, mark="")[:LONGEST_SHOWN]
+    return hide_credentials(whole_address, mark="")[:LONGEST_SHOWN]
 
 
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
-    if hide_user(url) != url:
+    if hide_credentials(url) != url:
         # the message and the manifest would show it
         msg = "a user or a password before its host; an @ in its path is %40"
         raise ValueError(msg)
@@ -507,7 +507,7 @@ def _require_scheme(url: str) -> str:
         where=_short_address(url),
         expected="http://host/path, s3://bucket/prefix, or another that fsspec knows; "
         "file:///path for a folder",
-        got=ascii(hide_user(scheme)[:LONGEST_SHOWN]),
+        got=ascii(hide_credentials(scheme)[:LONGEST_SHOWN]),
         fix=fix,
     )
 
@@ -529,7 +529,7 @@ def _require_place(url: str, place: str) -> None:
             fix=STORE_HINT,
         )
     without_blanks = re.sub(r"\s", "", url)
-    has_user = hide_user(without_blanks) != without_blanks
+    has_user = hide_credentials(without_blanks) != without_blanks
     has_blank = re.search(r"\s", url.rpartition("@")[0]) is not None
     if has_user and has_blank and not url.startswith(LOCAL):
         # messages would show what stands before the blank
@@ -602,7 +602,7 @@ def _store_errors(url: str) -> Iterator[None]:
 def _translate_error(error: Exception, url: str) -> LagbenchError:
     """Return the error of ours that an exception of a file system means."""
     message = f"{type(error).__name__}: {str(error)[:300]}"
-    if hide_user(url) != url:
+    if hide_credentials(url) != url:
         # a library may show a part of the password
         message = type(error).__name__
     if isinstance(error, ImportError):

@@ -410,11 +410,11 @@ class SplitResults:
     @property
     def models(self) -> dict[str, Method]:
         """The learned and hybrid models, in the order of their names."""
-        return {
-            name: method
-            for name, method in sorted(self.methods.items())
-            if name not in REFERENCES
-        }
+        models = {}
+        for name, method in sorted(self.methods.items()):
+            if method.kind in (Kind.LEARNED, Kind.HYBRID):
+                models[name] = method
+        return models
 
     def best(self, *kinds: Kind) -> str | None:
         """Return the best method of some kinds; None where none of them is ranked."""

@@ -18,7 +18,7 @@ import lagbench
 from lagbench import addresses
 from lagbench.data.layout import working_copy_of
 from lagbench.data.manifest import Manifest
-from lagbench.errors import DataError, LagbenchError, UsageError, hide_user
+from lagbench.errors import DataError, LagbenchError, UsageError, hide_credentials
 from lagbench.exchange import download
 from lagbench.exchange.downloading import DownloadResult
 from lagbench.exchange.local_split import LocalSplit
@@ -323,7 +323,7 @@ def test_no_value_in_a_message_shows_the_user_of_an_address(value: object) -> No
 )
 def test_a_password_may_hold_slashes(text: str, shown: str) -> None:
     """An address without a user, and an @ elsewhere, stay as they are."""
-    assert hide_user(text) == shown
+    assert hide_credentials(text) == shown
 
 
 @pytest.mark.parametrize(

@@ -207,7 +207,7 @@ def velocities_that_lie(path: Path, rng: np.random.Generator) -> None:
 
 
 def wrong_walls(path: Path, rng: np.random.Generator) -> None:
-    """Move walls wrongly: no numbers, other shapes or types, or far too fast."""
+    """Spoil the wall velocities of a trajectory: not finite, too fast, other shapes."""
     kind = int(rng.integers(9))
 
     def change(arrays: Arrays) -> None:
