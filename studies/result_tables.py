@@ -147,7 +147,7 @@ def _where_learning_pays(
         )
     if at_less_cost:
         sentences.append(
-            f"On {_join(at_less_cost)} every classical solver costs more than the best"
+            f"On {_join(at_less_cost)} no classical solver costs as little as the best"
             " model. There the model is more accurate than the cheapest solver."
         )
     return sentences

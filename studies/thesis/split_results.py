@@ -412,7 +412,8 @@ class SplitResults:
         """The learned and hybrid models, in the order of their names."""
         models = {}
         for name, method in sorted(self.methods.items()):
-            if method.kind in (Kind.LEARNED, Kind.HYBRID):
+            is_model = method.kind in (Kind.LEARNED, Kind.HYBRID)
+            if is_model and name not in REFERENCES:
                 models[name] = method
         return models
 
