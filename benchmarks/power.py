@@ -246,8 +246,8 @@ rate of 5 % gives a share between 3.6 and 6.4 % (95 % interval).
 {false_rows}
 
 If one side has only one seed, the test judges the weights of this seed, not the method
-([table](scoring.md#comparing-two-methods)). These weights may really be better or
-worse, although the method is the same. So the leaderboard speaks of "these weights".
+([table](scoring.md#comparing-two-methods)). These weights may really be better or worse
+than other weights of the same method. So the leaderboard speaks of "these weights".
 
 The rows *middling* and *large* are equal. All deviations of *large* are twice those of
 *middling*, and a common factor does not change the test.

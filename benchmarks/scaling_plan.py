@@ -352,9 +352,10 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     }
     return [
         f"The plan is for {SCENARIOS:,} scenarios, with the times per particle of "
-        f"q = {measured_q}. A scenario has {n:,} particles, {frames} frames of {row.substeps} "
-        f"substeps, and a grid of {row.grid} x {row.grid} cells. The horizon and "
-        f"the perturbed runs end at frame {HORIZON_END}, as in fluid full:",
+        f"q = {measured_q}. A scenario has {n:,} particles, {frames} frames of "
+        f"{row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
+        f"The horizon and the perturbed runs end at frame {HORIZON_END}, as in fluid "
+        "full:",
         "",
         "| part | size or time |",
         "|---|--:|",
