@@ -245,10 +245,9 @@ rate of 5 % gives a share between 3.6 and 6.4 % (95 % interval).
 |---|---|---|---|---|---|
 {false_rows}
 
-With one seed on each side, the test compares two sets of weights
-([sign-flip test](scoring.md#comparing-two-methods)). One set may really be better than
-the other set, although the method is the same. So the leaderboard speaks of "these
-weights" if one side has only one seed.
+If one side has only one seed, the test judges the weights of this seed, not the method
+([table](scoring.md#comparing-two-methods)). These weights may really be better or worse
+than other weights of the same method. So the leaderboard speaks of "these weights".
 
 The rows *middling* and *large* are equal. All deviations of *large* are twice those of
 *middling*, and a common factor does not change the test.

@@ -351,10 +351,11 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"The plan is for {SCENARIOS:,} scenarios, with the times of q = {measured_q}. "
-        f"A scenario has {n:,} particles, {frames} frames of {row.substeps} "
-        f"substeps, and a grid of {row.grid} x {row.grid} cells. The horizon and "
-        f"the perturbed runs end at frame {HORIZON_END}, as in fluid full:",
+        f"The plan is for {SCENARIOS:,} scenarios, with the times per particle of "
+        f"q = {measured_q}. A scenario has {n:,} particles, {frames} frames of "
+        f"{row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
+        f"The horizon and the perturbed runs end at frame {HORIZON_END}, as in fluid "
+        "full:",
         "",
         "| part | size or time |",
         "|---|--:|",
@@ -420,9 +421,9 @@ def main() -> int:
         "",
         "A *whole generation* makes one scenario of train, one scenario of test, and "
         "the [perturbed run](../glossary.md) of the test scenario. The *sum of the "
-        "parts* comes from the first table. A whole generation takes longer, because "
-        "the command also imports, compiles, writes the manifest and draws the "
-        "pictures. The *client* is the process that you start. "
+        "parts* comes from the first table. A whole generation takes longer than the "
+        "sum of the parts, because the command also imports, compiles, writes the "
+        "manifest and draws the pictures. The *client* is the process that you start. "
         "The client starts the workers.",
         "",
         *whole_table(measured),
