@@ -118,9 +118,9 @@ def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
         )
     if does_not_pay:
         sentences.append(
-            f"Learning does not pay on {_join(does_not_pay)}. There a classical solver"
-            " that costs no more is more accurate than the best learned or hybrid"
-            " model."
+            f"Learning does not pay on {_join(does_not_pay)}. There the best learned"
+            " or hybrid model is less accurate than a classical solver that costs no"
+            " more."
         )
     sentences += no_verdict
     return " ".join(sentences)
@@ -165,8 +165,7 @@ def deciding_model(results: SplitResults) -> str | None:
 def time_over_simulator(results: SplitResults, model: str) -> float | None:
     """Return the time of a frame of a model over that of the solver of the data.
 
-    Both are times of the first ten frames, measured in one run. None without such a
-    run.
+    Both times were measured in one run. None without such a run.
     """
     measured = results.methods[model].measured
     if measured is None or measured.speed_up is None:
@@ -203,7 +202,7 @@ def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
         )
     sentence = (
         f"{place}the best model takes more time per frame than the simulator that made"
-        f" the data ({times}, in the first ten frames)."
+        f" the data ({times})."
     )
     return [sentence[0].upper() + sentence[1:]]
 

@@ -61,14 +61,14 @@ INTRODUCTION = """\
 On this page you can look up for each data set:
 
 - which model is the most accurate;
-- how accurate predictors without training are;
-- whether a model is better than a classical solver that costs no more;
+- the scores of predictors without training;
+- whether a model is better than every classical solver of the same or a smaller cost;
 - which recipe trained a model, and how long the training took.
 
 The next table has the best learned model and the best hybrid of each data set. The
 [verdict](#verdict) follows. Then each data set has a chapter with its
-[active entries](glossary.md) and reference predictors. Last come the [claims](#claims)
-of the thesis and notes on the trainings."""
+[active entries](glossary.md) and reference predictors. Last come [claims](#claims)
+about the models, and notes on the trainings."""
 
 SUMMARY_NOTE = """\
 - Scores are errors ([metrics](scoring.md#metrics)), so lower is better.
@@ -130,8 +130,8 @@ vorticity.
 score files and the records of the trainings."""
 
 CLAIMS_NOTE = """\
-The questions below concern the splits of the thesis. Some test a claim of the thesis
-on our data. The answers use the ranking metric and the level of 5 %:
+The questions below concern the splits of the thesis. Some questions test a claim of the
+thesis on our data. The answers use the ranking metric and the level of 5 %:
 
 | answer | meaning |
 | --- | --- |
@@ -140,7 +140,7 @@ on our data. The answers use the ranking metric and the level of 5 %:
 | open | the test finds no difference from the only compared model |
 | better than 4, worse than 0, open: 1 | better than four models, open for one |
 | 3 of 5 compared | two of the five other models have no usable entry |
-| these weights | a model that has random training has fewer than three seeds |
+| these weights | a compared model with random training has fewer than three seeds |
 | - | no usable entries to compare |
 
 A usable entry is active and fails no [gate](baselines.md#gates). Graph networks are
@@ -198,9 +198,9 @@ The file `leaderboard/submissions/SPLIT/SIZE/METHOD.yaml` states under `command`
 each model was made."""
 
 MISSING_NOTE = """\
-These models have no active entry, so the tables do not show them. Semicolons separate
-the names of the models. The command in a line trains the models of this line, but
-leaves out models without a recipe."""
+The models below have no active entry, so the tables do not show them. Semicolons
+separate the names of the models. Each command trains the models of its line that have a
+recipe."""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
@@ -384,9 +384,9 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
     if missing:
         names = "; ".join(missing)
         if len(missing) == len(expected):
-            names = "all models of the thesis, and NeuralMPM trained at this size"
+            names = "all models of the thesis, and NeuralMPM of this size"
         command = f"python -m studies.thesis --size {results.size.name} --split {split}"
-        yield f"- {results.where}: without an entry, `{command}`: {names}."
+        yield f"- {results.where}: without a recorded training: {names}. `{command}`"
     if results.stale:
         count = len(results.stale)
         yield f"- {results.where}: {count} score files belong to other data."
