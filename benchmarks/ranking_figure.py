@@ -8,6 +8,7 @@ a permuted prediction, and the scores that our own metrics give them.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -206,6 +207,11 @@ def draw_prediction(axes: Axes, pair: FramePair, limit: float) -> None:
 
 def main() -> int:
     """Draw the figure."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.parse_args()
+
     rng = np.random.Generator(np.random.PCG64(1))
     full_box_pairs = full_box(rng)
     splash_pairs = splash(rng)
