@@ -338,8 +338,11 @@ class FullBox(Driver[FullBoxParameters]):
             max_speed = float(speeds.max())
             is_valid = max_speed <= speed_bound
         if not is_valid:
+            what = "the stream is no possible velocity"
+            if state.stream is None:
+                what = "a fringe needs a stream"
             raise UsageError(
-                "a fringe needs a stream",
+                what,
                 where=f"scenario {index}, stream",
                 expected=f"a velocity of {self.dimension} components up to dx/dt = "
                 f"{speed_bound:.6g}",

@@ -301,7 +301,7 @@ def loaded_after() -> Callable[[str], set[str]]:
         (READING[5], {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"}),
         (READING[6], DRAWN),
         (READING[7], {"matplotlib", "PIL", "taichi", "torch"}),
-        (WRITING[0], {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"}),
+        (WRITING[0], {"xarray", "pandas", "netCDF4", "pydantic", "scipy", "dask"}),
     ],
 )
 def test_light_things_stay_light(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.errors import UsageError, UsageErrorCollector
+from lagbench.references.predictor import Kind
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.submission.budget import Budget
 from lagbench.submission.format import Header
@@ -68,9 +69,11 @@ def draft_entry(
         read_verified(folder)  # publishing may have to write it
     with errors:
         about = _describe(headers, meta, extended)
-    kind = meta.kind
+    kind: Kind | None = meta.kind
     if extended is not None:
         kind = _fill_from_entry(meta, extended).kind
+    elif add:
+        kind = None  # that of an entry which is not known, for it was refused
     with errors:
         weight_paths = require_weights(
             weights, headers, rivals, folder=folder, place=place, kind=kind

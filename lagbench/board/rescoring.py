@@ -140,8 +140,13 @@ class Rescoring:
                     of=len(stored.tallies),
                 )
             except ChecksFailedError as error:
-                got = f"{error.what}: {error.got}"
-                issues.append(make_issue("rescored", path, got))
+                issue = make_issue(
+                    "rescored",
+                    path,
+                    f"{error.what}: {error.got}",
+                    expected=f"a value of {error.where} in {file.score_path} too",
+                )
+                issues.append(issue)
                 continue
             if reproduction.agrees:
                 agrees_with_one = True
@@ -162,7 +167,7 @@ class Rescoring:
                 f"{reproduction.tolerance:.1%}",
             )
             issues.append(issue)
-        # an entry that is replaced may have the name of the one that agrees
+        # an entry and its successor may have the same name
         if not agrees_with_one:
             yield from issues
 

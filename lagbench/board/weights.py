@@ -61,8 +61,8 @@ MOST_LOG_BYTES = 256 << 10
 
 TRAINING_LOG = "training.json"
 
-HYBRID_PREFIX = "hybrid-"
-"""Start of the names of our hybrid baselines; a learned baseline has another start."""
+HYBRID_BASELINES = ("hybrid-projection", "hybrid-coarse")
+"""Our baselines that contain a solver; those of packages are not known."""
 
 
 class LogLeftOutWarning(UserWarning):
@@ -76,7 +76,7 @@ def require_weights(
     *,
     folder: Folder,
     place: Place,
-    kind: Kind,
+    kind: Kind | None,
 ) -> tuple[Path | None, ...]:
     """Return the weights of each of the predictions, by seed; None where it has none.
 
@@ -86,7 +86,7 @@ def require_weights(
         rivals: other active entries of the data set, by path.
         folder: the leaderboard.
         place: split, size and method of the entry.
-        kind: what the submitter says of the method.
+        kind: what the submitter says of the method; None where it is not known.
 
     Raises:
         UsageError: the weights are too large, or more files than predictions; they did
@@ -258,9 +258,10 @@ def _require_new_use(
             )
 
 
-def _require_kind(file: WeightsFile, kind: Kind) -> None:
+def _require_kind(file: WeightsFile, kind: Kind | None) -> None:
     """Refuse weights of a hybrid for an entry that states another kind."""
-    if file.baseline.startswith(HYBRID_PREFIX) and kind is not Kind.HYBRID:
+    is_hybrid = file.baseline in HYBRID_BASELINES
+    if is_hybrid and kind not in (Kind.HYBRID, None):
         raise UsageError(
             "the weights are those of a hybrid, and the entry states another kind",
             where=f"kind in --from meta.yaml, and {file.path}",
@@ -524,6 +525,7 @@ def check_weights(
             log = path.with_suffix(".json")
             known_paths |= {path, log}
             yield from _check_log(folder, log)
+            yield from _check_kind(folder, log, entry.kind, where=where)
 
             is_active = entry.status is Status.ACTIVE
             if is_active and is_unchanged(folder, path, weights.sha256):
@@ -587,6 +589,29 @@ def _check_weights_file(
                 f"SHA-256 {sha256[:16]}",
                 expected=f"{weights.sha256[:16]} as the entry says",
             )
+
+
+def _check_kind(
+    folder: Folder, log: Path, kind: Kind, *, where: str
+) -> Iterator[ValidationIssue]:
+    """Yield that weights are those of a hybrid and the entry says otherwise.
+
+    The log of a training names the baseline.
+    """
+    file = folder.path / log
+    if not file.exists() or folder.link_in(log) is not None:
+        return
+    if reason_unfit_log(file) is not None:
+        return
+    baseline = json.loads(file.read_bytes()).get("baseline")
+    if baseline in HYBRID_BASELINES and kind is not Kind.HYBRID:
+        yield make_issue(
+            "training",
+            where,
+            f"kind: {kind}",
+            what=f"weights of {baseline}, which is a hybrid",
+            expected="kind: hybrid",
+        )
 
 
 def _check_log(folder: Folder, path: Path) -> Iterator[ValidationIssue]:

@@ -15,24 +15,18 @@ from typing import TYPE_CHECKING
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.progress import Progress as ProgressDisplay
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
 from lagbench.errors import escape_unprintable
 from lagbench.figures.tables import Table
-from lagbench.store.copy import silence_fetching
-from lagbench.work.run import Progress, watched
+from lagbench.work.run import Progress, silence, watched
 
 from .stderr import print_on_stderr
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as ProgressDisplay
+
     from lagbench.submission.issues import ValidationResult
 
 WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
@@ -298,22 +292,14 @@ def progress_bar(
         seconds_per_line: time between two lines that go to a file or a pipe [s].
     """
     if quiet:
-        with silence_fetching():
+        with silence():
             yield None
         return
     if not watched():
         yield _print_lines(unit, seconds_per_line)
         return
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[count]}"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with ProgressDisplay(*columns, console=console, transient=True) as display:
+    with _bar_on_stderr() as display:
         task = display.add_task("starting", total=None, count="")
 
         def update_bar(progress: Progress) -> None:
@@ -326,6 +312,21 @@ def progress_bar(
             )
 
         yield update_bar
+
+
+def _bar_on_stderr() -> ProgressDisplay:
+    """Return a progress bar; commands without one do not load its library."""
+    from rich import progress
+
+    columns = (
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TextColumn("{task.fields[count]}"),
+        progress.TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    return progress.Progress(*columns, console=console, transient=True)
 
 
 def note_at_start(note: str, listener: Listener | None) -> Listener:

@@ -35,8 +35,8 @@ from lagbench.errors import (
     check_regular,
 )
 
+from .hdf5 import to_plain
 from .layout import NOTES_NAME
-from .variables import to_plain
 
 HASHED_SUBSETS = ("train", "valid", "test")
 """Subsets that the data set hash covers."""

@@ -1,4 +1,4 @@
-"""Open HDF5 files, and read their members and attributes as netCDF shows them.
+"""Open HDF5 and netCDF files; read members and attributes as netCDF shows them.
 
 h5py opens a file in half the time that netCDF4 takes. Links are listed and never
 followed: nothing outside the file is opened. Files of strangers are checked in
@@ -8,16 +8,39 @@ followed: nothing outside the file is opened. Files of strangers are checked in
 from __future__ import annotations
 
 import codecs
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import h5py
 import numpy as np
 
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, check_regular
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    check_regular,
+)
 
-from .variables import HIDDEN_ATTRIBUTES
+if TYPE_CHECKING:
+    import netCDF4
+
+HIDDEN_ATTRIBUTES = frozenset(
+    (
+        "CLASS",
+        "NAME",
+        "REFERENCE_LIST",
+        "DIMENSION_LIST",
+        "_Netcdf4Dimid",
+        "_Netcdf4Coordinates",
+        "_NCProperties",
+        "_nc3_strict",
+    )
+)
+"""Attributes by which netCDF stores dimensions; it shows them to nobody."""
 
 MAX_LINKS = 1000
 """Most entries of a group that are inspected."""
@@ -160,6 +183,29 @@ def open_hdf5(
 
 
 # --- members and storage --------------------------------------------------------------
+
+
+def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
+    """Open a netCDF4 file, to read it or to write it anew.
+
+    Every use of the library goes through here, because it takes a tenth of a second to
+    load: help and plans of work do without it.
+
+    Raises:
+        UsageError: the path is no UTF-8, which the library needs.
+    """
+    import netCDF4
+
+    try:
+        return netCDF4.Dataset(path, mode, format="NETCDF4")
+    except UnicodeEncodeError as error:
+        raise UsageError(
+            "no netCDF file can have that name",
+            where=str(path),
+            expected="a path in UTF-8",
+            got="bytes that are no UTF-8",
+            fix="use another name",
+        ) from error
 
 
 def list_members(
@@ -323,3 +369,33 @@ def read_attribute(owner: h5py.HLObject, name: str) -> object:
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace").replace("\0", "")
     return value
+
+
+def to_plain(value: object) -> object:
+    """Return a JSON value equal to an attribute, whatever library read it.
+
+    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
+    element become Python numbers; -0.0 becomes 0.0.
+    """
+    if isinstance(value, (np.ndarray, np.generic)):
+        if value.size == 1:
+            value = value.item()
+        else:
+            value = value.tolist()
+    if isinstance(value, bytes):
+        value = value.decode("utf-8")
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float) and math.isfinite(value):
+        return value + 0.0
+    if isinstance(value, str) and "\0" not in value:
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item) for item in value]
+    raise DataError(
+        "a value cannot be hashed",
+        expected="a finite number, a string without NUL, or lists and mappings of them",
+        got=repr(value),
+    )

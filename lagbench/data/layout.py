@@ -386,7 +386,7 @@ def generation_command(path: Path) -> str | None:
 
 def quote_root(root: str | Path) -> str:
     """Return a root as an option's value for a shell: its URL, or its absolute path."""
-    url = url_of(Path(root))
+    url = as_url(root) or url_of(Path(root))
     if url is not None:
         return shlex.quote(hide_credentials(url))
     return shlex.quote(os.path.abspath(root))

@@ -1,4 +1,4 @@
-"""Find a split and its data, by the split's name or by the path of its folder.
+"""Find a split and its data by name or folder; compare data with recorded hashes.
 
 The *root folder* holds all data sets; a root in an object store has a working copy on
 this machine.

@@ -33,6 +33,7 @@ from .hdf5 import (
     list_variables,
     read_attribute,
     read_attributes,
+    to_plain,
 )
 from .layout import ScenarioKey, generation_command, has_file
 from .variables import (
@@ -40,7 +41,6 @@ from .variables import (
     MAX_VALUES_PER_FRAME,
     expected_attributes,
     list_differing_attributes,
-    to_plain,
 )
 
 BLOCK_BYTES = 1 << 20

@@ -9,21 +9,20 @@ Parameters of a scenario are attributes of the file. They do enter the hash.
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError
 
 from . import MATERIALS
+from .hdf5 import HIDDEN_ATTRIBUTES, to_plain
 
 if TYPE_CHECKING:
-    import netCDF4
+    pass
 
 ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
     "frame": {
@@ -68,20 +67,6 @@ UNCHECKED_ATTRIBUTES = {"content_sha256", "long_name"}
 
 The hash is checked elsewhere, and a patch release may reword a name.
 """
-
-HIDDEN_ATTRIBUTES = frozenset(
-    (
-        "CLASS",
-        "NAME",
-        "REFERENCE_LIST",
-        "DIMENSION_LIST",
-        "_Netcdf4Dimid",
-        "_Netcdf4Coordinates",
-        "_NCProperties",
-        "_nc3_strict",
-    )
-)
-"""Attributes by which netCDF stores dimensions; it shows them to nobody."""
 
 _RESERVED = {
     "Conventions",
@@ -143,30 +128,6 @@ These are two for each of ten million particles, or three for each of 6.7 millio
 """
 
 
-def open_netcdf(path: Path, mode: Literal["r", "w"] = "r") -> netCDF4.Dataset:
-    """Open a netCDF4 file, to read it or to write it anew.
-
-    Every use of the library goes through here, because it takes a tenth of a second to
-    load: help and plans of work do without it. It stands here because a process that
-    only writes does without h5py.
-
-    Raises:
-        UsageError: the path is no UTF-8, which the library needs.
-    """
-    import netCDF4
-
-    try:
-        return netCDF4.Dataset(path, mode, format="NETCDF4")
-    except UnicodeEncodeError as error:
-        raise UsageError(
-            "no netCDF file can have that name",
-            where=str(path),
-            expected="a path in UTF-8",
-            got="bytes that are no UTF-8",
-            fix="use another name",
-        ) from error
-
-
 def expected_attributes(name: str, dims: Sequence[str]) -> dict[str, object]:
     """Return the attributes that a variable is written with."""
     attributes = dict(ATTRIBUTES[name])
@@ -195,36 +156,6 @@ def _is_equal(expected: object, value: object) -> bool:
         isinstance(value, np.ndarray)
         and expected.dtype == value.dtype
         and np.array_equal(expected, value)
-    )
-
-
-def to_plain(value: object) -> object:
-    """Return a JSON value equal to an attribute, whatever library read it.
-
-    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
-    element become Python numbers; -0.0 becomes 0.0.
-    """
-    if isinstance(value, (np.ndarray, np.generic)):
-        if value.size == 1:
-            value = value.item()
-        else:
-            value = value.tolist()
-    if isinstance(value, bytes):
-        value = value.decode("utf-8")
-    if isinstance(value, int):
-        return int(value)
-    if isinstance(value, float) and math.isfinite(value):
-        return value + 0.0
-    if isinstance(value, str) and "\0" not in value:
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_plain(item) for item in value]
-    raise DataError(
-        "a value cannot be hashed",
-        expected="a finite number, a string without NUL, or lists and mappings of them",
-        got=repr(value),
     )
 
 

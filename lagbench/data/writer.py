@@ -33,6 +33,7 @@ from . import MATERIALS
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher
 from .field_errors import describe_value
+from .hdf5 import open_netcdf
 from .layout import ScenarioKey
 from .variables import (
     MAX_VALUES_PER_FRAME,
@@ -41,7 +42,6 @@ from .variables import (
     as_attribute,
     expected_attributes,
     find_name_fault,
-    open_netcdf,
 )
 
 FORMAT = 1

@@ -20,10 +20,9 @@ from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.hdf5 import open_hdf5, open_netcdf
 from lagbench.data.layout import MAX_ID
 from lagbench.data.structure import Structure, check_structure
-from lagbench.data.variables import open_netcdf
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .axis_order import ORDER, OrderedArray, check_order

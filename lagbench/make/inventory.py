@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.data.checksums import file_sha256, load_recorded_hashes
+from lagbench.data.hdf5 import to_plain
 from lagbench.data.layout import (
     PICTURES,
     format_ids,
@@ -34,7 +35,6 @@ from lagbench.data.manifest import (
 from lagbench.data.registry import Size, default_path
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.data.statistics import QUANTITIES
-from lagbench.data.variables import to_plain
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw_initial_state, file_parameters
 from lagbench.generators.simulate import OUTCOMES

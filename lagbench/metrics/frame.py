@@ -267,11 +267,16 @@ class Snapshot:
     @cached_property
     def fields(self) -> Fields:
         """Grid fields of these particles [per frame]."""
-        return fields(
+        fields_of_frame = fields(
             self.position,
             self.velocity,
             self.scenario.config.grid,
             full=self.scenario.full_weight,
+        )
+        return replace(
+            fields_of_frame,
+            weight=_read_only(fields_of_frame.weight),
+            velocity=_read_only(fields_of_frame.velocity),
         )
 
     @cached_property
@@ -405,7 +410,18 @@ class Scenario:
                 )
 
         box = self.config.box
-        return Snapshot(box.wrap(x), box.displacement(before, x), self)
+        return Snapshot(
+            position=_read_only(box.wrap(x)),
+            velocity=_read_only(box.displacement(before, x)),
+            scenario=self,
+        )
+
+
+def _read_only(values: Floats) -> Floats:
+    """Return a view of an array that a metric cannot change for the other metrics."""
+    view = values.view()
+    view.setflags(write=False)
+    return view
 
 
 def snapshots(
@@ -510,7 +526,7 @@ class FramePair:
     def _vorticity(self, snapshot: Snapshot) -> Floats:
         grid = self.scenario.config.grid
         omega = curl(snapshot.fields.velocity, grid.spacing, grid.box.periodic)
-        return omega[self.nodes].reshape(-1)
+        return _read_only(omega[self.nodes].reshape(-1))
 
     @cached_property
     def truth_rotates(self) -> bool:

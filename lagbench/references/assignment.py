@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.box import UNIT_SQUARE, Box
-
-Floats = NDArray[np.float64]
+from lagbench.data.box import UNIT_SQUARE, Box, Floats
 
 MOST_TOGETHER = 4096
 """Particles among which the best assignment is sought: its time grows with the cube."""

@@ -26,7 +26,6 @@ FORMAT = 1
 IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
 """Fields that identify the predicted data set and the method."""
 
-
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path, explain_write_error
-from lagbench.data.variables import open_netcdf
+from lagbench.data.hdf5 import open_netcdf
 
 from .card import ScoreCard
 from .published_scores import FORMAT, IDENTITY

@@ -129,19 +129,21 @@ def write_archive(
 def _read_complete_manifest(size: Size, root: Path) -> Manifest:
     """Return the manifest of a data set with all scenarios and the recorded hash."""
     where = str(size.folder(root))
-    repair = suggest_repair(size, root=root)
     manifest = read_manifest(root, size.split, size.name, size.major)
-    present = set()
+    present: list[int] = []
     if manifest is not None:
-        present = {entry.scenario for entry in manifest.files}
-    missing = [scenario for scenario in size.scenarios if scenario not in present]
-    if manifest is None or missing:
+        present = [entry.scenario for entry in manifest.files]
+    if manifest is None or present != list(size.scenarios):
+        missing = set(size.scenarios).difference(present)
+        got = f"{len(present)} scenarios"
+        if missing:
+            got += f"; missing: {format_ids(sorted(missing))}"
         raise DataError(
-            "the data set is not complete",
+            "the data set is not complete, or has other scenarios",
             where=where,
             expected=f"a manifest with scenarios {format_ids(size.scenarios)}",
-            got=f"missing: {format_ids(missing)}",
-            fix=repair,
+            got=got,
+            fix=suggest_repair(size, root=root),
         )
     if size.measured is None:
         raise DataError(
@@ -158,7 +160,7 @@ def _read_complete_manifest(size: Size, root: Path) -> Manifest:
             where=where,
             expected=f"data set hash {recorded_hash}",
             got=manifest.dataset_sha256,
-            fix=repair,
+            fix=suggest_repair(size, root=root),
         )
     return manifest
 

@@ -13,7 +13,6 @@ import shutil
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextvars import ContextVar
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -65,8 +64,6 @@ _manifests: dict[str, tuple[float, Manifest | None]] = {}
 
 _copies_of_writers: list[Path] = []
 """Working copies from which this process writes to a store, one for each data set."""
-
-_is_silent: ContextVar[bool] = ContextVar("is_silent", default=False)
 
 
 def object_address(size: Size, url: str, name: str) -> str:
@@ -607,16 +604,6 @@ def suspend_fetching(root: Path) -> Iterator[None]:
         _manifests.clear()
 
 
-@contextlib.contextmanager
-def silence_fetching() -> Iterator[None]:
-    """Print nothing on stderr about transfers."""
-    token = _is_silent.set(True)
-    try:
-        yield
-    finally:
-        _is_silent.reset(token)
-
-
 class _TransferDisplay:
     """Prints on a terminal how much has been fetched."""
 
@@ -627,7 +614,7 @@ class _TransferDisplay:
         self.finished_objects = 0
         self._arrived_bytes = 0
         self._last_print = 0.0
-        self._is_visible = watched() and not _is_silent.get()
+        self._is_visible = watched()
 
     def __enter__(self) -> _TransferDisplay:
         self._print()

@@ -486,16 +486,21 @@ def _bucket_of(url: str) -> str:
     return url.split("//", 1)[1].split("/")[0]
 
 
+def _load_fsspec() -> Any:  # noqa: ANN401
+    """Return the library of file systems; only commands that use a store load it."""
+    import fsspec  # type: ignore[import-untyped]
+
+    return fsspec
+
+
 def _require_scheme(url: str) -> str:
     """Return the scheme of an address that fsspec knows.
 
     Raises:
         UsageError: fsspec does not know it, or there is none.
     """
-    import fsspec  # type: ignore[import-untyped]
-
     scheme, mark, place = url.partition("://")
-    if mark and scheme in fsspec.available_protocols():
+    if mark and scheme in _load_fsspec().available_protocols():
         _require_place(url, place)
         return scheme
     fix = STORE_HINT
@@ -549,8 +554,7 @@ def _file_system(url: str) -> tuple[Any, str]:
     """
     if url.startswith(S3):
         require("s3fs", extra="s3")
-    import fsspec
-
+    fsspec = _load_fsspec()
     scheme = _require_scheme(url)
     # Another endpoint or other credentials are another system, also within one process.
     settings = []

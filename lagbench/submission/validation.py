@@ -22,7 +22,7 @@ import h5py
 
 from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.layout import ClosedFolderError, expand_home, url_of
+from lagbench.data.layout import ClosedFolderError, expand_home
 from lagbench.data.local import (
     load_rooted_registry,
     locate_split,
@@ -264,8 +264,7 @@ def _examine(
     size, lookup_error = _find_size(names, registry)
     size_json = None
     if size is not None:
-        if url_of(root) is not None:  # a store, of which the root is a working copy
-            update_working_copy(size, root, size.scored_scenarios)
+        update_working_copy(size, root, size.scored_scenarios)
         size_json = size.model_dump_json()
     request = {
         "path": str(path),

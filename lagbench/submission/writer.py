@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_output_file, explain_write_error
+from lagbench.data.hdf5 import open_netcdf
 from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.data.variables import open_netcdf
 from lagbench.errors import (
     DataError,
     UsageError,
@@ -334,12 +334,11 @@ class PredictionsWriter:
             )
         if number is None or number not in self._row_of:
             raise UsageError(
-                "no such test scenario",
+                "no such scenario in the subset",
                 where=where,
                 expected=expected,
                 got=repr(scenario)[:80],
-                fix="name scenarios by id, not by row; predictions for other subsets "
-                "are not stored",
+                fix="name scenarios by id, not by row; for shift, state the subset",
             )
         return number
 

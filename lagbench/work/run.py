@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -98,9 +100,27 @@ def _run_with(
 # --- progress -------------------------------------------------------------------------
 
 
+_is_silent: ContextVar[bool] = ContextVar("is_silent", default=False)
+
+
 def watched() -> bool:
-    """Tell whether a person can watch stderr; where it is closed, Python has none."""
+    """Tell whether a person watches stderr; where it is closed, Python has none.
+
+    Nobody does within :func:`silence`.
+    """
+    if _is_silent.get():
+        return False
     return sys.stderr is not None and sys.stderr.isatty()
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Show no progress on stderr meanwhile."""
+    token = _is_silent.set(True)
+    try:
+        yield
+    finally:
+        _is_silent.reset(token)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -816,6 +816,23 @@ def test_weights_of_a_hybrid_are_not_those_of_a_learned_model(own: BoardBench) -
     assert own.state() == before
 
 
+def test_a_log_of_a_hybrid_is_not_that_of_a_learned_model(own: BoardBench) -> None:
+    """An entry that was written by hand is found."""
+    run = trained(own, 0)
+    write_record(run, {"step": 6, "baseline": "hybrid-coarse"})
+    submitted(own, run)
+    assert failing_checks(own) == {"training"}
+
+
+def test_a_refused_addition_says_nothing_of_the_kind(own: BoardBench) -> None:
+    """The entry that the weights would belong to is not known."""
+    hybrid = WEIGHTS / "cavity/mini/hybrid-projection_0.pt"
+    run = trained(own, 0)
+    with pytest.raises(UsageError) as caught:
+        submitted(own, run, weights=(hybrid,), add=True)
+    assert "kind" not in str(caught.value)
+
+
 def test_more_seeds_have_the_kind_of_their_entry(own: BoardBench) -> None:
     """So weights of a hybrid are refused for what else is wrong with them."""
     hybrid = WEIGHTS / "cavity/mini/hybrid-projection_0.pt"

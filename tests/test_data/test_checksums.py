@@ -24,7 +24,7 @@ from lagbench.data.checksums import (
     record_hashes,
     subset_hash,
 )
-from lagbench.data.variables import to_plain
+from lagbench.data.hdf5 import to_plain
 from lagbench.errors import DataError
 
 FLOATS = hnp.arrays(

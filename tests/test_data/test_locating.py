@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.program import app
-from lagbench.data.layout import dataset_folder, scenario_path
+from lagbench.data.layout import dataset_folder, quote_root, scenario_path
 from lagbench.data.local import (
     is_split_name,
     load_rooted_registry,
@@ -89,6 +89,14 @@ def test_a_file_is_no_root(
     assert done.exit_code == 2
     assert str(file) in done.stderr
     assert "generate" not in done.stderr
+
+
+def test_a_url_is_quoted_without_its_password() -> None:
+    """It stays a URL, and names no user."""
+    assert quote_root("s3://bucket/data") == "s3://bucket/data"
+    quoted = quote_root("s3://key:secret@bucket/data")
+    assert "secret" not in quoted
+    assert "bucket/data" in quoted
 
 
 def test_doctor_names_a_root_that_is_a_file_in_its_table(tmp_path: Path) -> None:

@@ -664,6 +664,32 @@ def test_a_value_that_is_no_number_names_its_metric(what: str, function: Any) ->
     assert "scenario 3" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda pair: pair.truth.position,
+        lambda pair: pair.prediction.velocity,
+        lambda pair: pair.truth.fields.velocity,
+        lambda pair: pair.predicted_vorticity,
+    ],
+)
+def test_a_metric_cannot_change_what_other_metrics_read(
+    read: Callable[[FramePair], Floats],
+) -> None:
+    """A function that writes in place is an error of its metric."""
+
+    def move(pair: FramePair) -> float:
+        values = read(pair)
+        values -= 1.0
+        return float(values.mean())
+
+    pair = pairs()[0]
+    before = read(pair).copy()
+    with pytest.raises(ValueError, match="read-only"):
+        replace(OTHERS, statistic=move).measure(pair)
+    assert np.array_equal(read(pair), before)
+
+
 def test_a_metric_may_have_no_code_and_a_bool_of_numpy() -> None:
     """Such as a ufunc, whose name is in the error too; undefined values are NaN."""
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)

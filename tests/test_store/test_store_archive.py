@@ -177,6 +177,46 @@ def test_only_right_data_are_packed(
     assert not list(output.glob("*"))
 
 
+def without_last(manifest: Manifest) -> Manifest:
+    """Return a manifest that lacks the last file."""
+    return manifest.model_copy(update={"files": manifest.files[:-1]})
+
+
+def with_first_twice(manifest: Manifest) -> Manifest:
+    """Return a manifest that names the first file twice."""
+    files = (manifest.files[0], *manifest.files)
+    return manifest.model_copy(update={"files": files})
+
+
+def with_other_hash(manifest: Manifest) -> Manifest:
+    """Return a manifest of a data set with another hash."""
+    return manifest.model_copy(update={"dataset_sha256": "0" * 64})
+
+
+@pytest.mark.parametrize(
+    ("change", "got"),
+    [
+        (without_last, "missing: 4"),
+        (with_first_twice, "6 scenarios"),
+        (with_other_hash, "0000"),
+    ],
+)
+def test_a_manifest_of_other_files_is_not_packed(
+    copied: Callable[[], Path],
+    tmp_path: Path,
+    change: Callable[[Manifest], Manifest],
+    got: str,
+) -> None:
+    """Scenarios that are missing or named twice, and another hash of the data set."""
+    root = copied()
+    path = root / DATA / "manifest.json"
+    manifest = Manifest.model_validate_json(path.read_bytes())
+    path.write_text(change(manifest).model_dump_json())
+    with pytest.raises(DataError) as caught:
+        archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
+    assert got in str(caught.value.got)
+
+
 def test_an_incomplete_data_set_is_made_whole_in_its_own_root(tmp_path: Path) -> None:
     with pytest.raises(LagbenchError) as caught:
         archive.write_archive(SPLIT, SIZE, root=tmp_path, output=tmp_path / "new")

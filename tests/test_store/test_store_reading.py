@@ -28,6 +28,7 @@ from lagbench.make.verify import verify
 from lagbench.store import copy
 from lagbench.store.objects import NotDataError, WrongContentError, WrongLengthError
 from lagbench.submission import template
+from lagbench.work.run import silence
 
 FOLDER = f"{SPLIT}/{SIZE}/v2"
 MANIFEST = f"{FOLDER}/manifest.json"
@@ -346,7 +347,7 @@ def test_a_terminal_shows_the_progress(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     open_and_close(url)
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
-    with copy.silence_fetching():
+    with silence():
         open_and_close(url, subset="valid")
     assert capsys.readouterr() == ("", "")
 
