@@ -67,8 +67,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def _move_walls_towards(self, frame: int) -> None:
         velocities = [state.walls_towards(frame) for state in self._states]
-        exact = np.stack(velocities)
-        velocity = exact.astype(np.float32)
+        exact_velocity = np.stack(velocities)
+        velocity = exact_velocity.astype(np.float32)
         self.move_walls(velocity)
 
     def _drive(self, end: int) -> int:
@@ -79,8 +79,8 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         next_frame = frame + 1
         if past == 0:
             self._move_walls_towards(next_frame)
-        until = next_frame * interval
-        return min(end, until)
+        end_of_frame = next_frame * interval
+        return min(end, end_of_frame)
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario."""
@@ -155,9 +155,7 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        jacobian_min = health.jacobian_min
-        jacobian_max = health.jacobian_max
-        return broken_jacobian_bounds(jacobian_min, jacobian_max)
+        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)

@@ -119,8 +119,8 @@ class FullBox(Driver[FullBoxParameters]):
         next_frame = frame + 1
         if past == 0:
             self._drive_towards(next_frame)
-        until = next_frame * interval
-        return min(end, until)
+        end_of_frame = next_frame * interval
+        return min(end, end_of_frame)
 
     def jacobian(self) -> Singles:
         """Volume ratio J of the fluid's particles [1], shape [scenario, particle]."""
@@ -187,9 +187,7 @@ class FullBox(Driver[FullBoxParameters]):
         self._kernels.release()
 
     def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
-        jacobian_min = health.jacobian_min
-        jacobian_max = health.jacobian_max
-        return broken_jacobian_bounds(jacobian_min, jacobian_max)
+        return broken_jacobian_bounds(health.jacobian_min, health.jacobian_max)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)

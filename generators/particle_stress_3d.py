@@ -469,9 +469,9 @@ class ParticleStress3D(FreeSurfaceKernels):
         weight_y = self.weight_y[s, p]
         weight_z = self.weight_z[s, p]
         for i, j in ti.static(_ROWS):
-            along_x = weight_x[i]
-            along_y = weight_y[j]
-            across = along_x * along_y
+            weight_i = weight_x[i]
+            weight_j = weight_y[j]
+            across = weight_i * weight_j
             weights = across * weight_z
             at_column = stepped(at_middle, step_x, i - 1)
             at_row = stepped(at_column, step_y, j - 1)
@@ -602,17 +602,17 @@ class ParticleStress3D(FreeSurfaceKernels):
         moments_xy = ti.Vector.zero(f32, 8)
         moments_z = vec4(0.0)
         for i, j in ti.static(_ROWS):
-            along_x = weight_x[i]
-            along_y = weight_y[j]
-            across = along_x * along_y
+            weight_i = weight_x[i]
+            weight_j = weight_y[j]
+            across = weight_i * weight_j
             start = self.row_start(lowest, i, j)
-            row_x = i - 1.0
-            row_y = j - 1.0
-            distance_x = row_x - place.x
-            distance_y = row_y - place.y
+            node_x = i - 1.0
+            node_y = j - 1.0
+            distance_x = node_x - place.x
+            distance_y = node_y - place.y
             for k in ti.static(_NODES):
-                along_z = weight_z[k]
-                weight = across * along_z
+                weight_k = weight_z[k]
+                weight = across * weight_k
                 node = start + k
                 node_state = self.node_state[s, node]
                 share = weight * node_state

@@ -53,8 +53,7 @@ class Ball:
     @property
     def reach(self) -> tuple[float, float, float]:
         """The radius, three times."""
-        r = self.radius
-        return r, r, r
+        return (self.radius, self.radius, self.radius)
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""

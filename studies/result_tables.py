@@ -429,8 +429,11 @@ def _seconds_of_run(method: Method, run: MeasuredCost) -> float | None:
 
 
 def metrics_table(results: SplitResults) -> str:
-    """Return the means of the chosen metrics that do not rank, in the same order."""
-    metrics = shown_metrics(results)[1:]
+    """Return the means of the metrics that do not rank, the best method first."""
+    metrics = []
+    for metric in shown_metrics(results):
+        if metric.name != results.ranking:
+            metrics.append(metric)
     heads = ["model"]
     for metric in metrics:  # as in "position_rmse [length], ↓"
         goal = ARROWS[metric.direction]

@@ -270,11 +270,11 @@ def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
             yield table_markdown(comparison_table(all_rows))
 
 
-def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
-    """Yield where references beat models, and how errors still fall at the end."""
-    if not learned:
+def _references_and_training(all_results: Sequence[SplitResults]) -> Iterator[str]:
+    """Yield where reference predictors lead, and how much trainings still gain."""
+    if not all_results:
         return
-    leading = leading_table(learned)
+    leading = leading_table(all_results)
     if leading:
         yield "## In which metrics does a reference predictor lead?"
         yield LEADING_NOTE
@@ -282,7 +282,7 @@ def _references_and_training(learned: Sequence[SplitResults]) -> Iterator[str]:
 
     yield "## How much does the error decrease with the training?"
     yield TRAINING_NOTE
-    yield training_table(learned)
+    yield training_table(all_results)
 
 
 def _chapter(results: SplitResults) -> Iterator[str]:

@@ -7,7 +7,7 @@ ends the scoring.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from lagbench.errors import (
     LagbenchError,
@@ -16,6 +16,7 @@ from lagbench.errors import (
     find_place_in_extension,
     text_of,
 )
+from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import MAX_TEXT, Severity, ValidationIssue, quote
@@ -48,17 +49,31 @@ class PackageMetricError(WorkFailedError):
         return rebuild, ()
 
 
-def raise_package_metric_error(error: Exception) -> None:
-    """Name the metric of another package that raised an error, and its line.
-
-    Nothing happens where the error is not that of such a metric.
+def aggregate_named(
+    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
+) -> dict[str, Score]:
+    """Return scores by the name of the metric.
 
     Raises:
-        PackageMetricError: the error is that of such a metric.
+        PackageMetricError: a metric of another package failed.
+    """
+    try:
+        return aggregate(metrics, tallies)
+    except Exception as error:
+        named_error = name_metric(error)
+        if named_error is error:
+            raise
+        raise named_error from error
+
+
+def name_metric(error: Exception) -> Exception:
+    """Return the error for a metric of another package that raised an error.
+
+    It names the metric and its line. Another error is returned as it is.
     """
     name = getattr(error, "metric_name", None)
     if name is None or name in METRICS:
-        return
+        return error
     notes = ", ".join(getattr(error, "__notes__", ()))
     # a metric that a user hands over is in no package
     module = getattr(error, "metric_module", None)
@@ -69,7 +84,7 @@ def raise_package_metric_error(error: Exception) -> None:
         notes or None,
     ]
     where = ", ".join(place for place in places if place)
-    raise PackageMetricError(name, where=where, got=_describe(error)) from error
+    return PackageMetricError(name, where=where, got=_describe(error))
 
 
 def _describe(error: Exception) -> str:

@@ -2,7 +2,8 @@
 
 The truth's snapshots and fields are formed once for the submission and the references
 beside it; memory is that of a few frames, whatever the horizon. The few pictures of a
-submission that a board page shows are taken while it is scored.
+submission that a board page shows, the preview, are taken while it is scored; their
+packing in scores.nc is stated here too.
 """
 
 from __future__ import annotations

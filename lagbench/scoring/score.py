@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Generator, Iterator, Mapping, 
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from lagbench.errors import (
     check_installed,
     suggest_name,
 )
-from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (
@@ -55,10 +54,11 @@ from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, Trace, judge_copying, judge_physics, judge_predictability
 from .package_metrics import (
     PackageMetricError,
+    aggregate_named,
     describe_failure,
     drop_metric,
+    name_metric,
     own_metric_error,
-    raise_package_metric_error,
 )
 from .published_scores import IDENTITY, read_scores
 from .references import check_train, measurable
@@ -351,12 +351,8 @@ def _aggregate(
         for outcome in outcomes:
             tallies[row][outcome.scenario] = outcome.tallies[row]
     scores: dict[str, Mapping[str, Score]] = {}
-    try:
-        for row, row_tallies in tallies.items():
-            scores[row] = aggregate(metrics, row_tallies)
-    except Exception as error:
-        raise_package_metric_error(error)
-        raise
+    for row, row_tallies in tallies.items():
+        scores[row] = aggregate_named(metrics, row_tallies)
     return tallies, scores
 
 
@@ -563,24 +559,16 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 report=report,
             )
     except Exception as error:
-        _raise_with_scenario(error, number)
+        named_error = name_metric(error)
+        named_error.add_note(f"scenario {number}")
+        if named_error is error:
+            raise
+        raise named_error from error
 
     preview = None
     if recorder is not None:
         preview = recorder.preview
     return ScenarioScores(number, tallies, trace, preview)
-
-
-def _raise_with_scenario(error: Exception, scenario: int) -> NoReturn:
-    """Raise an error of the scoring again, with the scenario in its notes."""
-    note = f"scenario {scenario}"
-    try:
-        raise_package_metric_error(error)
-    except PackageMetricError as named_error:
-        named_error.add_note(note)
-        raise
-    error.add_note(note)
-    raise error
 
 
 def _predicted_frames(

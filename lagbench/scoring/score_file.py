@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from lagbench.data.hdf5 import open_hdf5, open_variable, read_attribute
 from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError
-from lagbench.metrics.aggregate import Score, Tally, aggregate
+from lagbench.metrics.aggregate import Score, Tally
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
-from .package_metrics import PackageMetricError, raise_package_metric_error
+from .package_metrics import PackageMetricError, aggregate_named
 from .published_scores import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
@@ -84,27 +84,12 @@ class SubmissionStatistics:
                 metrics[name] = table[name]
         while True:
             try:
-                return _aggregate_named(metrics.values(), self.tallies)
+                return aggregate_named(metrics.values(), self.tallies)
             except PackageMetricError as error:
                 message = f"{error.what}; it is left out: {error.where}: {error.got}"
                 warnings.warn(message, PluginWarning, stacklevel=3)
                 # metrics that follow from it need the stored statistics only
                 del metrics[error.metric]
-
-
-def _aggregate_named(
-    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
-) -> dict[str, Score]:
-    """Return scores by the name of the metric.
-
-    Raises:
-        PackageMetricError: a metric of another package failed.
-    """
-    try:
-        return aggregate(metrics, tallies)
-    except Exception as error:
-        raise_package_metric_error(error)
-        raise
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:
