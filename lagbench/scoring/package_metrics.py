@@ -7,7 +7,7 @@ ends the scoring.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from lagbench.errors import (
     LagbenchError,
@@ -16,7 +16,6 @@ from lagbench.errors import (
     find_place_in_extension,
     text_of,
 )
-from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import METRICS
 from lagbench.submission.issues import MAX_TEXT, Severity, ValidationIssue, quote
@@ -47,23 +46,6 @@ class PackageMetricError(WorkFailedError):
             type(self), self.metric, where=str(self.where), got=str(self.got)
         )
         return rebuild, ()
-
-
-def aggregate_named(
-    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
-) -> dict[str, Score]:
-    """Return scores by the name of the metric.
-
-    Raises:
-        PackageMetricError: a metric of another package failed.
-    """
-    try:
-        return aggregate(metrics, tallies)
-    except Exception as error:
-        named_error = name_metric(error)
-        if named_error is error:
-            raise
-        raise named_error from error
 
 
 def name_metric(error: Exception) -> Exception:

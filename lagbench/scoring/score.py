@@ -54,7 +54,6 @@ from .card import JSON_NAME, ScoreCard, format_scores
 from .flags import Flag, Trace, judge_copying, judge_physics, judge_predictability
 from .package_metrics import (
     PackageMetricError,
-    aggregate_named,
     describe_failure,
     drop_metric,
     name_metric,
@@ -351,8 +350,14 @@ def _aggregate(
         for outcome in outcomes:
             tallies[row][outcome.scenario] = outcome.tallies[row]
     scores: dict[str, Mapping[str, Score]] = {}
-    for row, row_tallies in tallies.items():
-        scores[row] = aggregate_named(metrics, row_tallies)
+    try:
+        for row, row_tallies in tallies.items():
+            scores[row] = aggregate(metrics, row_tallies)
+    except Exception as error:
+        named_error = name_metric(error)
+        if named_error is error:
+            raise
+        raise named_error from error
     return tallies, scores
 
 

@@ -29,7 +29,7 @@ from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
 from lagbench.submission.format import require_name
 
-from .package_metrics import PackageMetricError, aggregate_named
+from .package_metrics import PackageMetricError, name_metric
 from .published_scores import FORMAT, IDENTITY, unreadable_scores
 from .skill import Skill, compute_skill
 
@@ -84,12 +84,29 @@ class SubmissionStatistics:
                 metrics[name] = table[name]
         while True:
             try:
-                return aggregate_named(metrics.values(), self.tallies)
+                return _aggregate_named(metrics.values(), self.tallies)
             except PackageMetricError as error:
                 message = f"{error.what}; it is left out: {error.where}: {error.got}"
                 warnings.warn(message, PluginWarning, stacklevel=3)
                 # metrics that follow from it need the stored statistics only
                 del metrics[error.metric]
+
+
+def _aggregate_named(
+    metrics: Iterable[Metric], tallies: Mapping[int, Tally]
+) -> dict[str, Score]:
+    """Return scores by the name of the metric.
+
+    Raises:
+        PackageMetricError: a metric of another package failed.
+    """
+    try:
+        return aggregate(metrics, tallies)
+    except Exception as error:
+        named_error = name_metric(error)
+        if named_error is error:
+            raise
+        raise named_error from error
 
 
 def read_statistics(path: str | Path) -> SubmissionStatistics:
