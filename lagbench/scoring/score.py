@@ -27,7 +27,7 @@ from lagbench.errors import (
     check_installed,
     suggest_name,
 )
-from lagbench.metrics.aggregate import Score, Tally
+from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import (

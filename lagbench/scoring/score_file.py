@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lagbench.data.hdf5 import open_hdf5, open_variable, read_attribute
 from lagbench.data.registry import PluginWarning
 from lagbench.errors import UnreadableFileError
-from lagbench.metrics.aggregate import Score, Tally
+from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
