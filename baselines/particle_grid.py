@@ -363,10 +363,11 @@ class ParticleGrid(nn.Module):
     def beside_walls(self) -> Tensor:
         """Return 1 at the two rows of nodes beside each wall, else 0.
 
-        The shape is [wall, x node, y node].
+        A wall on a row of nodes has this row only. The shape is [wall, x node, y node].
         """
         distance = self.wall_distance(self.spacing)
-        is_beside = distance.abs() < 1.0
+        # a wall on nodes has its neighbours at 1, up to rounding
+        is_beside = distance.abs() < 0.999
         return is_beside.to(torch.float32)
 
 

@@ -195,7 +195,8 @@ def main() -> int:
         f"The box holds {PARTICLES:,} q^2 particles. Compared with q = 1, the grid of "
         "`neuralmpm` has q times as many cells along each axis. The connectivity "
         "radius of `gns` is divided by q, so a particle keeps its number of "
-        "neighbours. In the last row time ~ (number of particles)^exponent."
+        "neighbours. The last row has the exponent p of the fit time ~ (number of "
+        "particles)^p."
     )
     heads = ("q", "particles", *MODELS)
     table = markdown(heads, lines)

@@ -354,7 +354,7 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
         f"The plan is for {SCENARIOS:,} scenarios, with the times per particle of "
         f"q = {measured_q}. A scenario has {n:,} particles, {frames} frames of "
         f"{row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
-        f"The horizon and the perturbed runs end at frame {HORIZON_END}, as in fluid "
+        f"The horizon and the perturbed runs have {HORIZON_END} frames, as in fluid "
         "full:",
         "",
         "| part | size or time |",

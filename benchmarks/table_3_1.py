@@ -226,8 +226,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         f"from separate runs of {FIXED} substeps. Each run also copies all positions "
         f"once. {consequence}",
         "",
-        "The two times of the thesis do not agree: in rows 2 to 6, t/frame is 1.9 to "
-        "2.5 times (substeps) x (t/substep). The last column compares t/frame.",
+        "The two times of the thesis do not agree. In its rows 2 to 6, t/frame is "
+        "larger than the product of substeps and t/substep, by a factor of 1.9 to 2.5. "
+        "The last column compares t/frame.",
         "",
     ]
 

@@ -43,6 +43,7 @@ class FreeSurface3D(FreeSurfaceDriver):
         return np.stack(columns, axis=-1)
 
     def _set_deformation(self, gradients: Singles) -> None:
+        """Fill the fields of the columns of F, whose fourth component is not used."""
         scenarios, particles, _, _ = gradients.shape
         shape = (scenarios, particles, 4)
         for axis, field in enumerate(self._kernels.deformation_columns):

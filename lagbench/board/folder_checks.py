@@ -404,6 +404,7 @@ class FolderChecks:
             )
 
     def _check_misplaced_files(self) -> None:
+        """Report links, irregular files, and files that no rule and no entry names."""
         named_paths = []
         for entry in self.entries:
             for prediction in entry.predictions:

@@ -413,6 +413,10 @@ def _may_hold(expected: Structure, group: str) -> bool:
 
 
 def _find_type_issue(array: ArrayInfo, expected: Structure) -> StorageIssue | None:
+    """Return an issue where an array of a file holds neither numbers nor texts.
+
+    Texts are allowed only where the format has them.
+    """
     if expected.texts and array.kind in ("string", "variable-length"):
         return None
     if array.kind.startswith(("float", "int", "uint")):

@@ -230,10 +230,13 @@ def _material_code(name: str) -> int:
 
 
 def parse_kinds(text: str | None) -> dict[int, str]:
-    """Return what a user says about numbers of particles.
+    """Return the material, or "drop", of each kind number, as ``--kinds`` has them.
 
     >>> parse_kinds("3=jelly,0=drop")
     {3: 'jelly', 0: 'drop'}
+
+    Raises:
+        UsageError: the text has another form, or a number is given twice.
     """
     kinds: dict[int, str] = {}
     if not text:
@@ -249,7 +252,16 @@ def parse_kinds(text: str | None) -> dict[int, str]:
                 fix="write NUMBER=MATERIAL with commas in between",
             )
         _material_code(name)  # refuses unknown names
-        kinds[int(number)] = name
+        kind = int(number)
+        if kind in kinds:
+            raise UsageError(
+                f"kind {kind} is given twice",
+                where="--kinds",
+                expected="each number once",
+                got=f"{kind}={kinds[kind]} and {kind}={name}",
+                fix="leave one of the two out",
+            )
+        kinds[kind] = name
     return kinds
 
 

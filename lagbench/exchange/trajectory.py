@@ -280,7 +280,11 @@ def check_options(options: DataOptions) -> DataOptions:
 
 
 def _validate_options(options: object, path: Path | None) -> DataOptions:
-    """Return checked options, from a file or, without a path, from a caller."""
+    """Return a checked description of data from elsewhere, which adoption needs.
+
+    It comes from a file or, without a path, from a caller. At most ten mistakes are
+    named together.
+    """
     checked_options: DataOptions = {}
     details: list[ErrorDetails] = []
     try:

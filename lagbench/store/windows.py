@@ -614,7 +614,10 @@ def copy_window(
     scenario: int,
     frame: int,
 ) -> Window:
-    """Copy frames, each of shape [particle, axis], to a window."""
+    """Return a window with copies of frames, each of shape [particle, axis].
+
+    The caller adds viscosity, force and obstacle.
+    """
     dimension = frames[0].shape[1]
     if dimension == 2:
         # x and y of a particle travel as one number of 8 bytes: six times faster.

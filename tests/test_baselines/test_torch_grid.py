@@ -496,6 +496,15 @@ def test_walls_lie_between_two_rows_of_nodes() -> None:
         assert_close(nearest, half_cell)
 
 
+@pytest.mark.parametrize("cells", [22, 30])
+def test_opposite_walls_have_as_many_rows_beside_them(cells: int) -> None:
+    """In a box of two sides, walls may lie on nodes."""
+    grid = ParticleGrid(((0.0, 1.0), (0.0, 0.5)), cells, multiple=4)
+    sums = [int(beside.sum()) for beside in grid.beside_walls()]
+    assert sums[0] == sums[1] > 0
+    assert sums[2] == sums[3] > 0
+
+
 def test_positions_without_a_number_gather_no_number() -> None:
     """A rollout that diverges gives NaN, which the rollout freezes, and no error."""
     grid = ParticleGrid(BOX, 7)

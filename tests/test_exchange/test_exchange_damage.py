@@ -812,6 +812,14 @@ def test_kinds_that_are_no_numbers(text: str) -> None:
     assert caught.value.where == "--kinds"
 
 
+@pytest.mark.parametrize("text", ["3=jelly,3=snow", "0=drop,-0=snow"])
+def test_a_kind_has_one_material(text: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_kinds(text)
+    assert caught.value.where == "--kinds"
+    assert "twice" in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -200,7 +200,7 @@ def allow_removal(folder: Path) -> None:
 
 
 def _leaves(value: Plain, place: tuple[Plain, ...] = ()) -> list[tuple[Plain, ...]]:
-    """Return the places of all values below a value."""
+    """Return the places of all values below a value, of mappings and lists too."""
     places = []
     if isinstance(value, dict):
         items = list(value.items())
