@@ -229,8 +229,8 @@ cancels in the difference of the two methods.
 **Rows.** The first three rows use assumed values. The other rows use values from the
 score files of size mini. *Seed* and *rest* come from all methods with several seeds.
 *Method in scenario* comes from pairs of methods whose means differ by less than a
-factor of two. A split may have only one such pair, so these values are rough. A split
-without such a pair has no row.
+factor of two, and of which at least one has several seeds. A split may have only one
+such pair, so these values are rough. A split without such a pair has no row.
 
 More scenarios do not remove the scatter between seeds. Train more seeds if two methods
 differ by less than this scatter.

@@ -351,11 +351,10 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"The plan is for {SCENARIOS:,} scenarios, with the times per particle of "
-        f"q = {measured_q}. A scenario has {n:,} particles, {frames} frames of "
-        f"{row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
-        f"The horizon and the perturbed runs have {HORIZON_END} frames, as in fluid "
-        "full:",
+        f"The plan is for {SCENARIOS:,} scenarios. It uses the times per particle that "
+        f"we measured for q = {measured_q}. A scenario has {n:,} particles, {frames} "
+        f"frames of {row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
+        f"The perturbed runs have {HORIZON_END} frames, as in fluid full:",
         "",
         "| part | size or time |",
         "|---|--:|",

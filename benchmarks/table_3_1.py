@@ -210,9 +210,9 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
     clock = "as wall-clock time in milliseconds"
     if device == Device.CPU:
         clock = "as processor time in milliseconds"
-    consequence = "On a CPU a copy takes little time."
+    consequence = "On a CPU the copy takes little time."
     if device == Device.CUDA:
-        consequence = "On a GPU a copy takes long."
+        consequence = "On a GPU the copy takes long, so t/substep is too large."
     return [
         "## Table 3.1: time of the solver for more and more particles",
         "",
@@ -223,8 +223,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "",
         f"Our times are the shortest of {repeats} runs, {clock}. t/frame is the time "
         "of all substeps of a frame. fps means frames per second. t/substep comes "
-        f"from separate runs of {FIXED} substeps. Each run also copies all positions "
-        f"once. {consequence}",
+        f"from separate runs of {FIXED} substeps. A run of either kind also copies all "
+        f"positions once. {consequence}",
         "",
         "The two times of the thesis do not agree. In its rows 2 to 6, t/frame is "
         "larger than the product of substeps and t/substep, by a factor of 1.9 to 2.5. "
