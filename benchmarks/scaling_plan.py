@@ -353,8 +353,8 @@ def plan_table(row: ThesisRow, p: Parts, memory: int, *, measured_q: int) -> lis
     return [
         f"The plan is for {SCENARIOS:,} scenarios. It uses the times per particle that "
         f"we measured for q = {measured_q}. A scenario has {n:,} particles, {frames} "
-        f"frames of {row.substeps} substeps, and a grid of {row.grid} x {row.grid} cells. "
-        f"The perturbed runs have {HORIZON_END} frames, as in fluid full:",
+        f"frames of {row.substeps} substeps, and a grid of {row.grid} x {row.grid} "
+        f"cells. The perturbed runs have {HORIZON_END} frames, as in fluid full:",
         "",
         "| part | size or time |",
         "|---|--:|",
