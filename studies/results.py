@@ -166,7 +166,7 @@ The next tables have the comparisons behind the answers:
 
 LEADING_NOTE = """\
 The table lists the metrics in which a reference predictor has a better mean than every
-learned or hybrid model."""
+learned or hybrid model. A data set without a row has no such metric."""
 
 TRAINING_NOTE = """\
 All rows are of the first seed. The columns *validation at* show the lowest validation
