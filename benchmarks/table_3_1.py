@@ -223,8 +223,8 @@ def describe(device: str, *, machine: str, repeats: int) -> list[str]:
         "",
         f"Our times are the shortest of {repeats} runs, {clock}. t/frame is the time "
         "of all substeps of a frame. fps means frames per second. t/substep comes "
-        f"from separate runs of {FIXED} substeps. Every run also copies all "
-        f"positions once. {consequence}",
+        f"from separate runs of {FIXED} substeps. Each of these runs "
+        f"also copies all positions once. {consequence}",
         "",
         "The two times of the thesis do not agree. In its rows 2 to 6, t/frame is "
         "larger than the product of substeps and t/substep, by a factor of 1.9 to 2.5. "
