@@ -74,7 +74,7 @@ class Status(enum.StrEnum):
 
 def _check_kind(kind: Kind) -> Kind:
     if kind is Kind.NAIVE:
-        raise ValueError("is not learned, hybrid or classical")
+        raise ValueError("is not learned, hybrid, calibrated or classical")
     return kind
 
 
@@ -415,8 +415,8 @@ class About(Strict):
     notes: Long = ""
     kind: Annotated[Kind, Field(strict=False), AfterValidator(_check_kind)] = Field(
         default=Kind.LEARNED,
-        description="learned, or hybrid: a solver with a learned part; "
-        "classical where nothing is learned",
+        description="learned: a network; hybrid: a solver with a network inside; "
+        "calibrated: a solver with up to a dozen fitted numbers; classical",
     )
     training: Long = Field(default="", description="what it was trained on, in words")
     budget: EntryBudget | None = None

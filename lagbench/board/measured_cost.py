@@ -135,9 +135,8 @@ def measure_costs(
             least[name] = round_digits(min(times), DIGITS)
     kinds: dict[Kind, dict[str, float]] = {Kind.CLASSICAL: {}, Kind.NAIVE: {}}
     for reference in references:
-        kinds[reference.kind][reference.name] = max(
-            least[f"reference {reference.name}"], 1e-7
-        )
+        side = Kind.CLASSICAL if reference.kind.is_on_classical_side else Kind.NAIVE
+        kinds[side][reference.name] = max(least[f"reference {reference.name}"], 1e-7)
     costs = []
     for one in running:
         cost = MeasuredCost(

@@ -92,7 +92,8 @@ def _check_cost(
     """Yield names of costs that are no reference predictors of the data set."""
     names_of_kind: dict[Kind, list[str]] = {Kind.CLASSICAL: [], Kind.NAIVE: []}
     for reference in references_of(size):
-        names_of_kind[reference.kind].append(reference.name)
+        side = Kind.CLASSICAL if reference.kind.is_on_classical_side else Kind.NAIVE
+        names_of_kind[side].append(reference.name)
     groups = {
         "classical": (cost.classical, names_of_kind[Kind.CLASSICAL]),
         "naive": (cost.naive, names_of_kind[Kind.NAIVE]),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from lagbench.data.registry import Size
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.shipped import shipped
-from lagbench.references.table import CLASSICAL, REFERENCES
+from lagbench.references.table import REFERENCES
 
 from .output import print_line, print_table
 
@@ -47,10 +47,7 @@ def print_references(
                 cell = f"{value:.3g}"
             cells.append(cell)
         if any(cell != "-" for cell in cells):
-            kind = "naive"
-            if name in CLASSICAL:
-                kind = "classical"
-            rows.append((name, kind, *cells))
+            rows.append((name, REFERENCES[name].kind, *cells))
     columns = ("reference", "kind", *size_names)
     metric = ranking_metric(sizes[0])
     print_line(f"{metric} of the reference predictors: lower is better")

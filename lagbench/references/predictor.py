@@ -1,7 +1,6 @@
 """Reference predictors: what predicts without training, and what it may know.
 
-A *naive* predictor learns nothing and integrates no equations; it may look things up
-in train. A *classical* one integrates the equations. Both get what a model gets of a
+They are naive, classical or calibrated (:class:`Kind`). All get what a model gets of a
 test scenario: its first frames, its materials, the motion of its walls and its
 viscosity.
 
@@ -47,11 +46,26 @@ NEAREST = 10
 class Kind(enum.StrEnum):
     """How a prediction comes about."""
 
-    # learns nothing and integrates no equations; may look things up in train
+    # learns nothing and knows no equation; may look things up in train
     NAIVE = "naive"
-    CLASSICAL = "classical"  # integrates the equations
-    LEARNED = "learned"  # its parameters are fitted to train
-    HYBRID = "hybrid"  # a solver with a learned part
+    # integrates the equations with stated constants
+    CLASSICAL = "classical"
+    # a classical solver whose constants, a dozen numbers at most, are fitted on train
+    CALIBRATED = "calibrated"
+    # a network, no solver
+    LEARNED = "learned"
+    # a solver with a network inside
+    HYBRID = "hybrid"
+
+    @property
+    def is_on_classical_side(self) -> bool:
+        """Whether a model is measured against it: anyone can fit a number."""
+        return self in (Kind.CLASSICAL, Kind.CALIBRATED)
+
+    @property
+    def has_network(self) -> bool:
+        """Whether a network is at work."""
+        return self in (Kind.LEARNED, Kind.HYBRID)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -157,7 +171,7 @@ class ReferencePredictor:
 
     name: str  # name of its rows
     title: str  # the same for readers
-    kind: Kind  # naive or classical
+    kind: Kind  # naive, classical or calibrated
     definition: str  # what it predicts, one sentence
     predict: Callable[[Given], Prediction]
     applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it

@@ -43,7 +43,7 @@ NAIVE = frozenset(
 """Names of the naive predictors: skill is measured against the best of them."""
 
 CLASSICAL = frozenset(REFERENCES) - NAIVE
-"""Names of the classical solvers, which ``against_classical`` is measured against."""
+"""Names of the classical and calibrated solvers, against which models are measured."""
 
 
 def references_of(size: Size) -> tuple[ReferencePredictor, ...]:
