@@ -46,15 +46,16 @@ def entropy(
 ) -> tuple[int, ...]:
     """Return what seeds a scenario: a word of its data set, its version and its id.
 
-    The word is the first eight bytes of SHA-256("split/size"), big-endian. In a season
-    its seed, four words of eight bytes, takes the place of that word and the version.
+    The word is the first eight bytes of SHA-256("split/size"), big-endian. The seed of
+    a blind test, four words of eight bytes, takes the place of that word and the
+    version.
 
     Args:
         split: name of the split.
         size: name of the size.
         major: MAJOR of the version.
         scenario: id of the scenario.
-        draw_seed: seed of a season [64 hex digits].
+        draw_seed: seed of a blind test [64 hex digits].
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
@@ -62,11 +63,10 @@ def entropy(
     (1229782938247303441, 3)
     """
     if draw_seed is not None:
-        season = bytes.fromhex(draw_seed)
+        seed_bytes = bytes.fromhex(draw_seed)
         words = []
-        for start in range(0, len(season), 8):
-            eight_bytes = season[start : start + 8]
-            word = int.from_bytes(eight_bytes, "big")
+        for start in range(0, len(seed_bytes), 8):
+            word = int.from_bytes(seed_bytes[start : start + 8], "big")
             words.append(word)
         return (*words, scenario)
     name = f"{split}/{size}"

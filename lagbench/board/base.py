@@ -22,7 +22,6 @@ from .folder import (
     GATES,
     REFERENCES,
     SCORES,
-    SEASONS,
     SHIFT,
     VERIFIED,
     WEIGHTS,
@@ -73,7 +72,7 @@ def check_base(
         if str(path) in LONGEST_LISTS:
             if not _lost_own_lines_only(folder, path, start, own_methods):
                 yield _maintained_issue(path, verb)
-        elif path.parts[0] == SEASONS or path == Path(GATES):
+        elif path == Path(GATES):
             yield _maintained_issue(path, verb)
         elif path.parts[0] == REFERENCES:
             if path in paths_at_start:

@@ -30,7 +30,6 @@ from .folder import Folder
 from .folder_checks import FolderChecks
 from .issues import issue_from_error, make_issue
 from .rescoring import Confirmation, Rescoring
-from .season_checks import check_seasons
 from .verified import record_verified
 
 MOST_METRICS = 3  # metrics that an issue names
@@ -112,12 +111,6 @@ def check_board(
     )
     checks.run()
     issues = [*checks.issues]
-    issues += check_seasons(
-        folder,
-        checks.entries,
-        readable_score_files=checks.readable_score_files,
-        registry=full_registry,
-    )
     if base is not None:
         issues += check_base(folder, base, own)
 

@@ -439,8 +439,8 @@ ENTRY_COLUMNS = (
         label="scores",
         form="text",
         meaning="How far the maintainers followed the scores: as submitted (not at "
-        "all), scored again from the submitter's predictions, reproduced from the "
-        "model, or blind: scored on data drawn after the model was frozen.",
+        "all), scored again from the submitter's predictions, or reproduced from "
+        "the model.",
         read=_describe_check,
     ),
     Column(

@@ -279,7 +279,6 @@ class Level(enum.StrEnum):
     AS_SUBMITTED = "as submitted"
     SCORED_AGAIN = "scored again"  # the submitter's predictions gave the same scores
     REPRODUCED = "reproduced"  # its model, run by the maintainers, gave them
-    BLIND = "blind"  # its model was also scored on data drawn after it was frozen
 
     @property
     def rank(self) -> int:
@@ -350,21 +349,6 @@ class MeasuredCost(Strict):
         return self.model_copy(update=own_time) == other
 
 
-class BlindScore(Strict):
-    """The skill of an entry on a season's data, beside that on the public data."""
-
-    season: Name
-    public: Number
-    blind: Number
-    low: Number = Field(description="lower bound of the 95 % interval of the gap")
-    high: Number
-
-    @property
-    def gap(self) -> float:
-        """Public skill minus blind skill."""
-        return self.public - self.blind
-
-
 class Verification(Strict):
     """A line of verified.yaml: what the maintainers found out about an entry."""
 
@@ -378,7 +362,6 @@ class Verification(Strict):
         tuple[Reproduction, ...], Field(max_length=MOST_SEEDS, strict=False)
     ] = ()
     cost: MeasuredCost | None = None
-    blind: BlindScore | None = None
 
     @property
     def is_reproduced(self) -> bool:
@@ -396,8 +379,6 @@ class Verification(Strict):
         has_models = bool(self.reproduced)
         if self.level.rank >= Level.REPRODUCED.rank and not has_models:
             raise ValueError(f"level: {self.level} needs models that were predicted")
-        if self.level is Level.BLIND and self.blind is None:
-            raise ValueError("level: blind needs a season")
         return self
 
 

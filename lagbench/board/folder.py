@@ -6,8 +6,6 @@
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
     weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
     weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
-    seasons/<name>/season.yaml                    frozen entries of a blind season
-    seasons/<name>/scores.yaml                    their blind scores
     verified.yaml, gates.json, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
@@ -30,9 +28,6 @@ Place = tuple[str, str, str]  # split, size and method
 SCORES = "scores"
 REFERENCES = "floors"
 WEIGHTS = "weights"
-SEASONS = "seasons"
-SEASON_FILE = "season.yaml"
-SEASON_SCORES = "scores.yaml"
 PAGE = "index.html"
 SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
@@ -185,16 +180,6 @@ class Folder:
         """Return weights and the logs of their trainings, ordered by name."""
         return self._fit_files(WEIGHTS)
 
-    def season_files(self) -> tuple[Path, ...]:
-        """Return the files of blind seasons, relative to the folder, by name."""
-        paths = []
-        for path in self._files(SEASONS):
-            is_known = path.name in (SEASON_FILE, SEASON_SCORES)
-            has_place = len(path.parts) == 3 and all(map(PART.fullmatch, path.parts))
-            if is_known and has_place:
-                paths.append(path)
-        return tuple(paths)
-
     def claimed_places(self) -> set[Place]:
         """Return split, size and method of every path that has the name of an entry.
 
@@ -212,7 +197,6 @@ class Folder:
         """Yield the files that should not lie in the folder, and why."""
         names = (PAGE, SCHEMA, VERIFIED, GATES, SHIFT, README)
         known_paths = {Path(name) for name in names} | set(expected_paths)
-        known_paths.update(self.season_files())
         for path in self._files(""):
             reason = self._reason_irregular(path)
             if reason is None and path not in known_paths:

@@ -488,7 +488,6 @@ class FolderChecks:
         except LagbenchError as error:
             self.issues.append(issue_from_error("verified", error, VERIFIED))
             return
-        seasons = {path.parts[1] for path in self.folder.season_files()}
         names = {entry_path(place).as_posix() for place in unreadable_places}
         for entry in self.entries:
             line = verification_of(entry, verified)
@@ -502,7 +501,6 @@ class FolderChecks:
                     entry,
                     size,
                     ranking_values=self._ranking_values,
-                    seasons=seasons,
                 )
         for name in sorted(verified.keys() - names):
             self._add("verified", VERIFIED, ascii(name)[:120])

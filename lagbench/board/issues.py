@@ -171,13 +171,6 @@ CHECKS: Mapping[str, BoardCheck] = {
         "the JSON that `python -m studies.gates` writes",
         "restore the file, or write it anew: python -m studies.gates",
     ),
-    "season": BoardCheck(
-        "a file of a season that was edited, cannot be read, or disagrees with the "
-        "score files",
-        "a season is not the one that was closed",
-        "what `lagbench season close` and `lagbench season run` wrote",
-        "restore the files of the commit that closed the season",
-    ),
     "base": BoardCheck(
         "a change to an existing entry, or to a file of the maintainers",
         "the change alters what was there before",

@@ -186,7 +186,6 @@ LEVEL_MEANINGS = {
     Level.AS_SUBMITTED: "the maintainers did not follow the scores",
     Level.SCORED_AGAIN: "the maintainers scored the predictions of the submitter again",
     Level.REPRODUCED: "the maintainers ran the model and got the same scores",
-    Level.BLIND: "the model was also scored on scenarios drawn after it was frozen",
 }
 """What the maintainers did with an entry, in words behind the name of its level."""
 
@@ -372,20 +371,11 @@ def _describe_levels(rows: Sequence[BoardRow]) -> str:
         if row.verified is not None and row.verified.cost is not None:
             machines.add(row.verified.cost.machine)
     clauses: list[str] = []
-    run_again = counts[Level.REPRODUCED] + counts[Level.BLIND]
+    run_again = counts[Level.REPRODUCED]
     if run_again:
         models = _count(run_again, "entry", "entries")
         clause = f"ran the models of {models} again and got the same scores"
         clause += _describe_extent(whole_count, run_again - whole_count)
-        blind_count = counts[Level.BLIND]
-        if blind_count:
-            blind_entries = f"{blind_count} of these entries"
-            if blind_count == run_again:
-                blind_entries = "the same entries"
-            clause += (
-                f"; {blind_entries} were also scored on scenarios that were drawn "
-                "after the models were frozen (blind)"
-            )
         clauses.append(clause)
     if counts[Level.SCORED_AGAIN]:
         predictions = _count(counts[Level.SCORED_AGAIN], "entry", "entries")

@@ -305,12 +305,6 @@ def describe_verification(verified: Verification) -> str:
             f"{text(reproduction.reproduced)} predicted anew on "
             f"{reproduction.scenarios} of {reproduction.of} scenarios"
         )
-    if verified.blind is not None:
-        blind = verified.blind
-        parts.append(
-            f"season {blind.season}: skill {text(blind.public)} in public, "
-            f"{text(blind.blind)} blind"
-        )
     return "; ".join(parts)
 
 

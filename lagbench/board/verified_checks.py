@@ -7,7 +7,7 @@ what there can be.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,6 @@ def check_line(
     size: Size,
     *,
     ranking_values: RankingValues,
-    seasons: Collection[str] = (),
 ) -> Iterator[ValidationIssue]:
     """Yield the parts of a line that cannot be true.
 
@@ -47,21 +46,12 @@ def check_line(
         entry: the entry.
         size: its data set, as it is described now.
         ranking_values: the ranking metric in the score files that are sound.
-        seasons: names of the blind seasons on the board.
     """
     where = f"{VERIFIED}, {entry.yaml_path}"
     yield from _check_dates(line, where)
     is_of_today = is_current(entry.dataset, size)
     if line.cost is not None and is_of_today:
         yield from _check_cost(line.cost, size, where)
-    if line.blind is not None and line.blind.season not in seasons:
-        yield make_issue(
-            "verified",
-            f"{where}, blind",
-            line.blind.season,
-            what="a blind score of a season that is not there",
-            expected="a season of this leaderboard",
-        )
     if line.is_reproduced:
         yield from _check_level(line, entry, ranking_values, where)
         if is_of_today:

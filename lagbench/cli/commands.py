@@ -153,27 +153,6 @@ COMMANDS = (
     ),
 )
 
-SEASON_COMMANDS = (
-    CommandEntry(
-        name="close",
-        target="season:close_command",
-        summary="Freeze the models of a leaderboard; this fixes the blind scenarios.",
-        example="season close spring-2027 --size mini",
-    ),
-    CommandEntry(
-        name="run",
-        target="season:run_command",
-        summary="Score the frozen models of a season on its blind scenarios.",
-        example="season run spring-2027",
-    ),
-    CommandEntry(
-        name="show",
-        target="season:show_command",
-        summary="Print public and blind skill of a season, and their gap.",
-        example="season show spring-2027",
-    ),
-)
-
 LEADERBOARD_COMMANDS = (
     CommandEntry(
         name="build",

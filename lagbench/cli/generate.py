@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from lagbench.data.drawn import drawn_registry, drawn_root
 from lagbench.data.layout import format_ids, url_of
 from lagbench.data.local import locate_new
-from lagbench.data.registry import Registry, load
-from lagbench.errors import UsageError, format_count, hide_credentials
+from lagbench.errors import format_count, hide_credentials
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.inventory import recording_hint
-from lagbench.scoring.boards import find_board
 
 from .options import (
-    FoundBoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
@@ -64,15 +60,14 @@ def generate_command(
     dry_run: Annotated[
         bool, option("--dry-run", "Print the cost only: bytes, time, free disk.")
     ] = False,
-    season: Annotated[
+    draw_seed: Annotated[
         str | None,
         option(
-            "--season NAME",
-            "Simulate the blind scenarios of this season, for all its data sets or "
-            "for those of --split and --size.",
+            "--draw-seed HEX",
+            "Simulate new test scenarios, drawn from this seed of 64 hexadecimal "
+            "digits.",
         ),
     ] = None,
-    board: FoundBoardOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -80,113 +75,39 @@ def generate_command(
 
     An interrupted call goes on where it stopped.
     """
-    if season is None:
-        _refuse_board(board)
-        split = choose_split(split_argument, split_option)
-        if size is None and not quiet:
-            print_note(_describe_default_size(split, root))
-        targets = [GenerationTarget(split=split, size=size, root=root, registry=None)]
+    split = choose_split(split_argument, split_option)
+    if size is None and not quiet:
+        print_note(_describe_default_size(split, root))
+    registry = None
+    if draw_seed is not None:
+        chosen = locate_new(split, size, root=root)
+        size = chosen.size.name
+        registry = drawn_registry(chosen.registry, split, size, draw_seed)
+        root = drawn_root(root, draw_seed)
+    with progress_bar(quiet=quiet or dry_run) as progress:
+        result = generate(
+            split,
+            size,
+            subset=subset,
+            scenarios=scenarios,
+            root=root,
+            workers=workers,
+            device=device,
+            scheduler=scheduler,
+            gather=gather or (),
+            force=force,
+            dry_run=dry_run,
+            progress=progress,
+            on_wait=lambda holder: print_note(f"waiting for {holder}"),
+            registry=registry,
+        )
+    if result.dry_run:
+        lines = _describe_plan(result)
     else:
-        split_name = None
-        if split_argument or split_option:
-            split_name = choose_split(split_argument, split_option)
-        targets = _season_targets(season, board, root, split_name, size)
-    for target in targets:
-        with progress_bar(quiet=quiet or dry_run) as progress:
-            result = generate(
-                target.split,
-                target.size,
-                subset=subset,
-                scenarios=scenarios,
-                root=target.root,
-                workers=workers,
-                device=device,
-                scheduler=scheduler,
-                gather=gather or (),
-                force=force,
-                dry_run=dry_run,
-                progress=progress,
-                on_wait=lambda holder: print_note(f"waiting for {holder}"),
-                registry=target.registry,
-            )
-        if result.dry_run:
-            lines = _describe_plan(result)
-        else:
-            lines = _describe_result(result)
-            if result.complete and season is None:
-                lines += recording_hint(result.split, result.size, result.root)
-        print_result(result, lines, as_json=as_json, quiet=quiet)
-
-
-def _refuse_board(board: Path | None) -> None:
-    """Refuse a leaderboard where no season is read from it."""
-    if board is not None:
-        raise UsageError(
-            "only a season is read from a leaderboard",
-            where="--board",
-            expected="--season NAME beside it",
-            got=str(board),
-            fix="name the season: --season NAME; or leave --board out",
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class GenerationTarget:
-    """A data set to generate, and where it is described and kept."""
-
-    split: str
-    size: str | None
-    root: str | Path | None
-    registry: Registry | None
-
-
-def _season_targets(
-    name: str,
-    board: Path | None,
-    root: str | Path | None,
-    split: str | None,
-    size: str | None,
-) -> list[GenerationTarget]:
-    """Return the data sets of a season, or those of a split and size.
-
-    Raises:
-        UsageError: there is no such season, it has no such data set, or it waits for
-            its random value.
-    """
-    from lagbench.board.folder import Folder
-    from lagbench.board.season import read_season, season_registry, season_root
-    from lagbench.board.season_scores import read_scores
-
-    folder = Folder(find_board(board, reads=True))
-    season = read_season(folder, name)
-    scores = read_scores(folder, season)
-    recorded_hashes: Mapping[tuple[str, str], Mapping[int, str]] = {}
-    if scores is not None:
-        recorded_hashes = scores.recorded
-    registry = season_registry(season, load(), recorded_hashes, board=folder.path)
-    targets = []
-    known = []
-    for data_set in season.data_sets:
-        known.append(f"{data_set.split} {data_set.size}")
-        if split in (None, data_set.split) and size in (None, data_set.size):
-            targets.append(
-                GenerationTarget(
-                    split=data_set.split,
-                    size=data_set.size,
-                    root=season_root(name, root),
-                    registry=registry,
-                )
-            )
-    if not targets:
-        raise UsageError(
-            "the season has no such data set",
-            where="--split, --size",
-            expected=", ".join(known),
-            got=f"{split or 'any split'} {size or 'any size'}",
-            fix=f"name one of these, or leave both out; `lagbench season show {name}` "
-            "describes the season",
-        )
-    return targets
+        lines = _describe_result(result)
+        if result.complete and draw_seed is None:
+            lines += recording_hint(result.split, result.size, result.root)
+    print_result(result, lines, as_json=as_json, quiet=quiet)
 
 
 def _describe_default_size(split: str, root: str | Path | None) -> str:

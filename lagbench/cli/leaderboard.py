@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from lagbench.atomic import check_output_file, write_atomically
+from lagbench.board.blind import BlindScore, score_blind
 from lagbench.board.build import build, collect
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
@@ -309,6 +310,14 @@ def reproduce_command(
     threads: Annotated[
         int, option("--threads N", "Threads of a model on the CPU.", min=1)
     ] = 1,
+    draw_seed: Annotated[
+        str | None,
+        option(
+            "--draw-seed HEX",
+            "Score the models on the new scenarios of `generate --draw-seed HEX`; "
+            "nothing is recorded.",
+        ),
+    ] = None,
     board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -339,6 +348,20 @@ def reproduce_command(
             got="both" if costs and no_costs else f"--scenarios {scenarios}",
             fix="leave one of the options out, or ask for one scenario or more",
         )
+    if draw_seed is not None:
+        with progress_bar(quiet=quiet or as_json) as progress:
+            scores = score_blind(
+                find_board(board, reads=True),
+                entries or (),
+                draw_seed,
+                split=split,
+                size=size,
+                threads=threads,
+                root=root,
+                progress=progress,
+            )
+        print_result(scores, _describe_blind(scores), as_json=as_json, quiet=quiet)
+        return
     folder = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
         if recording and not quiet:
@@ -364,6 +387,14 @@ def reproduce_command(
     lines = _describe_reproduced(result, with_scores=not costs, with_costs=not no_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
+
+
+def _describe_blind(scores: Sequence[BlindScore]) -> Iterator[str]:
+    for one in scores:
+        yield (
+            f"{one.name}: skill {one.public_skill:.3f} on test, "
+            f"{one.blind_skill:.3f} on the new scenarios"
+        )
 
 
 def _time_solver(split: str, size: str) -> float | None:

@@ -35,7 +35,6 @@ from lagbench.errors import (
 from .commands import (
     COMMANDS,
     LEADERBOARD_COMMANDS,
-    SEASON_COMMANDS,
     CommandEntry,
 )
 from .stderr import print_on_stderr
@@ -61,13 +60,12 @@ RESUMABLE_COMMANDS = {
     "generate",
     "download",
     "train",
-    "season run",
     "leaderboard reproduce",
     "leaderboard shift",
 }
 """Commands that go on where they stopped."""
 
-GROUPS = ("leaderboard", "season")
+GROUPS = ("leaderboard",)
 """Words before the names of their commands."""
 
 COMMANDS_WITHOUT_SIZE = {
@@ -713,15 +711,3 @@ app.add_typer(
     name="leaderboard",
     epilog="Example: lagbench leaderboard show",
 )
-
-
-class _SeasonGroup(_LazyGroup):
-    entries = SEASON_COMMANDS
-
-
-season = typer.Typer(
-    cls=_SeasonGroup,
-    no_args_is_help=True,
-    help="Close, run and show blind tests of a leaderboard's models.",
-)
-app.add_typer(season, name="season", epilog="Example: lagbench season show rehearsal")

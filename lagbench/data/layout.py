@@ -30,8 +30,9 @@ from lagbench.errors import DataError, UsageError, hide_credentials
 CACHE_VARIABLE = "LAGBENCH_CACHE"
 """Environment variable for the folder of working copies and of measured speeds."""
 
-SEASON_PREFIX = "season."
-"""Begins the name of a folder of blind data, below the folder of all data sets."""
+DRAWN_PREFIX = "drawn-"
+"""Begins the name of a folder of blind scenarios; the seed of their draws follows.
+"""
 
 STORE_FILE = "store.json"
 """Name of the file that holds the URL of a working copy."""
@@ -366,18 +367,18 @@ def generation_command(path: Path) -> str | None:
 
     >>> generation_command(Path("/my data/cavity/tiny/v2/test/0003.nc"))
     "lagbench generate --split cavity --size tiny --subset test --root '/my data'"
-    >>> generation_command(Path("/d/season.may/cavity/tiny/v2/blind/1000.nc"))
-    'lagbench generate --season may --split cavity --size tiny --root /d'
+    >>> generation_command(Path("/d/drawn-0a/cavity/tiny/v2/test/1000.nc"))
+    'lagbench generate --draw-seed 0a --split cavity --size tiny --root /d'
     """
     folders = path.parts[:-1]
     if len(folders) < 4 or re.fullmatch(r"v\d+", folders[-2]) is None:
         return None
     split, size, _, subset = folders[-4:]
     data_root = path.parents[4]
-    if data_root.name.startswith(SEASON_PREFIX):
-        season = shlex.quote(data_root.name.removeprefix(SEASON_PREFIX))
+    if data_root.name.startswith(DRAWN_PREFIX):
+        draw_seed = shlex.quote(data_root.name.removeprefix(DRAWN_PREFIX))
         root = quote_root(data_root.parent)
-        names = f"--season {season} --split {split} --size {size}"
+        names = f"--draw-seed {draw_seed} --split {split} --size {size}"
         return f"lagbench generate {names} --root {root}"
     root = quote_root(data_root)
     names = f"--split {split} --size {size} --subset {subset}"

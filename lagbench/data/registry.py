@@ -215,7 +215,7 @@ class _SizeEntry(_RegistryModel):
     particle_counts: dict[int, Ids] = Field(default_factory=dict)
     parameters: dict[str, Value]
     task: Task
-    # seed of all draws of a season; without it they follow from the names
+    # seed of a blind test; without it the draws follow from the names
     draw_seed: Hash | None = None
 
     @model_validator(mode="after")
@@ -273,8 +273,8 @@ class Size(BaseModel):
     file: Path = Path("datasets.yaml")  # the file that describes it
     package_file: bool = False  # whether that file belongs to another package
     scored_subset: str = "test"  # subset that is predicted and scored
-    # seed of all draws of a season [64 hex digits]; without it they follow from the
-    # names of split, size, version and scenario
+    # seed of a blind test [64 hex digits]; without it draws follow from the names of
+    # split, size, version and scenario
     draw_seed: str | None = None
 
     @property
@@ -326,10 +326,8 @@ class Size(BaseModel):
         """Name of the file that describes the size and records its hashes.
 
         It is datasets.yaml of lagbench, a file in the folder of another package, the
-        description of a local split, or the scores of a season with blind scenarios.
+        description of a local split.
         """
-        if self.draw_seed is not None:
-            return "scores.yaml of the season"
         if self.package_file:
             return f"{self.file.parent.name}/{self.file.name}"
         return self.file.name

@@ -629,7 +629,7 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
 def _describe(setup: _Setup, store: Publication | None, manifest: Manifest) -> None:
     """Write the cards, and bring the store to the state of the folder.
 
-    Blind scenarios of a season have no card: it would say how to make the public ones.
+    Scenarios of a blind test have no card: it would say how to make the public ones.
     """
     size = setup.size
     if size.draw_seed is not None:

@@ -391,9 +391,6 @@ DAMAGE: dict[str, Damage] = {
     "verified: cost of an unknown naive predictor": verified(
         cost=cost(naive={"ballistic": 1.0})
     ),
-    "verified: blind score of no season": verified(
-        blind={"season": "s", "public": 0.5, "blind": 0.5, "low": -0.1, "high": 0.1}
-    ),
     "gates: gates that are none": text("{", "gates.json"),
     "schema: kind of a reference": put(kind="naive"),
     "schema: blank command": put(command=" "),
@@ -508,11 +505,11 @@ def test_damage_is_found(name: str, own: BoardBench) -> None:
 
 def test_a_link_is_called_a_link(own: BoardBench, tmp_path: Path) -> None:
     """At the top of the folder too, whatever its name."""
-    for name in ("seasons", "README.md", "other"):
+    for name in ("notes", "README.md", "other"):
         (own.folder / name).symlink_to(tmp_path)
     result = check_board(own.folder, registry=own.registry, isolated=False)
     places = {str(finding.where) for finding in result.findings}
-    assert places == {"seasons", "README.md", "other"}
+    assert places == {"notes", "README.md", "other"}
     assert all("link" in str(finding.got) for finding in result.findings)
 
 
@@ -529,7 +526,6 @@ def test_all_checks_have_damage() -> None:
         "base",
         "measured",
         "weights",
-        "season",
         "shift",
     }
     assert not tested & elsewhere

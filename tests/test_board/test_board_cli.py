@@ -139,7 +139,6 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         (["leaderboard", "shift", "--all"], 2, "no leaderboard here"),
         (["leaderboard", "picture", "cavity"], 2, "no leaderboard here"),
         (["compare", "cavity/mini/gns", "persistence"], 2, "no leaderboard here"),
-        (["season", "show", "trial"], 2, "no leaderboard here"),
     ],
 )
 def test_errors_have_their_codes(

@@ -83,7 +83,7 @@ def test_measured_costs_count_before_stated_ones(tab: Tab) -> None:
     measured = MeasuredCost.model_construct(
         seconds_per_frame=0.5, machine="a machine", solver=0.25, classical={}
     )
-    verified = Verification.model_construct(cost=measured, reproduced=(), blind=None)
+    verified = Verification.model_construct(cost=measured, reproduced=())
     row = replace(first_row, verified=verified)
     with_measured = replace(tab, rows=(row, *others), solver_seconds=0.02)
     assert seconds_by_name(with_measured)[row.entry.name] == pytest.approx(0.04)

@@ -15,14 +15,13 @@ from typer.testing import CliRunner, Result
 from lagbench.cli.commands import (
     COMMANDS,
     LEADERBOARD_COMMANDS,
-    SEASON_COMMANDS,
     CommandEntry,
 )
 from lagbench.cli.program import app
 
 Run = Callable[..., Result]
 
-ENTRIES = (*COMMANDS, *LEADERBOARD_COMMANDS, *SEASON_COMMANDS)
+ENTRIES = (*COMMANDS, *LEADERBOARD_COMMANDS)
 LOADED_MODULES = """
 import sys
 from typer.testing import CliRunner
@@ -41,8 +40,6 @@ def path_of(entry: CommandEntry) -> tuple[str, ...]:
     """Return the words by which a command is called."""
     if entry in LEADERBOARD_COMMANDS:
         return ("leaderboard", entry.name)
-    if entry in SEASON_COMMANDS:
-        return ("season", entry.name)
     return (entry.name,)
 
 
@@ -68,7 +65,7 @@ def test_the_help_lists_all_commands_in_the_order_of_use(run: Run) -> None:
 
 
 def test_the_help_of_a_group_loads_no_command() -> None:
-    modules = loaded_modules([["--help"], ["leaderboard", "--help"], ["season", "-h"]])
+    modules = loaded_modules([["--help"], ["leaderboard", "--help"]])
     assert modules <= {
         "lagbench.cli.program",
         "lagbench.addresses",

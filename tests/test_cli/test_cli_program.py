@@ -189,8 +189,6 @@ def test_an_interruption_says_to_leave_out_what_deletes_the_work(
         ("leaderboard check", "begins anew"),
         ("score predictions.nc", "begins anew"),
         ("predict weights.pt", "begins anew"),
-        ("season run winter", "goes on where it stopped"),
-        ("season show winter", "begins anew"),
     ],
 )
 def test_an_interruption_says_what_the_same_command_does(

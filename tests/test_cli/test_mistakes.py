@@ -177,12 +177,7 @@ MISTAKES = {
     "a picture that is no SVG": "leaderboard picture cavity --size mini -o x.png",
     "nothing to run again": "leaderboard reproduce",
     "both kinds of costs": "leaderboard reproduce --all --costs --no-costs",
-    "a season that is none": "season show winter",
-    "a source and its value": "season close may --source drand --value 12",
-    "a source without a name": "season close may --source ''",
-    "a value and a split": "season close may --value 12 --split cavity",
-    "a value and a number of scenarios": "season close may --value 12 --scenarios 4",
-    "a value and a budget": "season close may --value 12 --budget 8",
+    "a seed that is none": "generate curl-noise --size tiny --draw-seed 12",
     "a description with an unknown key": "submit good.nc --from bad_key.yaml",
     "a description that is no YAML": "submit good.nc --from bad.yaml",
     "neither added nor replaced": "submit good.nc --add --replace --board .",
@@ -203,7 +198,6 @@ MISTAKES = {
         "download curl-noise --size tiny --from ftp//host/data"
     ),
     "an option for weights only": "predict notes.txt --split curl-noise -o x.nc",
-    "a season to run that is none": "season run winter",
 }
 
 
@@ -284,7 +278,6 @@ HINTS = {
     f"{ADOPT} runs.npy --radius big": "expected: a number",
     f"{ADOPT} runs.npy --radius 0,1": "fix: write a decimal point: --radius 0.1",
     "generate cavity --size": "where: lagbench generate",
-    "generate cavity --board near/board": "fix: name the season: --season NAME",
     "leaderboard show --size": "where: lagbench leaderboard show",
     "score good.nc --all=3": "--all takes no value",
     "compare good.nc": "A predictions.nc",

@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from benchmarks.references import main as print_references
-from benchmarks.season_grinding import main as print_season_grinding
 from lagbench.board.folder import Folder
 from studies.frame_speeds import read_speed_ups
 from studies.frame_speeds import table as table_of_speeds
@@ -172,16 +171,3 @@ def test_the_tables_of_references_have_the_shipped_scores(
     active = [row for row in active if " tiny |" not in row]
     assert len(active) > 8
     assert table_like(page, active[0]) == active
-
-
-@pytest.mark.slow
-def test_the_tables_of_seeds_that_were_tried_have_the_scores_of_the_board(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Both tables, for every data set of size mini."""
-    print_season_grinding(["--board", str(BOARD)])
-    gains, swaps = tables_in(capsys.readouterr().out)
-    page = tables_in((DOCS / "seasons.md").read_text())
-    assert len(gains) > 10
-    assert table_like(page, gains[0]) == gains
-    assert table_like(page, swaps[0]) == swaps

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from lagbench.board.folder import (
     GATES,
     SCORES,
-    SEASONS,
     SHIFT,
     VERIFIED,
     WEIGHTS,
@@ -69,7 +68,6 @@ GRAPH_WORDS = ("--set", "training.steps=1", "--set", "model.noise_spread=true")
 SETTING_WORDS = ("--set", "training.seed=1", "--set", "model.evaluations=5")
 
 PLACE = Path("cavity/mini")
-SEASON = "spring"
 RECIPE = """format: 1
 recipes:
   curl-noise/tiny:
@@ -259,7 +257,7 @@ def make_valid_files(folder: Path, root: Path, leaderboard: Path) -> None:
 
 
 def _make_board(folder: Path, run: Callable[..., str]) -> None:
-    """Make a leaderboard of an entry with a model, and a season of it."""
+    """Make a leaderboard of an entry with a model."""
     board = folder / "board"
     board.mkdir()
     (board / "meta.yaml").write_text(META)
@@ -270,11 +268,6 @@ def _make_board(folder: Path, run: Callable[..., str]) -> None:
         *("--board", "b", "--new-board", "-q"),
         at="board",
     )
-    names = ("--board", "b", "-q")
-    close = ("season", "close", SEASON, "--scenarios", "4", *names)
-    run(*close, at="board")
-    run("generate", "--season", SEASON, *names, at="board")
-    run("season", "run", SEASON, *names, at="board")
 
 
 def _copy_records(folder: Path, leaderboard: Path) -> None:
@@ -419,7 +412,7 @@ def _seconds_of_rollout() -> float:
 
 def _board_targets(folder: Path) -> list[Target]:
     """Return the targets on leaderboards."""
-    return [*_season_targets(), *_entry_targets(), *_record_targets(folder)]
+    return [*_entry_targets(), *_record_targets(folder)]
 
 
 BOARD = ("--board", "b")
@@ -430,32 +423,6 @@ BUILD = ("leaderboard", "build", *BOARD)
 BOARD_READERS = [CHECK, *[SHOW] * 6, *[BUILD] * 3]
 BOARD_TEXT = (*YAML, *YAML, *BYTES, *PLACES)
 HASHED_FILE = (*BYTES, *PLACES[:7])
-
-
-def _season_targets() -> list[Target]:
-    """Return the targets on the files of a blind season."""
-    show = ("season", "show", SEASON, *BOARD)
-    run = ("season", "run", SEASON, "--check", *BOARD, "-q")
-    readers = [CHECK, *[show] * 8, run]
-    season = f"b/{SEASONS}/{SEASON}"
-    return [
-        Target(
-            name="season.yaml",
-            source="board",
-            victim=f"{season}/season.yaml",
-            mutations=BOARD_TEXT,
-            commands=readers,
-            weight=10,
-        ),
-        Target(
-            name="scores.yaml of a season",
-            source="board",
-            victim=f"{season}/scores.yaml",
-            mutations=BOARD_TEXT,
-            commands=readers,
-            weight=8,
-        ),
-    ]
 
 
 def _entry_targets() -> list[Target]:
