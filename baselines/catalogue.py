@@ -25,7 +25,6 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     describe_exception,
-    load_entry_point,
     suggest_name,
 )
 
@@ -134,7 +133,7 @@ def _warn_of_point(point: EntryPoint, reason: str) -> None:
 
 
 def _load_entry(point: EntryPoint) -> CatalogueEntry:
-    loaded_class = load_entry_point(point)
+    loaded_class = point.load()
     if not inspect.isclass(loaded_class):
         raise UsageError(
             f"{point.value} is no class",

@@ -37,7 +37,6 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     describe_exception,
-    load_entry_point,
     suggest_name,
 )
 
@@ -719,7 +718,7 @@ def _add_split(registry: Registry, point: EntryPoint) -> Registry:
     name = point.name
     if name in registry.splits:
         raise UsageError("its name is taken")
-    module = load_entry_point(point)
+    module = point.load()
     if not hasattr(module, "REGISTRY"):
         expected = "an attribute REGISTRY: the path of its datasets.yaml"
         raise UsageError("its module has no registry", expected=expected)

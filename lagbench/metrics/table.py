@@ -26,7 +26,6 @@ from lagbench.errors import (
     LagbenchError,
     UsageError,
     describe_exception,
-    load_entry_point,
     suggest_name,
 )
 
@@ -160,7 +159,7 @@ def _warn_of_package(point: EntryPoint, reason: str) -> None:
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
     """Return the metrics of an entry point of another package."""
-    value = load_entry_point(point)
+    value = point.load()
     metrics: tuple[object, ...] = (value,)
     if isinstance(value, Iterable):
         metrics = tuple(value)

@@ -518,7 +518,7 @@ def _require_scheme(url: str) -> str:
 
 
 def _require_place(url: str, place: str) -> None:
-    """Refuse an address without host, bucket or path, or with a blank in its user.
+    """Refuse an address without host, bucket or path, or with a user.
 
     Raises:
         UsageError: it is one of these.
@@ -533,17 +533,11 @@ def _require_place(url: str, place: str) -> None:
             got="nothing",
             fix=STORE_HINT,
         )
-    without_blanks = re.sub(r"\s", "", url)
-    has_user = hide_credentials(without_blanks) != without_blanks
-    has_blank = re.search(r"\s", url.rpartition("@")[0]) is not None
-    if has_user and has_blank and not url.startswith(LOCAL):
-        # messages would show what stands before the blank
+    if hide_credentials(url) != url:
         raise UsageError(
-            "a blank in the user or the password of an address",
+            "a user or a password stands in the address; let the environment give "
+            "them, as by AWS_PROFILE",
             where=_short_address(url),
-            expected="no blank before the last @",
-            got="a blank",
-            fix="write it as %20",
         )
 
 

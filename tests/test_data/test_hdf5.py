@@ -243,16 +243,6 @@ def test_files_that_are_too_long_are_refused(tmp_path: Path) -> None:
         check_regular(path, longest=99)
 
 
-def test_a_folder_in_place_of_a_file_names_its_files(tmp_path: Path) -> None:
-    """The folder of a training, say: the file of the weights is in it."""
-    (tmp_path / "weights.pt").write_bytes(b"")
-    (tmp_path / ".lock").write_bytes(b"")
-    (tmp_path / "tensorboard").mkdir()
-    with pytest.raises(UnreadableFileError) as caught:
-        check_regular(tmp_path, fix="write another one")
-    assert caught.value.fix == "name a file in it: weights.pt"
-
-
 @pytest.mark.parametrize(
     ("content", "got"),
     [

@@ -28,8 +28,6 @@ from lagbench.data.registry import PluginWarning
 from lagbench.errors import (
     UsageError,
     WorkFailedError,
-    find_place_in_extension,
-    load_entry_point,
 )
 from lagbench.metrics import (
     FAMILIES,
@@ -529,7 +527,6 @@ def test_a_pickled_metric_whose_package_is_missing_is_a_usage_error(
         "NO_METRIC",
         "NUMBER",
         "ROOTLESS",
-        "leaving:METRICS",
     ],
 )
 def test_a_bad_entry_point_is_left_out(
@@ -549,30 +546,6 @@ def test_a_bad_entry_point_is_left_out(
     assert len(warnings) == 1
     assert value in str(warnings[0].message)
     assert metrics == dict(METRICS)
-
-
-def test_a_module_that_would_end_the_program_is_named_with_its_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "parting.py").write_text("import sys\nsys.exit(3)\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    point = EntryPoint(name="part", value="parting:VALUE", group=table_module.GROUP)
-    with pytest.raises(ImportError) as caught:
-        load_entry_point(point)
-    place = find_place_in_extension(caught.value, "parting")
-    assert place == f"{tmp_path / 'parting.py'}, line 2"
-
-
-def test_a_module_that_sleeps_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "sleeping.py").write_text("import time\ntime.sleep(0.5)\nVALUE = 3\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    point = EntryPoint(name="slow", value="sleeping:VALUE", group=table_module.GROUP)
-    assert load_entry_point(point, patience=0.05) == 3
-    assert "sleeping:VALUE" in capsys.readouterr().err
-    assert load_entry_point(point) == 3
-    assert capsys.readouterr().err == ""
 
 
 def test_selection_brings_what_a_metric_follows_from() -> None:

@@ -16,9 +16,8 @@ from faulty_server import Mirror, serving
 
 import lagbench
 from lagbench import addresses
-from lagbench.data.layout import working_copy_of
 from lagbench.data.manifest import Manifest
-from lagbench.errors import DataError, LagbenchError, UsageError, hide_credentials
+from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.exchange import download
 from lagbench.exchange.downloading import DownloadResult
 from lagbench.exchange.local_split import LocalSplit
@@ -293,109 +292,14 @@ def test_an_invalid_address_of_releases_is_refused(
 
 @pytest.mark.parametrize(
     "address",
-    [
-        "ftp://qzuser:secret@localhost:1/data",
-        "memory://qzuser:secret@x/data",
-        "memory://qzuser:sec/ret@x/data",
-        "ftp://qzuser:sec/ret@localhost:1/data",
-    ],
+    ["ftp://ann:secret@localhost:1/data", "memory://ann:secret@x/data"],
 )
-def test_no_message_shows_the_user_of_an_address(address: str, here: Path) -> None:
-    """The store fails or is empty: neither part of the message has the password."""
-    with pytest.raises(LagbenchError) as caught:
-        download(SPLIT, SIZE, root=here, mirror=address, or_generate=False)
-    message = f"{caught.value} {caught.value.where} {caught.value.fix}"
-    for part in ("secret", "sec/", "ret@", "qzuser"):
-        assert part not in message
-    assert "...@" in message
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        OSError("ftp://qzuser:secret@host/data does not answer"),
-        Path("ftp://qzuser:secret@host/data"),
-        ("ftp://qzuser:secret@host/data", 3),
-    ],
-)
-def test_no_value_in_a_message_shows_the_user_of_an_address(value: object) -> None:
-    """Values of any type, and notes that are added later."""
-    error = UsageError("this fails", expected=value, got=value)
-    error.add_note("ftp://qzuser:secret@host/data")
-    assert "...@host" in str(error)
-    assert "secret" not in f"{error} {error.where}"
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("s3://ann:se/cret@host/data", "s3://...@host/data"),
-        ("s3://ann:0/cret@host/data", "s3://...@host/data"),
-        ("s3://ann:12x/cret@host/data", "s3://...@host/data"),
-        ("s3://ann:s@e/c//r:e@t@host/data", "s3://...@host/data"),
-        ("s3:/ann:se/cret@host/data", "s3:/...@host/data"),
-        ("x: s3://ann:a/b@h, s3://bob:c/d@h", "x: s3://...@h, s3://...@h"),
-        ("simplecache::s3://ann:a/b@h/x", "simplecache::s3://...@h/x"),
-        ("ftp://ann@host/data@v2", "ftp://...@host/data@v2"),
-        ("http://[::1]/data@v2", "http://[::1]/data@v2"),
-        ("https://host/data@v2", "https://host/data@v2"),
-        ("https://host:8000/data, ann@host", "https://host:8000/data, ann@host"),
-        ("see ann@host or a:b@c", "see ann@host or a:b@c"),
-        ("ftp://[a:se/cret@host/x", "ftp://...@host/x"),
-        ("ftp://[::1]:se/cret@host/x", "ftp://...@host/x"),
-        ("http://[::1]:8000/data@v2", "http://[::1]:8000/data@v2"),
-        ("http://localhost:8000/data@v2", "http://localhost:8000/data@v2"),
-        ("http://127.0.0.1:80/data@v2", "http://127.0.0.1:80/data@v2"),
-        ("http://nas:8000/data@v2", "http://nas:8000/data@v2"),
-        ("sftp://nas:22/data@v2/x", "sftp://nas:22/data@v2/x"),
-        ("HTTPS://nas:8000/data@v2", "HTTPS://nas:8000/data@v2"),
-        ("simplecache::http://nas:8000/a@v2", "simplecache::http://nas:8000/a@v2"),
-        ("s3://AKIA:1/abcSECRET@bucket", "s3://...@bucket"),
-        ("s3a://AKIA:22/abcSECRET@bucket/x", "s3a://...@bucket/x"),
-        ("memory://ann:80/secret@x/data", "memory://...@x/data"),
-        ("xhttps://ann:80/secret@x/data", "xhttps://...@x/data"),
-        ("s3+http://ann:80/secret@x/data", "s3+http://...@x/data"),
-        ("http://a.org:99999/cret@host", "http://...@host"),
-        ("http://ann@a.org:12/data@v2", "http://...@a.org:12/data@v2"),
-        ("http://ann:secret@nas:8000/data@v2", "http://...@nas:8000/data@v2"),
-        ("http://ann:secret@nas:8000/data", "http://...@nas:8000/data"),
-    ],
-)
-def test_a_password_may_hold_slashes(text: str, shown: str) -> None:
-    """An address without a user, and an @ elsewhere, stay as they are."""
-    assert hide_credentials(text) == shown
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["a", "a://", "a://b:", "a:", "/", "@", "a://b@", " ", "a://b.c:1/", "a://[", "a."],
-)
-@pytest.mark.parametrize("ending", ["", "@host"])
-def test_a_long_text_in_a_message_costs_no_time(text: str, ending: str) -> None:
-    """Quadratic time would be hours here: the suite would be stopped."""
-    letters = text * (1_000_000 // len(text)) + ending
-    message = str(UsageError("this fails", got=letters))
-    assert message.startswith("this fails")
-
-
-@pytest.mark.parametrize(
-    "address",
-    [
-        "http://ann:secret\u2100x@host/a",
-        "http://ann:12x/3secret@host/x",
-        "http://[a:secret@host/x",
-        "http://ann:secret x@host/a",
-        "http://ann:secret/\u2100@host/a",
-        "ftp://ann:secret x@host/a",
-    ],
-)
-def test_an_address_with_a_password_is_refused_without_it(address: str) -> None:
-    """Also where Python cannot read the address and repeats it."""
+def test_an_address_with_a_password_is_refused_without_it(
+    address: str, here: Path
+) -> None:
     with pytest.raises(UsageError) as caught:
-        objects.check_address(address)
-    error = caught.value
-    assert None not in (error.where, error.expected, error.got, error.fix)
-    assert "secret" not in f"{error} {error.where} {error.got}"
+        download(SPLIT, SIZE, root=here, mirror=address, or_generate=False)
+    assert "secret" not in str(caught.value)
 
 
 def test_an_at_sign_in_a_path_is_no_password() -> None:
@@ -403,23 +307,6 @@ def test_an_at_sign_in_a_path_is_no_password() -> None:
     objects.check_address("http://nas:8000/data@v2")
     objects.check_address("http://host/data@v2")
     objects.check_address("file:///my folder/data@v2")
-
-
-def test_a_part_of_a_password_is_not_shown() -> None:
-    """What a library says of an address may hold a part of it."""
-    with pytest.raises(UsageError) as caught:
-        objects.open_object("http://qzuser:sec/ret@localhost:1/x", 0, hint="")
-    assert "user or a password" in str(caught.value)
-    assert "sec" not in str(caught.value)
-
-
-def test_no_name_of_a_working_copy_holds_a_password() -> None:
-    copy = working_copy_of("ftp://ann:secret@host/data")
-    assert copy.name.startswith("ftp-host-data-")
-    slashed = working_copy_of("ftp://ann:sec/ret@host/data")
-    assert slashed.name.startswith("ftp-host-data-")
-    other = working_copy_of("ftp://ann:other@host/data")
-    assert copy != other
 
 
 def test_a_compressed_archive_is_not_unpacked(
