@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 from lagbench.board.entry import MeasuredCost
-from lagbench.board.overview import LearningVerdict, verdict_of_interval
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.predictor import Kind
-from lagbench.scoring.skill import AgainstClassical
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
@@ -62,169 +59,6 @@ def summary_table(all_results: Sequence[SplitResults]) -> str:
                 )
             )
     return markdown(heads, rows)
-
-
-def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
-    """Return in one sentence each where models beat a solver of their cost.
-
-    The model is the best learned or hybrid one of a data set of known cost, as on the
-    page of the leaderboard. A sentence says on how many data sets it is slower than the
-    simulator.
-    """
-    pays = []
-    pays_at_less_cost = []  # those of `pays` where every solver costs more
-    time_ratios = []  # time of a frame over the simulator's, where learning pays
-    open_sets = []
-    without_interval = []
-    does_not_pay = []
-    no_verdict = []  # sentences
-    for results in all_results:
-        model = deciding_model(results)
-        if model is None:
-            continue
-        against = results.against_classical(model)
-        if against is None:
-            continue
-        verdict = verdict_of_interval(
-            *against.interval, solver_costs_more=against.solver_costs_more
-        )
-        if verdict is LearningVerdict.NO_SOLVER:
-            sentence = _without_verdict(results, model, against)
-            no_verdict.append(sentence)
-        elif verdict is LearningVerdict.PAYS:
-            pays.append(results.where)
-            if against.solver_costs_more:
-                pays_at_less_cost.append(results.where)
-            time_ratios.append(time_over_simulator(results, model))
-        elif verdict is LearningVerdict.DOES_NOT_PAY:
-            does_not_pay.append(results.where)
-        elif math.isnan(sum(against.interval)):
-            without_interval.append(results.where)
-        else:
-            open_sets.append(results.where)
-    sentences = []
-    if pays:
-        sentences += _where_learning_pays(pays, pays_at_less_cost)
-        sentences += slower_than_simulator(time_ratios)
-    if open_sets:
-        sentences.append(
-            f"On {_join(open_sets)} the question is open. There the interval contains"
-            " 1."
-        )
-    if without_interval:
-        sentences.append(
-            f"On {_join(without_interval)} the question is open. There are too few"
-            " scenarios for an interval there."
-        )
-    if does_not_pay:
-        sentences.append(
-            f"Learning does not pay on {_join(does_not_pay)}. There the best learned"
-            " or hybrid model is less accurate than a classical solver that costs no"
-            " more."
-        )
-    sentences += no_verdict
-    return " ".join(sentences)
-
-
-def _where_learning_pays(
-    places: Sequence[str], at_less_cost: Sequence[str]
-) -> list[str]:
-    """Return sentences on the data sets where learning pays.
-
-    Args:
-        places: the data sets.
-        at_less_cost: those of them where every classical solver costs more.
-    """
-    place = "There"
-    count = len(places) - len(at_less_cost)
-    if at_less_cost:
-        place = f"On {count} of these {len(places)} data sets"
-    sentences = [f"Learning pays on {_join(places)}."]
-    if count:
-        sentences.append(
-            f"{place} the best learned or hybrid model is more accurate than every"
-            " classical solver that costs no more per frame."
-        )
-    if at_less_cost:
-        sentences.append(
-            f"On {_join(at_less_cost)} no classical solver costs as little as the best"
-            " model. There the model is more accurate than the cheapest solver."
-        )
-    return sentences
-
-
-def deciding_model(results: SplitResults) -> str | None:
-    """Return the most accurate learned or hybrid model whose cost is known, if any."""
-    for name in results.order():
-        is_model = results.methods[name].kind in (Kind.LEARNED, Kind.HYBRID)
-        if is_model and results.seconds_per_frame(name) is not None:
-            return name
-    return None
-
-
-def time_over_simulator(results: SplitResults, model: str) -> float | None:
-    """Return the time of a frame of a model over that of the solver of the data.
-
-    Both times were measured in one run. None without such a run.
-    """
-    measured = results.methods[model].measured
-    if measured is None or measured.speed_up is None:
-        return None
-    return 1.0 / measured.speed_up
-
-
-def slower_than_simulator(ratios: Sequence[float | None]) -> list[str]:
-    """Return a sentence on how often models take longer than the simulator.
-
-    There is no sentence if no model does. The total is that of the data sets whose time
-    is known.
-
-    Args:
-        ratios: time of a frame over the simulator's, one per data set; None where it is
-            not known.
-    """
-    known = [ratio for ratio in ratios if ratio is not None]
-    slower = sorted(ratio for ratio in known if ratio > 1.0)
-    if not slower:
-        return []
-    least = number(slower[0], 2)
-    most = number(slower[-1], 2)
-    times = f"{least} to {most} times as much"
-    if least == most:
-        times = f"{most} times as much"
-    place = ""
-    if len(ratios) > 1:
-        place = f"On {len(slower)} of these {len(ratios)} data sets "
-    if len(known) < len(ratios):
-        place = (
-            f"On {len(slower)} of the {len(known)} of these {len(ratios)} data sets"
-            " whose time was measured "
-        )
-    sentence = (
-        f"{place}the best model takes more time per frame than the simulator that made"
-        f" the data ({times})."
-    )
-    return [sentence[0].upper() + sentence[1:]]
-
-
-def _without_verdict(
-    results: SplitResults, model: str, against: AgainstClassical
-) -> str:
-    """Return sentences on a model that costs less than every classical solver."""
-    low, high = against.interval
-    return (
-        f"On {results.where} there is no verdict. There every classical solver costs"
-        f" more than the best model ({label(model)}). The error of this model is"
-        f" {number(against.value)} times the error of the cheapest solver"
-        f" ({label(against.reference)}), with a 95 % interval from {number(low)} to"
-        f" {number(high)}."
-    )
-
-
-def _join(names: Sequence[str]) -> str:
-    if len(names) == 1:
-        return names[0]
-    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _format_against(results: SplitResults, model: str) -> str:

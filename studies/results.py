@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
+from lagbench.board.overview import FINDING
 from lagbench.errors import LagbenchError
 
 from .result_tables import (
@@ -31,7 +32,6 @@ from .result_tables import (
     run_of,
     summary_table,
     training_table,
-    verdict_on_learning,
     vorticity_table,
 )
 from .thesis.cases import key_frame
@@ -65,10 +65,10 @@ On this page you can look up for each data set:
 - whether a model is better than every classical solver of the same or a smaller cost;
 - which recipe trained a model, and how long the training took.
 
-The next table has the best learned model and the best hybrid of each data set. The
-[verdict](#verdict) follows. Then each data set has a chapter with its
-[active entries](glossary.md) and reference predictors. Last come [claims](#claims)
-about the models, and notes on the trainings."""
+First comes what these numbers show [about learning](#does-learning-pay). The table
+behind it has the best learned model and the best hybrid of each data set. Then each
+data set has a chapter with its [active entries](glossary.md) and reference predictors.
+Last come [claims](#claims) about the models, and notes on the trainings."""
 
 SUMMARY_NOTE = """\
 - Scores are errors ([metrics](scoring.md#metrics)), so lower is better.
@@ -87,12 +87,9 @@ SUMMARY_NOTE = """\
   contain the 95 % interval.
 - If every solver costs more than the model, the ratio uses the cheapest solver. Then
   the cell says "which costs more".
-- *Learning pays* on a data set if the whole interval of `against_classical` is below 1.
-  The best learned or hybrid model decides.
-- If every solver costs more and the interval is not below 1 as a whole, there is no
-  verdict."""
+- The simulator itself, restarted from the given frames, is not among the solvers."""
 
-VERDICT = "## Verdict"
+LEARNING = "## Does learning pay?"
 
 HOW_TO_READ = """\
 ## How to read the chapters
@@ -217,11 +214,10 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     learned = [results for results in scored if results.models]
     newer_learned = [results for results in newer_results if results.models]
 
-    parts = [INTRODUCTION]
+    parts = [INTRODUCTION, LEARNING, " ".join(FINDING), "## Best models"]
     summarised = [*learned, *newer_learned]
     if summarised:
         parts += [summary_table(summarised), SUMMARY_NOTE]
-        parts += [VERDICT, verdict_on_learning(summarised)]
     parts.append(HOW_TO_READ)
     for results in [*scored, *newer_learned]:
         parts += _chapter(results)

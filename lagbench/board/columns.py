@@ -286,8 +286,8 @@ AGAINST_CLASSICAL = Column(
     label="÷ classical",
     direction=Direction.LOWER,
     meaning="Score over that of the best classical solver that costs no more per frame:"
-    " below 1 learning pays. Where every classical solver costs more, the cheapest one"
-    " takes its place. Empty where the entry states no cost.",
+    " below 1 the method is more accurate. Where every classical solver costs more, the"
+    " cheapest one takes its place. Empty where the entry states no cost.",
 )
 
 HAS_GAPS = "†"

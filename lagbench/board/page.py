@@ -50,21 +50,14 @@ from .encoding import decode, encode
 from .entry import Level
 from .model import Board, BoardRow, ReferenceRow, Tab
 from .overview import (
-    ANSWERS,
-    Conclusion,
-    LearningVerdict,
+    FINDING,
     MethodOverview,
     SizeOverview,
-    conclude,
-    conclusions_of,
     count_data_sets,
-    describe_slowdown,
     find_hero,
-    format_comparison,
     is_open,
     join_names,
     make_overviews,
-    state_verdicts,
     summarise,
 )
 from .page_data import page_data
@@ -148,14 +141,12 @@ FOOT = (
 OVERVIEW_WORDS = (
     "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
     "prediction. “0.9×” is the error beside that of the best classical solver that "
-    "costs no more per frame than the model: below 1, learning pays. Where all cost "
+    "costs no more per frame than the model. Where all cost "
     f"more, the cheapest one takes its place, and the sign {SOLVER_COSTS_MORE} stands "
-    "behind the number. "
-    "So two models of one data set may stand beside different solvers. The question is "
-    "open where the "
-    "95 % interval contains 1. The error is the metric that ranks on the data set: "
-    "that of vorticity in boxes full of fluid, the distance of particle clouds on free "
-    "surfaces. The cost is the processor time of a frame on one core. Size mini is "
+    "behind the number. So two models of one data set may stand beside different "
+    "solvers. The error is the metric that ranks on the data set: that of vorticity in "
+    "boxes full of fluid, the distance of particle clouds on free surfaces. The cost "
+    "is the processor time of a frame on one core. Size mini is "
     "what a laptop makes in minutes, full is larger."
 )
 
@@ -170,17 +161,6 @@ CELL_WORDS = (
     "have none. Variants of a method are folded behind it, without a rank."
 )
 
-VERDICT_HEADINGS = (
-    "data set",
-    "does learning pay?",
-    "most accurate model",
-    "kind",
-    "its error beside the solver",
-    "its time beside the simulator",
-    "best purely learned model",
-    "its error beside the solver",
-)
-"""Columns of the table of a size's data sets."""
 
 LEVEL_MEANINGS = {
     Level.AS_SUBMITTED: "the maintainers did not follow the scores",
@@ -335,11 +315,9 @@ def draw_intro(board: Board) -> Markup:
         "better than a classical solver of the same cost?"
     )
     paragraphs = [tag("p", question, class_="lede")]
-    verdicts = state_verdicts(conclusions_of(board.tabs))
-    if verdicts:
-        answer = tag("strong", verdicts[0])
-        details = " ".join(["", *verdicts[1:]])
-        paragraphs.append(tag("p", answer, details, class_="lede"))
+    statement, reasons = FINDING
+    answer = tag("strong", statement)
+    paragraphs.append(tag("p", answer, f" {reasons}", class_="lede"))
     entries = _count(len(rows), "entry", "entries")
     data_sets = _count(data_set_count, "data set", "data sets")
     evidence = escaped(
@@ -475,7 +453,7 @@ def draw_empty(board: Board) -> Markup:
 
 
 def draw_overview(overviews: Sequence[SizeOverview]) -> Markup:
-    """Return a section with the findings, the verdicts and a table of methods for each
+    """Return a section with the findings and a table of methods for each
     size.
     """
     if not overviews:
@@ -488,60 +466,10 @@ def draw_overview(overviews: Sequence[SizeOverview]) -> Markup:
         items = [tag("li", sentence) for sentence in summarise(overview)]
         parts.append(tag("h3", overview.size))
         parts.append(tag("ul", *items, class_="verdicts"))
-        parts.append(_verdict_table(overview))
         if number == 0:
             parts.append(tag("p", CELL_WORDS, class_="facts"))
         parts.append(_overview_table(overview))
     return tag("section", *parts, id="overview", class_="tab")
-
-
-def _verdict_table(overview: SizeOverview) -> Markup:
-    """Return a table with a row per data set: whether learning pays, by how much."""
-    conclusions = conclusions_of(overview.tabs)
-    if not conclusions:
-        return Markup("")
-    headings = [tag("th", heading, scope="col") for heading in VERDICT_HEADINGS]
-    rows = [_verdict_row(conclusion) for conclusion in conclusions]
-    caption = f"Where learning pays at size {overview.size}"
-    return _scrolled_table(
-        caption, headings, [tag("tbody", *rows)], class_="board answers"
-    )
-
-
-def _verdict_row(conclusion: Conclusion) -> Markup:
-    """Return the line of a data set; entries in it are links."""
-    tab = conclusion.tab
-    pays = conclusion.verdict is LearningVerdict.PAYS
-    row = conclusion.row
-    model: list[Markup | str] = [_entry_link(tab, row)]
-    if conclusion.better_has_no_cost:
-        model.append(tag("span", f" {conclusion.model}", class_="ci"))
-    time = "unknown"
-    if conclusion.slowdown is not None:
-        time = describe_slowdown(conclusion.slowdown)
-    learned = conclusion.learned
-    cells = [
-        tag("th", tag("a", tab.size.split, href=f"#{tab.id}"), scope="row"),
-        tag("td", ANSWERS[conclusion.verdict], class_="best" if pays else None),
-        tag("td", *model),
-        tag("td", str(row.entry.kind)),
-        tag("td", format_comparison(row)),
-        tag("td", time),
-    ]
-    if learned is None:
-        cells += [tag("td"), tag("td")]
-    else:
-        cells += [
-            tag("td", _entry_link(tab, learned)),
-            tag("td", format_comparison(learned)),
-        ]
-    return tag("tr", *cells)
-
-
-def _entry_link(tab: Tab, row: BoardRow) -> Markup:
-    """Return a link to an entry, by its name."""
-    name = clipped(row.entry.name, 60)
-    return tag("a", name, href=f"#tab={tab.id}&entry={row.id}")
 
 
 def _overview_table(overview: SizeOverview) -> Markup:
@@ -698,7 +626,6 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         aria_label="Scores",
         tabindex=0,
     )
-    conclusion = conclude(tab)
     notes = []
     for note in _notes(tab):
         notes.append(tag("p", note))
@@ -706,7 +633,6 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
         tag("p", _describe_task(tab, metrics), class_="facts"),
-        tag("p", conclusion, class_="verdict") if conclusion else "",
         tag("ul", *_tiles(view, metrics), class_="tiles"),
         _tools(view),
         tag("p", _describe_ranks(view), class_="facts"),

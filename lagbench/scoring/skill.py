@@ -5,9 +5,8 @@ perfect, 0 means that nothing was learned, below 0 the method is worse than not
 learning.
 
 ``against_classical = score / score of the best classical solver that costs no more per
-frame``. Learning pays if the whole interval is below 1: at this cost no solver here is
-as accurate. Where every solver costs more, it is the ratio to the cheapest one. It
-keeps the rule of McGreivy and Hakim (Nature Machine Intelligence 6 (2024) 1256):
+frame``. Where every solver costs more, it is the ratio to the cheapest one. It keeps
+the rule of McGreivy and Hakim (Nature Machine Intelligence 6 (2024) 1256):
 compare at equal cost or at equal accuracy, and with an efficient solver.
 
 The best predictor has the least mean over its own scenarios (see
@@ -68,9 +67,7 @@ class AgainstClassical:
 
     metric: str  # name of the ranking metric
     reference: str  # name of the classical solver
-    # score / score of that solver: learning pays if the whole interval is below 1; it
-    # does not pay if the interval is above 1 and the solver costs no more
-    value: float
+    value: float  # score / score of that solver
     interval: tuple[float, float]  # 95 %, as that of a skill
     std: float = math.nan  # sample standard deviation over seeds; NaN for one
     solver_costs_more: bool = False  # whether every solver does; this is the cheapest

@@ -34,7 +34,6 @@ from lagbench.board.entry import (
 from lagbench.board.model import Board, BoardRow, Tab
 from lagbench.board.overview import (
     SizeOverview,
-    conclude,
     find_hero,
     make_overviews,
 )
@@ -448,38 +447,6 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
     assert ranges["c"] == (3, 3)
 
 
-@pytest.mark.parametrize(
-    ("low", "ratio", "high", "verdict"),
-    [
-        (1.1, 1.5, 1.9, "does not pay"),
-        (0.8, 1.5, 1.9, "open"),
-        (0.8, 0.9, 1.1, "open"),
-        (0.4, 0.5, 0.6, "pays"),
-        (math.nan, 0.5, math.nan, "open"),
-    ],
-)
-def test_a_sentence_says_whether_learning_pays(
-    board: Board,
-    low: float,
-    ratio: float,
-    high: float,
-    verdict: str,
-) -> None:
-    """It follows from the ratio of the most accurate model, and states it."""
-    tab = first_tab(
-        board, compared(board, "Model", error=1.0, ratio=(low, ratio, high))
-    )
-    sentence = conclude(tab)
-    judgement, _, _ = sentence.partition(":")
-    assert "cavity full" in judgement
-    assert verdict in judgement
-    assert ("open" in judgement) is (verdict == "open")
-    assert "Model" in sentence
-    assert f"{ratio:#.3g}×" in sentence
-    assert ("(95\u00a0%: " in sentence) is not math.isnan(low)
-    assert conclude(first_tab(board, board.tabs[0].rows[0])) == ""
-
-
 def compared(
     board: Board,
     name: str,
@@ -508,74 +475,6 @@ DEAR = (1.2, 1.5, 1.9)  # ratios to a solver: low end, value, high end
 GOOD = (0.4, 0.5, 0.6)
 
 
-def test_the_most_accurate_model_decides_whether_learning_pays(board: Board) -> None:
-    """A less accurate one that beats solvers of at most its cost is named behind it."""
-    accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
-    cheap = compared(board, "Cheap", error=2.0, ratio=GOOD)
-    sentences = conclude(first_tab(board, cheap, accurate))
-    assert re.search("does not pay on cavity full.*Accurate.*Cheap.*0.500×", sentences)
-
-
-def test_a_ratio_near_one_keeps_its_interval_apart(board: Board) -> None:
-    """With two digits 1.12 (1.09 to 1.15) would read 1.1 (1.1 to 1.1)."""
-    row = compared(board, "Model", error=1.0, ratio=(1.09, 1.12, 1.15))
-    tab = first_tab(board, row)
-    assert "1.12× (95\u00a0%: 1.09 to 1.15) the error" in conclude(tab)
-    assert "1.12× (1.09 to 1.15)" in text_of_overview(page_of(board, tab))
-
-
-def test_models_without_a_known_cost_decide_nothing(board: Board) -> None:
-    """The sentence says that a better one is left out."""
-    silent = compared(board, "Silent", error=0.5, ratio=None)
-    accurate = compared(board, "Accurate", error=1.0, ratio=GOOD)
-    sentences = conclude(first_tab(board, silent, accurate))
-    assert re.search("Accurate.* of known cost", sentences)
-    assert "Silent" not in sentences
-    shown = text_of_overview(page_of(board, first_tab(board, silent, accurate)))
-    assert "model of known cost" in shown
-    shown = text_of_overview(page_of(board, first_tab(board, accurate)))
-    assert "model of known cost" not in shown
-    assert "cavityyesAccuratelearned0.500× (0.400 to 0.600)" in shown
-
-
-def test_the_overview_says_by_what_learning_pays(board: Board) -> None:
-    """That the winner is a hybrid and slow, and how purely learned models do."""
-    cost = EntryCost(seconds_per_frame=1.0, device="a", solver_seconds_per_frame=0.5)
-    winner = compared(board, "Winner", error=1.0, ratio=GOOD)
-    winner = with_entry(winner, kind=Kind.HYBRID, cost=cost)
-    learned = compared(board, "Net", error=2.0, ratio=(0.8, 0.9, 1.1))
-    tab = first_tab(board, winner, learned)
-    shown = text_of_overview(page_of(board, tab))
-    assert "Learning pays on the only data set" in shown
-    assert "The model is hybrid: a classical solver" in shown
-    assert "The model is slower than the simulator" in shown
-    assert (
-        "Purely learned models pay on 0 of 1 data sets; on 1 the question is open"
-        in shown
-    )
-    winner_cells = "Winnerhybrid0.500× (0.400 to 0.600)2×, slower"
-    assert f"cavityyes{winner_cells}Net0.900× (0.800 to 1.10)" in shown
-
-    cost = EntryCost(seconds_per_frame=1.0, device="a", solver_seconds_per_frame=0.99)
-    shown = text_of_overview(
-        page_of(board, first_tab(board, with_entry(winner, cost=cost)))
-    )
-    assert "slower" not in shown
-    paragraphs = read_html(page_of(board, tab)).named("p")
-    ledes = [one for one in paragraphs if one.attributes.get("class") == "lede"]
-    assert "Learning pays on the only data set" in ledes[1].text
-
-
-def test_the_overview_says_where_learning_does_not_pay(board: Board) -> None:
-    """Without a winner nothing is said of winners."""
-    row = compared(board, "Model", error=1.0, ratio=DEAR)
-    shown = text_of_overview(page_of(board, first_tab(board, row)))
-    assert "Learning does not pay on the only data set." in shown
-    assert "Learning pays" not in shown
-    assert "cavitynoModellearned1.50× (1.20 to 1.90)" in shown
-    assert "hybrid:" not in shown
-
-
 def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> None:
     """Rank 1 says nothing there."""
     row = compared(board, "Model", error=1.0, ratio=DEAR)
@@ -584,17 +483,6 @@ def test_the_overview_names_data_sets_where_no_entry_has_skill(board: Board) -> 
         tab = first_tab(board, replace(row, skill=value))
         shown = text_of_overview(page_of(board, tab))
         assert ("skill above 0 on cavity" in shown) is is_told
-
-
-def test_weights_that_fail_a_gate_decide_nothing(board: Board) -> None:
-    """The mark on their row says so."""
-    under_trained = compared(
-        board, "Young", error=0.5, ratio=GOOD, failed_gates=("bias",)
-    )
-    accurate = compared(board, "Accurate", error=1.0, ratio=DEAR)
-    sentences = conclude(first_tab(board, under_trained, accurate))
-    assert "Young" not in sentences
-    assert conclude(first_tab(board, under_trained)) == ""
 
 
 def test_the_notes_explain_marks_levels_and_columns(board: Board) -> None:
@@ -694,24 +582,6 @@ def with_solvers(tab: Tab, errors: Mapping[str, float]) -> Tab:
     return replace(tab, references=tuple(references))
 
 
-def test_a_model_cheaper_than_all_solvers_is_placed_among_them(board: Board) -> None:
-    """The cheapest solver has less error here, but costs more."""
-    row = compared(board, "Model", error=1.0, ratio=DEAR)
-    row = replace(row, solver_costs_more=True)
-    tab = with_solvers(first_tab(board, row), {"coarse": 1.5, "fine": 0.5, "mid": 1.2})
-    sentences = conclude(tab)
-    assert re.search("Model is less than .*mid and coarse.*greater .*fine", sentences)
-    shown = text_of_overview(page_of(board, tab))
-    assert "cavityno solver is as cheapModellearned1.50×‡ (1.20 to 1.90)" in shown
-    statement = "There is no verdict on the only data set"
-    assert statement in shown
-    assert "Learning" not in shown
-
-    tab = with_solvers(first_tab(board, row), {"twin": 1.0, "fine": 0.5, "finer": 0.4})
-    sentences = conclude(tab)
-    assert re.search("Model equals .*twin.*greater .*finer and fine", sentences)
-
-
 def test_the_table_of_a_data_set_marks_dearer_solvers(board: Board) -> None:
     """The sign stands behind the ratio, and the text below the table explains it."""
     row = compared(board, "Model", error=1.0, ratio=GOOD)
@@ -736,29 +606,6 @@ def test_the_table_of_a_terminal_marks_dearer_solvers(board: Board) -> None:
             assert ("‡" in table.title) is solver_costs_more
             for reference in tab.references:
                 assert cells[reference.name] == "-"
-
-
-def test_a_model_cheaper_than_all_solvers_can_beat_the_cheapest(board: Board) -> None:
-    """It has less error at less cost, so learning pays."""
-    row = compared(board, "Model", error=1.0, ratio=GOOD)
-    row = replace(row, solver_costs_more=True)
-    sentences = conclude(first_tab(board, row))
-    assert sentences.startswith("Learning pays on cavity")
-    assert "of projection, the cheapest classical solver, which costs" in sentences
-
-
-def test_a_model_that_pays_says_when_it_is_slower_than_the_simulator(
-    board: Board,
-) -> None:
-    """The simulator made the data: nobody would save time."""
-    row = compared(board, "Model", error=1.0, ratio=GOOD)
-    for speed_up, is_told in ((0.5, True), (2.0, False), (0.99, False)):
-        cost = EntryCost(
-            seconds_per_frame=1.0, device="a", solver_seconds_per_frame=speed_up
-        )
-        sentences = conclude(first_tab(board, with_entry(row, cost=cost)))
-        assert ("2 times" in sentences) is is_told
-        assert ("times as much" in sentences) is is_told
 
 
 def test_slow_solvers_are_marked(board: Board) -> None:

@@ -173,18 +173,6 @@ def test_the_links_of_the_pages_lead_somewhere() -> None:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_results_of_the_readme_are_those_of_the_results_page() -> None:
-    """Its table stands there line by line, and so does its verdict."""
-    results = (CLONE / "docs" / "results.md").read_text()
-    pattern = r"^\| \S+ (?:mini|full) \|.*$"
-    rows = re.findall(pattern, README, re.MULTILINE)
-    first_table = results.split("\n## ")[0]
-    assert rows == re.findall(pattern, first_table, re.MULTILINE)
-    start = README.index("Learning pays on")
-    verdict = README[start : README.index("\n\n", start)]
-    assert " ".join(verdict.split()) in results
-
-
 def test_what_is_stored_is_small() -> None:
     """The notebook has no outputs and no counts; on a slow line the film's reader waits
     for at most 1 MB.
