@@ -193,7 +193,7 @@ def tally(
 
 
 @functools.cache
-def _resampled_shares(count: int, stream: int) -> Floats:
+def resampled_shares(count: int, stream: int) -> Floats:
     """Return the share of each element in draws with replacement.
 
     The shape is [resample, element].
@@ -232,7 +232,7 @@ class Resampling:
         for stream, part in self.parts.items():
             count = len(part)
             stretch = math.sqrt(count / (count - 1))
-            shares = _resampled_shares(count, stream)
+            shares = resampled_shares(count, stream)
             deviations.append(stretch * np.einsum("rn,n->r", shares, part))
         return np.asarray(np.sum(deviations, axis=0))
 

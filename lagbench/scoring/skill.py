@@ -38,6 +38,8 @@ from lagbench.metrics.metric import Direction
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.submission.format import Header
 
+from .front import seconds_where_measured
+
 
 @dataclass(frozen=True, kw_only=True)
 class Skill:
@@ -179,27 +181,6 @@ def compute_against_classical(
         std=ratio.std,
         solver_costs_more=costs_more,
     )
-
-
-def seconds_where_measured(
-    *,
-    seconds_per_frame: float | None,
-    solver_seconds: float | None,
-    solver_seconds_here: float | None,
-) -> float | None:
-    """Return what a frame would cost a method where the references were timed [s].
-
-    The solver that made the data is timed on both machines: the method's time is scaled
-    by the ratio of the two. None where one of the times is not known.
-
-    Args:
-        seconds_per_frame: time of the method on its machine [s].
-        solver_seconds: time of our solver on that machine [s].
-        solver_seconds_here: time of our solver where the references were timed [s].
-    """
-    if not seconds_per_frame or not solver_seconds or not solver_seconds_here:
-        return None
-    return seconds_per_frame * solver_seconds_here / solver_seconds
 
 
 def compare_with_solvers(
