@@ -177,13 +177,6 @@ class UsageError(LagbenchError):
     exit_code = 2
 
 
-class WrongCallError(UsageError, TypeError):
-    """A call has an argument too many, one too few, or one of an unknown name.
-
-    It is a TypeError as well, as Python raises for such a call.
-    """
-
-
 class UnknownKeyError(UsageError, KeyError):
     """A mapping has no entry of that name.
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lagbench.arguments import check_arguments
 from lagbench.data.box import Box
 from lagbench.data.summary import summarise_arrays
 from lagbench.errors import UsageError
@@ -28,7 +27,6 @@ class TensorBox(nn.Module):
     start: Tensor
     period: Tensor
 
-    @check_arguments
     def __init__(self, box: Box) -> None:
         super().__init__()
         self.box = box

@@ -33,7 +33,6 @@ except ModuleNotFoundError:
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from lagbench.arguments import check_arguments
 from lagbench.data.registry import Registry
 from lagbench.store.windows import CACHE_BYTES, WindowReader
 from lagbench.store.windows import Window as ArrayWindow
@@ -148,7 +147,6 @@ class WindowSampler(Sampler[int]):
         UsageError: the ranks are more than the windows, or the rank is not one of them.
     """
 
-    @check_arguments
     def __init__(
         self,
         data: WindowDataset,
@@ -315,7 +313,6 @@ is ``batch.body_force[:, batch.frames]`` where a force drives the flow.
 """
 
 
-@check_arguments
 def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
     """Feed a model with its own predictions; gradients pass through all frames.
 
@@ -423,7 +420,6 @@ def _check_device(device: torch.device | str | int) -> torch.device:
     return tensor.device
 
 
-@check_arguments
 def predict(
     step: Step,
     split: str | Path,

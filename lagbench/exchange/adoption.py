@@ -12,7 +12,6 @@ from typing import Any, Unpack
 import h5py
 import numpy as np
 
-from lagbench.arguments import check_arguments
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.layout import expand_home
@@ -66,7 +65,6 @@ MOST_TRAJECTORIES = 100_000
 """Most trajectories of an HDF5 file that are looked at."""
 
 
-@check_arguments
 def adopt(
     sources: str | Path | Sequence[str | Path],
     *,
@@ -286,7 +284,6 @@ def _refuse_duplicates(rows: Sequence[Row]) -> None:
         path_of[row] = path
 
 
-@check_arguments
 def import_split(
     source: str | Path,
     *,

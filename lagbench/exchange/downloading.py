@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.addresses import ARCHIVES, describe
-from lagbench.arguments import check_arguments
 from lagbench.data.layout import (
     MANIFEST_NAME,
     format_ids,
@@ -79,7 +78,6 @@ class DownloadResult:
     verdict: str  # how the hashes compare with datasets.yaml, in words
 
 
-@check_arguments
 def download(
     split: str | Path,
     size: str | None = None,

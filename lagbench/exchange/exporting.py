@@ -16,7 +16,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.layout import expand_path
@@ -75,7 +74,6 @@ class ExportResult:
     bytes: int  # length of the files together [bytes]
 
 
-@check_arguments
 def export(
     split: str | Path,
     size: str | None = None,

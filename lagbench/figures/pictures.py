@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import check_output_file
 from lagbench.data.layout import expand_home, has_file
 from lagbench.data.local import locate, suggest_repair
@@ -33,7 +32,6 @@ VERSION_FOLDER = re.compile(r"v[0-9]+")
 """Name of the folder of one MAJOR version of a data set."""
 
 
-@check_arguments
 def plot(
     source: str | Path,
     *,
@@ -87,7 +85,6 @@ def plot(
         return plot_frame(file, frame, path, kind=kind, dpi=dpi, registry=registry)
 
 
-@check_arguments
 def animate(
     source: str | Path,
     *,

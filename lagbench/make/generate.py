@@ -19,7 +19,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
 from lagbench.data.layout import MANIFEST_NAME, expand_path, format_ids, url_of
@@ -107,7 +106,6 @@ class GenerationResult:
     dry_run: bool = False  # whether nothing was done
 
 
-@check_arguments
 def generate(
     split: str | Path,
     size: str | None = None,

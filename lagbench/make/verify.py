@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.arguments import check_arguments
 from lagbench.data.checksums import (
     HASHED_SUBSETS,
     dataset_hash,
@@ -129,7 +128,6 @@ class VerificationResult:
             )
 
 
-@check_arguments
 def verify(
     split: str | Path,
     size: str | None = None,

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import checked_path
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry, Size
@@ -49,7 +48,6 @@ DYNAMIC_AXES = {
 """Axes whose length differs from scenario to scenario."""
 
 
-@check_arguments
 def export_onnx(
     step: Step,
     path: str | Path,

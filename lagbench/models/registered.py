@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import checked_path
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
@@ -24,7 +23,6 @@ RECIPE = "own-training"
 """Name of the recipe of a model that `lagbench train` did not train."""
 
 
-@check_arguments
 def build_registered(
     baseline: str,
     *,
@@ -57,7 +55,6 @@ def build_registered(
     return model.build(stated, info)
 
 
-@check_arguments
 def export_safetensors(
     model: Baseline, path: str | Path, *, baseline: str, seed: int = 0, step: int = 0
 ) -> Path:

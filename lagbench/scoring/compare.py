@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import read_beginning
 from lagbench.data.layout import expand_home, format_ids
 from lagbench.data.local import locate, locate_split, suggest_split_of
@@ -269,7 +268,6 @@ class _ScoringOptions:
     examine: Callable[[str, str], None] | None = None
 
 
-@check_arguments
 def compare(
     first: str | Path,
     second: str | Path,

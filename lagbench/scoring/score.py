@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.layout import expand_home
 from lagbench.data.local import (
@@ -81,7 +80,6 @@ WORTH_WORKERS = 1_000_000
 """Least particles times predicted frames for which worker processes are worth it."""
 
 
-@check_arguments
 def score(
     predictions: str | Path,
     *,

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from lagbench.arguments import check_arguments
 from lagbench.data import registry
 from lagbench.data.box import AXES, parse_obstacle
 from lagbench.data.local import locate, suggest_repair
@@ -42,7 +41,6 @@ def list_splits() -> tuple[str, ...]:
     return tuple(sorted(registry.load().splits))
 
 
-@check_arguments
 def load_manifest(
     split: str | Path, size: str | None = None, *, root: str | Path | None = None
 ) -> Manifest:
@@ -72,7 +70,6 @@ def load_manifest(
     return manifest
 
 
-@check_arguments
 def open_split(
     split: str | Path,
     size: str | None = None,

@@ -17,7 +17,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.arguments import check_arguments
 from lagbench.data.box import parse_obstacle
 from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import has_file, major_of
@@ -387,7 +386,6 @@ class WindowReader:
     and content hash are compared, its values are not hashed.
     """
 
-    @check_arguments
     def __init__(
         self,
         split: str | Path,
@@ -546,7 +544,6 @@ class Windows(WindowReader):
         return self.read(index)
 
 
-@check_arguments
 def windows(
     split: str | Path,
     size: str | None = None,

@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.arguments import check_arguments
 from lagbench.data.checksums import ContentHasher
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.layout import expand_home, format_ids
@@ -166,7 +165,6 @@ class Predictions:
         return hasher
 
 
-@check_arguments
 def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predictions:
     """Open a predictions.nc without trusting it.
 

@@ -20,7 +20,6 @@ from typing import Any
 
 import h5py
 
-from lagbench.arguments import check_arguments
 from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.layout import ClosedFolderError, expand_home
 from lagbench.data.local import (
@@ -121,7 +120,6 @@ def seconds_for(path: Path) -> float:
     return byte_count / BYTES_PER_SECOND
 
 
-@check_arguments
 def validate(
     path: str | Path,
     *,

@@ -15,7 +15,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lagbench.arguments import check_arguments
 from lagbench.atomic import atomic_path, check_output_file, explain_write_error
 from lagbench.data.hdf5 import open_netcdf
 from lagbench.data.layout import expand_home, format_ids
@@ -129,7 +128,6 @@ class PredictionsWriter:
         DataError: the hash of the data set is not known.
     """
 
-    @check_arguments
     def __init__(
         self,
         path: str | Path,
@@ -547,7 +545,6 @@ def _no_positions(where: str, got: str) -> UsageError:
     )
 
 
-@check_arguments
 def write(
     path: str | Path,
     positions: Mapping[int, ArrayLike] | ArrayLike,
@@ -701,7 +698,6 @@ def check_predictions_output(output: Path, *, overwrite: bool) -> None:
         )
 
 
-@check_arguments
 def template(
     split: str | Path,
     size: str | None = None,
