@@ -37,6 +37,7 @@ from lagbench.errors import (
 
 from .constants import blamed_on_parameters, place_of, solver_constants, split_module
 from .draws import generator
+from .refinement import recorded_particles, refined
 from .solver import Health, Singles, Solver, build
 from .split import Device, FreeSurfaceParameters, InitialState, SolverParameters
 
@@ -106,13 +107,13 @@ def start_frame(size: Size, scenario: int) -> int:
 def substep_count(size: Size, scenario: int) -> int:
     """Return how many substeps a scenario takes, those before frame 0 included."""
     last_frame = start_frame(size, scenario) + size.frame_count(scenario) - 1
-    return last_frame * size.substeps_per_frame
+    return last_frame * size.substeps_per_frame * size.refinement
 
 
 def perturbed_substep_count(size: Size, scenario: int) -> int:
     """Return how many substeps a perturbed run takes: it ends with the horizon."""
     omitted = size.frames_after_horizon(scenario) * size.substeps_per_frame
-    return substep_count(size, scenario) - omitted
+    return substep_count(size, scenario) - omitted * size.refinement
 
 
 def draw_initial_state(size: Size, scenario: int) -> InitialState:
@@ -183,6 +184,8 @@ def file_parameters(
     for name, value in state.parameters.items():
         parameters[_FILE_NAMES.get(name, name)] = value
     parameters["start_frame"] = state.start_frame
+    if size.refinement > 1:
+        parameters["refinement"] = size.refinement
     return parameters
 
 
@@ -316,11 +319,20 @@ class ScenarioBatch:
     def __init__(
         self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None
     ) -> None:
-        size = job.size
+        size = refined(job.size)
         scenario_count = len(job.scenarios)
         self.job = job  # what to simulate
+        self.size = size  # on which the solver runs
         # the scenarios before their first substep, in the order of the job
         self.states = [_RECENT.draw(size, scenario) for scenario in job.scenarios]
+        # which particles of each scenario its file holds
+        self.recorded = []
+        for scenario, state in zip(job.scenarios, self.states, strict=True):
+            particles = np.arange(job.size.particles)
+            if size.subdivision > 1:
+                coarse = draw_initial_state(job.size, scenario)
+                particles = recorded_particles(coarse, state)
+            self.recorded.append(particles)
         self.solver = _solver(solver_constants(size), job.device, scenario_count)
         self._is_free_surface = isinstance(
             self.solver.parameters, FreeSurfaceParameters
@@ -343,7 +355,7 @@ class ScenarioBatch:
         """Yield (index in the batch, frame) whenever the solver stands at that
         frame.
         """
-        interval = self.job.size.substeps_per_frame
+        interval = self.size.substeps_per_frame
         schedule: list[tuple[int, int, int]] = []
         for index, state in enumerate(self.states):
             frame_count = self._frames[index]
@@ -363,8 +375,8 @@ class ScenarioBatch:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[Singles, Singles]:
-        """Return position [length] and velocity [length/s], shape [particle, axis],
-        at the last recording.
+        """Return position [length] and velocity [length/s] of all particles of the run,
+        shape [particle, axis], at the last recording.
         """
         return self._position[index], self._velocity[index]
 
@@ -399,7 +411,7 @@ class ScenarioBatch:
 
     def _update_extremes(self) -> int:
         """Widen the extremes of the scenarios that still record; return how many do."""
-        interval = self.job.size.substeps_per_frame
+        interval = self.size.substeps_per_frame
         running_count = 0
         for index, health in enumerate(self.solver.health()):
             last_frame = self.states[index].start_frame + self._frames[index] - 1

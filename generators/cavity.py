@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from lagbench.data import WALLS
 
-from .constants import closed_box_walls, constants, interval, shift_number
+from .constants import constants, interval, shift_number
 from .draws import (
     RandomSource,
     choice,
@@ -38,7 +38,8 @@ from .draws import (
     log_uniform,
     uniform,
 )
-from .split import ClosedBoxParameters, InitialState, liquid
+from .full_box_parameters import FullBoxParameters
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -67,9 +68,9 @@ _TURN = {"left": -1.0, "bottom": 1.0, "right": 1.0, "top": -1.0}
 _TANGENT = {"left": 1, "right": 1, "bottom": 0, "top": 0}
 
 
-def solver_parameters(size: Size) -> ClosedBoxParameters:
+def solver_parameters(size: Size) -> FullBoxParameters:
     """Return the constants of thesis Table 5.2 at this size; walls hold the fluid."""
-    return constants(ClosedBoxParameters, size, no_slip=True)
+    return constants(FullBoxParameters, size, box=size.box, no_slip=True)
 
 
 def is_classic(scenario: int) -> bool:
@@ -151,7 +152,7 @@ def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a fluid at rest and the wall motion that drives it through all frames."""
-    low, high = closed_box_walls(size)
+    low, high = size.bounds[0]
     start = start_frame(size, scenario, rng)
     motion = _draw_motion(rng, size, scenario, start)
     belt = _belt(size, scenario)
@@ -166,6 +167,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=low,
         high=high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
     if belt is not None:
         motion_kind = "belt"

@@ -96,6 +96,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=box.low,
         high=box.high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
     return InitialState(
         position=position,

@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 
 from lagbench.errors import UsageError
 
-from .constants import closed_box_walls, constants, shift_number
+from .constants import constants, shift_number
 from .draws import RandomSource, fill_grid, quantise
+from .full_box_parameters import FullBoxParameters
 from .noise import Jet, coordinates, gradients, noise, ramp
-from .split import ClosedBoxParameters, InitialState, liquid
+from .split import InitialState, liquid
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -37,9 +38,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def solver_parameters(size: Size) -> ClosedBoxParameters:
+def solver_parameters(size: Size) -> FullBoxParameters:
     """Return the solver's constants at this size; walls let the fluid slide."""
-    return constants(ClosedBoxParameters, size, no_slip=False)
+    return constants(FullBoxParameters, size, box=size.box, no_slip=False)
 
 
 def stream_function(
@@ -131,12 +132,10 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     Central differences between nodes inside the walls: what is not zero of the
     divergence is the grid's share, not the field's.
     """
-    low, high = closed_box_walls(size)
-    wall = size.value("wall")
-    first = wall + 1
-    end = size.grid - wall
-    indices = np.arange(first, end)
-    node = indices / size.grid
+    low, high = size.bounds[0]
+    parameters = solver_parameters(size)
+    indices = np.arange(parameters.cells[0])
+    node = (parameters.origin[0] + 1.0 + indices) / size.grid
     node_count = len(node)
     grid_x, grid_y = np.meshgrid(node, node, indexing="ij")
     x = grid_x.ravel()
@@ -197,7 +196,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
 
     The stream function is Perlin noise times ``scale``, between the walls.
     """
-    low, high = closed_box_walls(size)
+    low, high = size.bounds[0]
     columns = size.value("lattice_x")
     rows = size.value("lattice_y")
     place_count = columns * rows
@@ -216,6 +215,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=low,
         high=high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
     frequency = _frequency(size, scenario)
     lattice = gradients(rng, frequency)

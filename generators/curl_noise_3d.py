@@ -131,6 +131,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=box.low,
         high=box.high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
     if has_rings(scenario):
         kind = "rings"

@@ -45,7 +45,16 @@ Array = NDArray[np.float64]
 
 def solver_parameters(size: Size) -> FullBoxParameters:
     """Return the solver's constants at this size; walls let the fluid slide."""
-    return constants(FullBoxParameters, size, box=size.box, no_slip=False)
+    is_solid = is_inside(lattice_places(size), middle_of_disc(size, 0), _radius(size))
+    solid_count = int(is_solid.sum())
+    return constants(
+        FullBoxParameters,
+        size,
+        box=size.box,
+        no_slip=False,
+        particles=is_solid.size - solid_count,
+        obstacle_particles=solid_count,
+    )
 
 
 def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
@@ -66,22 +75,42 @@ def lattice_counts(size: Size) -> tuple[int, int]:
     return columns, rows
 
 
-def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
-    """Draw the centre of the fixed disc [length]; only its y differs by scenario.
+def lattice_places(size: Size) -> Array:
+    """Return the places of the lattice [length], shape [place, 2]."""
+    indices = np.indices(lattice_counts(size))
+    indices_by_axis = indices.reshape(2, -1)
+    cell = indices_by_axis.T
+    middle = cell + 0.5
+    from_corner = middle / size.value("lattice")
+    corner = np.array(size.box.low)
+    return quantise(corner + from_corner)
 
-    It lies off the middle of the channel by whole spacings of the lattice, so that
-    every disc covers as many places of the lattice.
+
+def _radius(size: Size) -> float:
+    """Return the radius of the disc [length]."""
+    return 0.5 * float(size.value("obstacle_diameter"))
+
+
+def middle_of_disc(size: Size, steps: int) -> tuple[float, float]:
+    """Return the centre of a disc that is some steps off the middle [length].
+
+    A step is a spacing of the lattice at refinement 1, so that every disc covers as
+    many places of the lattice.
     """
-    most_steps = int(size.value("offset_max"))
-    twice_most_steps = 2 * most_steps
-    place_count = twice_most_steps + 1
-    place = choice(rng, place_count)
-    steps = place - most_steps
-    offset = steps / size.value("lattice")
+    offset = steps * size.subdivision / size.value("lattice")
     _, middle = size.box.centre.tolist()
     x = float(size.value("obstacle_x"))
     y = middle + offset
     return x, y
+
+
+def draw_centre(size: Size, rng: RandomSource) -> tuple[float, float]:
+    """Draw the centre of the fixed disc [length]; only its y differs by scenario."""
+    most_steps = int(size.value("offset_max"))
+    twice_most_steps = 2 * most_steps
+    place_count = twice_most_steps + 1
+    place = choice(rng, place_count)
+    return middle_of_disc(size, place - most_steps)
 
 
 def _square(vectors: Array) -> Array:
@@ -204,7 +233,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     counts = lattice_counts(size)
     box = size.box
     diameter = float(size.value("obstacle_diameter"))
-    radius = 0.5 * diameter
+    radius = _radius(size)
     x, y = draw_centre(size, rng)
     centre = np.array([x, y])
     position = fill_box(
@@ -213,14 +242,9 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=box.low,
         high=box.high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
-    indices = np.indices(counts)
-    indices_by_axis = indices.reshape(2, -1)
-    cell = indices_by_axis.T
-    middle = cell + 0.5
-    from_corner = middle / size.value("lattice")
-    corner = np.array(box.low)
-    places = quantise(corner + from_corner)
+    places = lattice_places(size)
     place_count = len(places)
     is_solid = is_inside(places, (x, y), radius)
     solid_count = int(is_solid.sum())
@@ -257,12 +281,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     least_reynolds, most_reynolds = interval(size, "reynolds")
     reynolds = log_uniform(rng, least_reynolds, most_reynolds)
     viscosity = speed * diameter / reynolds
-    area = box.volume * size.particles / place_count
+    particle_count = len(fluid)
+    area = box.volume * particle_count / place_count
     return InitialState(
         position=fluid,
         velocity=quantise(velocity),
         affine=quantise(affine),
-        material=liquid(size.particles),
+        material=liquid(particle_count),
         area=area,
         viscosity=viscosity,
         obstacle=obstacle,
@@ -279,9 +304,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
 def _check_counts(size: Size, solid_count: int, lattice_count: int) -> None:
     """Refuse counts that do not follow from the lattice and the disc.
 
+    Those of a finer lattice are nowhere stated.
+
     Raises:
         UsageError: datasets.yaml states other numbers of particles.
     """
+    if size.subdivision > 1:
+        return
     fluid_count = lattice_count - solid_count
     stated_solid_count = int(size.value("obstacle_particles"))
     expected = (fluid_count, solid_count)

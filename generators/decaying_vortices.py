@@ -73,6 +73,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         low=box.low,
         high=box.high,
         jitter=size.value("jitter"),
+        subdivision=size.subdivision,
     )
     count = size.value("frequency_count")
     frequency = size.value("frequency_min") + scenario % count

@@ -140,6 +140,30 @@ def add_in_order(values: Iterable[float]) -> float:
     return total
 
 
+def draw_offsets(
+    rng: RandomSource, shape: tuple[int, int], *, subdivision: int
+) -> Array:
+    """Draw offsets from the places of a lattice, in [-1/2, 1/2).
+
+    A lattice that is finer by a factor takes its numbers from a stream of its own, and
+    the scenario's stream goes on as if the lattice were not finer. So a scenario is the
+    same at every refinement.
+
+    Args:
+        rng: the scenario's stream.
+        shape: particles and axes.
+        subdivision: the factor by which the lattice is finer along each axis.
+    """
+    particles, dimension = shape
+    unit = rng.random((particles // subdivision**dimension, dimension))
+    if subdivision > 1:
+        # four words of 53 bits seed the finer stream
+        words = [int(value * 2.0**53) for value in unit.ravel()[:4].tolist()]
+        seed = np.random.SeedSequence(words)
+        unit = np.random.Generator(np.random.PCG64(seed)).random(shape)
+    return unit - 0.5
+
+
 def _draw_unit(rng: RandomSource) -> float:
     """Draw from the uniform distribution on [0, 1)."""
     (share,) = rng.random((1,))
@@ -279,6 +303,7 @@ def fill(
     low: float,
     high: float,
     jitter: float,
+    subdivision: int = 1,
 ) -> Array:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
@@ -291,6 +316,7 @@ def fill(
         low: coordinate of the left and bottom walls [length].
         high: coordinate of the right and top walls [length].
         jitter: width of the uniform displacement, in spacings [1].
+        subdivision: as in :func:`draw_offsets`.
 
     Returns:
         Positions [length], multiples of 2^-20, shape [particle, 2].
@@ -300,7 +326,14 @@ def fill(
     for column in range(columns + 1):
         end = count * column // columns
         ends.append(end)
-    return _fill_columns(rng, np.array(ends), low=low, high=high, jitter=jitter)
+    return _fill_columns(
+        rng,
+        np.array(ends),
+        low=low,
+        high=high,
+        jitter=jitter,
+        subdivision=subdivision,
+    )
 
 
 def fill_grid(
@@ -311,10 +344,13 @@ def fill_grid(
     low: float,
     high: float,
     jitter: float,
+    subdivision: int = 1,
 ) -> Array:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
     ends = rows * np.arange(columns + 1)
-    return _fill_columns(rng, ends, low=low, high=high, jitter=jitter)
+    return _fill_columns(
+        rng, ends, low=low, high=high, jitter=jitter, subdivision=subdivision
+    )
 
 
 def _fill_columns(
@@ -324,6 +360,7 @@ def _fill_columns(
     low: float,
     high: float,
     jitter: float,
+    subdivision: int,
 ) -> Array:
     """Put particles near the middles of their cells, column by column.
 
@@ -346,8 +383,7 @@ def _fill_columns(
     rows_across = np.repeat(column_sizes, column_sizes)
     cell_counts = np.stack([columns_across, rows_across], axis=-1)
 
-    unit = rng.random(cell.shape)
-    centred = unit - 0.5
+    centred = draw_offsets(rng, cell.shape, subdivision=subdivision)
     displacement = centred * jitter
     middle = cell + 0.5
     place = middle + displacement  # [cells]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .draws import RandomSource, quantise
+from .draws import RandomSource, draw_offsets, quantise
 
 __all__ = [
     "Flow",
@@ -324,6 +324,7 @@ def fill_box(
     low: Sequence[float],
     high: Sequence[float],
     jitter: float,
+    subdivision: int = 1,
 ) -> Array:
     """Fill a box with a lattice of particles, each a little off its place.
 
@@ -333,6 +334,7 @@ def fill_box(
         low: lower end of the box along each axis [length].
         high: upper end of the box along each axis [length].
         jitter: width of the uniform displacement, in spacings [1].
+        subdivision: as in :func:`.draw_offsets`.
 
     Returns:
         Positions [length], multiples of 2^-20, shape [particle, axis].
@@ -341,8 +343,7 @@ def fill_box(
     indices = np.indices(tuple(counts))
     cell_by_axis = indices.reshape(dimension, -1)
     cell = cell_by_axis.T
-    unit = rng.random(cell.shape)
-    centred = unit - 0.5
+    centred = draw_offsets(rng, cell.shape, subdivision=subdivision)
     displacement = centred * jitter
     middle = cell + 0.5
     place = middle + displacement  # [cells]

@@ -25,6 +25,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data.box import Box
 from lagbench.data.layout import scenario_path
@@ -90,17 +91,28 @@ class SimulatedScenario:
     pace: SimulationPace | None = None  # of a scenario that was simulated alone
 
 
-def _particle_mass(size: Size, state: InitialState) -> float:
-    density = float(size.value("density"))
-    mass = density * state.area  # of all particles
-    return mass / size.particles
+def _mass(size: Size, state: InitialState) -> float:
+    """Return the mass of all particles."""
+    return float(size.value("density")) * state.area
 
 
 def scenario_writer(
-    job: SimulationJob, scenario: int, state: InitialState
+    job: SimulationJob,
+    scenario: int,
+    state: InitialState,
+    recorded: NDArray[np.int64] | None = None,
 ) -> ScenarioWriter:
-    """Return the writer of a scenario's file, with all that is known before it runs."""
+    """Return the writer of a scenario's file, with all that is known before it runs.
+
+    Args:
+        job: the size, and where its files lie.
+        scenario: id.
+        state: the scenario before its first substep.
+        recorded: the particles of the state that the file holds; all when None.
+    """
     size = job.size
+    if recorded is None:
+        recorded = np.arange(len(state.position))
     key = size.key(scenario)
     frame_count = size.frame_count(scenario)
 
@@ -119,11 +131,11 @@ def scenario_writer(
     return ScenarioWriter(
         scenario_path(job.root, key),
         key,
-        particles=size.particles,
+        particles=len(recorded),
         frames=frame_count,
         frame_interval=size.frame_interval,
-        material=state.material,
-        particle_mass=_particle_mass(size, state),
+        material=state.material[recorded],
+        particle_mass=_mass(size, state) / len(recorded),
         wall_velocity=wall_velocity,
         body_force=body_force,
         parameters=file_parameters(size, scenario, state),
@@ -170,21 +182,25 @@ def simulate(
     """
     size = job.size
     batch = ScenarioBatch(job, report)
-    masses = [_particle_mass(size, state) for state in batch.states]
+    # of each particle of the run
+    masses = [_mass(size, state) / len(state.position) for state in batch.states]
     # kinetic energies by scenario, frame by frame
     energies: list[list[float]] = [[] for _ in masses]
     started = clock()
     with ExitStack() as stack:
         writers = []
-        for scenario, state in zip(job.scenarios, batch.states, strict=True):
-            writer = scenario_writer(job, scenario, state)
+        for scenario, state, recorded in zip(
+            job.scenarios, batch.states, batch.recorded, strict=True
+        ):
+            writer = scenario_writer(job, scenario, state, recorded)
             writers.append(stack.enter_context(writer))
 
         recorders = _soundness_recorders(batch)
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
-            stored_velocity = velocity if size.stores_velocity else None
-            writers[index].append(position, stored_velocity)
+            recorded = batch.recorded[index]
+            stored_velocity = velocity[recorded] if size.stores_velocity else None
+            writers[index].append(position[recorded], stored_velocity)
             energy = _kinetic_energy(velocity, masses[index])
             energies[index].append(energy)
             if recorders:
@@ -215,7 +231,9 @@ def simulate(
     if timed_frames > 0 and len(job.scenarios) == 1:
         pace = SimulationPace(
             seconds=seconds,
-            particle_substeps=timed_frames * size.substeps_per_frame * size.particles,
+            particle_substeps=timed_frames
+            * batch.size.substeps_per_frame
+            * batch.size.particles,
             frames=timed_frames,
         )
     return [
@@ -262,13 +280,13 @@ def _diagnose(
         kinetic_energy_mean=math.fsum(energies) / len(energies),
         energy_last_over_max=last_over_max,
         max_speed=extremes.max_speed,
-        cfl=extremes.max_speed * size.dt * size.grid,
+        cfl=extremes.max_speed * size.dt * size.grid,  # the same at any refinement
         jacobian_min=extremes.jacobian_min,
         jacobian_max=extremes.jacobian_max,
     )
 
 
-def draw_perturbation(size: Size, scenario: int) -> Singles:
+def draw_perturbation(size: Size, scenario: int, particles: int) -> Singles:
     """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
     scenario_words = entropy(
@@ -277,7 +295,7 @@ def draw_perturbation(size: Size, scenario: int) -> Singles:
     words = (*scenario_words, 1)
     seed = np.random.SeedSequence(words)
     rng = np.random.Generator(np.random.PCG64(seed))
-    shape = (size.particles, size.box.dimension)
+    shape = (particles, size.box.dimension)
     draws = rng.random(shape)
     is_negative = draws < 0.5
     signs = np.where(is_negative, -1.0, 1.0)
@@ -303,8 +321,8 @@ def measure_predictability(
         frame_counts.append(frame_count)
     batch = ScenarioBatch(job, report, frames=frame_counts)
     # displacements of the batch [length], shape [scenario, particle, axis]
-    scenario_count = len(frame_counts)
-    shape = (scenario_count, size.particles, size.box.dimension)
+    positions = [state.position for state in batch.states]
+    shape = np.shape(positions)
     offsets = np.zeros(shape, dtype=np.float32)
     limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
@@ -317,12 +335,13 @@ def measure_predictability(
             if frame == input_frames - 1:
                 offsets[:] = 0.0
                 scenario = job.scenarios[index]
-                offsets[index] = draw_perturbation(size, scenario)
+                offsets[index] = draw_perturbation(size, scenario, len(offsets[index]))
                 batch.displace(offsets)
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
+                recorded_position = position[batch.recorded[index]]
                 truth = truths[index].read("position", frame)
-                error = _root_mean_square_error(position, truth, size.box)
+                error = _root_mean_square_error(recorded_position, truth, size.box)
                 limits[index].append(error)
     return {
         scenario: tuple(limit)

@@ -119,6 +119,7 @@ def _parse_ids(value: str | int) -> tuple[int, ...]:
 Ids = Annotated[tuple[int, ...], BeforeValidator(_parse_ids)]
 Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Version = Annotated[str, Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
@@ -216,6 +217,10 @@ class _SizeEntry(_RegistryModel):
     task: Task
     # seed of a blind test; without it the draws follow from the names
     draw_seed: Hash | None = None
+    # cells of the run that made the files, along each axis, per cell of ``grid``
+    refinement: int = Field(1, ge=1, le=16)
+    # version of this size where its bits are older than those of the split
+    version: Version | None = None
 
     @model_validator(mode="after")
     def _check_box(self) -> _SizeEntry:
@@ -275,6 +280,10 @@ class Size(BaseModel):
     # seed of a blind test [64 hex digits]; without it draws follow from the names of
     # split, size, version and scenario
     draw_seed: str | None = None
+    # cells of the run that made the files, along each axis, per cell of ``grid``
+    refinement: int = 1
+    # the same of this description itself: 1, but for the size on which the solver runs
+    subdivision: int = 1
 
     @property
     def scored_scenarios(self) -> tuple[int, ...]:
@@ -527,7 +536,7 @@ class Size(BaseModel):
 class Split(_RegistryModel):
     """A named data set: version, provenance, parameters, sizes and mirrors' URLs."""
 
-    version: str = Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")
+    version: Version
     title: str
     description: str
     citation: str
@@ -617,7 +626,7 @@ class Registry:
         return Size(
             split=split,
             name=name,
-            version=parent.version,
+            version=entry.version or parent.version,
             generator=parent.generator,
             subsets=entry.subsets,
             frames=entry.frames,
@@ -630,6 +639,7 @@ class Registry:
             file=self.files.get(split, Path("datasets.yaml")),
             package_file=split in self.package_splits,
             draw_seed=entry.draw_seed,
+            refinement=entry.refinement,
         )
 
     def _measured_values(self, split: str, name: str) -> Measured | None:
@@ -643,7 +653,8 @@ class Registry:
         hashes = measured.subset_sha256
         if not hashes.keys() >= set(HASHED_SUBSETS):
             return measured
-        major = major_of(self.splits[split].version)
+        parent = self.splits[split]
+        major = major_of(parent.sizes[name].version or parent.version)
         if measured.dataset_sha256 == dataset_hash(split, name, major, hashes):
             return measured
         first = max(1, major - MOST_OLDER_VERSIONS)

@@ -242,10 +242,10 @@ def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -
     is drawn.
     """
     size = unmeasured.size(SPLIT, SIZE)
-    signs = draw_perturbation(size, 3) * 2**20
+    signs = draw_perturbation(size, 3, size.particles) * 2**20
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert abs(signs.mean()) < 0.1
-    other_signs = draw_perturbation(size, 4) * 2**20
+    other_signs = draw_perturbation(size, 4, size.particles) * 2**20
     assert not np.array_equal(signs, other_signs)
     rng = generator(SPLIT, SIZE, 2, 3)
     plain = rng.random((size.particles, 2))
