@@ -100,7 +100,7 @@ class TrainingJob:
         self,
         log: TrainingLog,
         weights: Mapping[str, Tensor],
-        optimizer: Mapping[str, Any] | None = None,
+        optimizer: Mapping[str, Tensor] | None = None,
     ) -> Checkpoint:
         """Return a checkpoint of the present step."""
         training = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,7 +45,7 @@ class Optimisation:
         steps: int,
         processes: int = 1,
         step: int = 0,
-        optimizer_state: Mapping[str, Any] | None = None,
+        optimizer_state: Mapping[str, Tensor] | None = None,
     ) -> None:
         if next(model.parameters(), None) is None:
             raise UsageError(
@@ -74,33 +73,28 @@ class Optimisation:
         if optimizer_state is not None:
             self._load_optimizer_state(optimizer_state)
 
-    def _load_optimizer_state(self, state: Mapping[str, Any]) -> None:
+    def _load_optimizer_state(self, tensors: Mapping[str, Tensor]) -> None:
         """Continue with the state that an optimiser of an earlier run had."""
-        try:
-            self.optimizer.load_state_dict(dict(state))
-            self._check_shapes()
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise UnreadableFileError(
-                "the state of the optimiser does not fit the model",
-                where="the checkpoint to go on from",
-                expected=f"the state of AdamW for {type(self.model).__name__}",
-                got=f"{type(error).__name__}: {reason[:200]}",
-                fix="train anew with --fresh, or take an earlier checkpoint",
-            ) from error
+        parameters = dict(self.model.named_parameters())
+        for key, value in tensors.items():
+            name, _, kind = key.rpartition("/")
+            parameter = parameters.get(name)
+            shape = torch.Size() if kind == "step" else getattr(parameter, "shape", None)
+            if parameter is None or value.shape != shape:
+                raise UnreadableFileError(
+                    f"the state {key} of the optimiser does not fit the model; train "
+                    "anew with --fresh"
+                )
+            device = "cpu" if kind == "step" else parameter.device
+            self.optimizer.state[parameter][kind] = value.to(device)
 
-    def _check_shapes(self) -> None:
-        """Refuse averages of another shape: the optimiser would write beyond them.
-
-        Raises:
-            ValueError: an average does not have the shape of its parameter.
-        """
-        for parameter, values in self.optimizer.state.items():
-            for name, value in values.items():
-                shape = torch.Size() if name == "step" else parameter.shape
-                is_dense = isinstance(value, Tensor) and value.layout is torch.strided
-                if not is_dense or value.shape != shape:
-                    raise ValueError(f"{name} is no tensor of shape {list(shape)}")
+    def state_tensors(self) -> dict[str, Tensor]:
+        """Return the state of the optimiser, by "<parameter>/<name>"."""
+        tensors = {}
+        for name, parameter in self.model.named_parameters():
+            for kind, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"{name}/{kind}"] = value
+        return tensors
 
     @property
     def learning_rate(self) -> float:
@@ -214,7 +208,7 @@ class Optimisation:
             expected="finite terms",
             got=f"NaN or infinite: {', '.join(broken)}",
             fix="lower training.learning_rate or set training.clip=1;"
-            " checkpoint.pt holds the last good weights",
+            " checkpoint.safetensors holds the last good weights",
         )
 
 

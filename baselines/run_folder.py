@@ -1,6 +1,6 @@
 """The folder of a training: its paths, and the checks before a training goes on there.
 
-It holds checkpoint.pt, weights.pt, training.json and tensorboard/.
+It holds checkpoint.safetensors, weights.safetensors, training.json and tensorboard/.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.checkpoint = path / "checkpoint.pt"  # the last state, to go on from
+        self.checkpoint = path / "checkpoint.safetensors"  # the last state, to go on from
         # the best weights in bfloat16, to predict from
-        self.weights = path / "weights.pt"
+        self.weights = path / "weights.safetensors"
         self.log = path / "training.json"  # the log of the training
         self.tensorboard = path / "tensorboard"  # folder of TensorBoard's files
         # files of an earlier training that are still there
@@ -261,7 +261,9 @@ class RunFolder:
                 as they are.
         """
         replaced = [file for file in self._earlier_files if file != path]
-        save(path, checkpoint, replaced=replaced)
+        save(path, checkpoint)
+        for file in replaced:
+            file.unlink(missing_ok=True)
         self._forget_earlier_files()
 
     def remove_new_logs(self) -> None:

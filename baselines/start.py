@@ -24,9 +24,10 @@ from lagbench.submission.budget import Budget
 
 from .baseline import Baseline, DatasetInfo, rescale
 from .catalogue import CatalogueEntry
-from .checkpoint import RECIPE_NAME, Checkpoint, check_data, load, load_weights, restore
+from .checkpoint import Checkpoint, check_data, load, load_weights, restore
 
 WHERE = "--start"
+RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"
 # larger numbers in a stranger's file are not believed
 MOST_HOURS = 1e9
 MOST_STEPS = 10**12
@@ -82,7 +83,7 @@ class LastStateWarning(UserWarning):
 
 def warn_of_last_state(checkpoint: Checkpoint, path: Path) -> None:
     """Warn of a training's last state if its best weights lie beside the file."""
-    best = path.with_name("weights.pt")
+    best = path.with_name("weights.safetensors")
     if checkpoint.optimizer is not None and best.is_file():
         message = (
             f"{path} holds the last state of a training; the best weights on valid "

@@ -33,7 +33,7 @@ from lagbench.work.run import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline, count_parameters
 from .catalogue import check_data_set, find
-from .checkpoint import check_weights, load_weights, round_weights
+from .checkpoint import load_weights, round_weights
 from .dataset_info import find_forcing, read_dataset_info
 from .job import TrainingJob
 from .machine import (
@@ -235,7 +235,6 @@ def train(
         explain_memory_errors(MEMORY_HINT),
     ):
         model = _build_model(job, entry.model, initial)
-        check_weights(model.state_dict(), where=f"weights of {entry.name}")
         _warn_of_unseen_forcing(model, tier, root_folder)
         return _train_model(job, model)
 

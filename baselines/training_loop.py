@@ -334,7 +334,7 @@ class TrainingLoop:
             folder.save(folder.weights, self._start_weights)
             self._start_weights = None
         self._read_clocks()
-        optimizer_state = self.optimisation.optimizer.state_dict()
+        optimizer_state = self.optimisation.state_tensors()
         checkpoint = self.job.checkpoint(self.log, weights, optimizer_state)
         folder.save(folder.checkpoint, checkpoint)
         self._write_log()

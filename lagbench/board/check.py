@@ -86,8 +86,7 @@ def check_board(
         page: whether to compare the page, too, where all else is right.
         base: git revision; entries there that the folder alters are issues.
         own: methods whose entries the change may alter.
-        isolated: whether a child process reads score files first, and the recipes of
-            shared weights.
+        isolated: whether a child process reads score files first.
         predictions: files of predictions of entries, which are scored again.
         recording: whether to note confirmed entries in verified.yaml.
         measured_sizes: sizes whose shipped scores of reference predictors are measured
@@ -107,7 +106,6 @@ def check_board(
         folder=folder,
         registry=full_registry,
         unreadable=_find_unreadable(folder) if isolated else {},
-        isolated=isolated,
     )
     checks.run()
     issues = [*checks.issues]

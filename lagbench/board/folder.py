@@ -3,8 +3,7 @@
     submissions/<split>/<size>/<method>.yaml      entries
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
-    weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
-    weights/<split>/<size>/<method>_<seed>.safetensors   or weights with their recipe
+    weights/<split>/<size>/<method>_<seed>.safetensors   weights, and their log, .json
     weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
     verified.yaml, gates.json, schema.json, index.html, README.md
 
@@ -97,7 +96,7 @@ def is_place_of_file(path: Path) -> bool:
     return path.suffix in ENDINGS.get(path.parts[0], ())
 
 
-def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Path:
+def weights_path(place: Place, seed: int | None, like: str | Path = ".safetensors") -> Path:
     """Return the path of the model of a seed, relative to the folder.
 
     Args:
@@ -106,10 +105,10 @@ def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Pa
         like: a file name; the path ends as it does, where models may end so.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
-    'weights/cavity/mini/gns_3.pt'
+    'weights/cavity/mini/gns_3.safetensors'
     """
     split, size, method = place
-    ending = ".pt"
+    ending = ".safetensors"
     if Path(like).suffix in MODEL_ENDINGS:
         ending = Path(like).suffix
     return Path(WEIGHTS, split, size, f"{method}_{seed or 0}{ending}")

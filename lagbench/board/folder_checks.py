@@ -70,7 +70,6 @@ class FolderChecks:
     folder: Folder
     registry: Registry
     unreadable: Mapping[Path, str]  # files that a child process cannot read, and why
-    isolated: bool = True  # whether a child process reads the recipes of shared weights
     issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     # score files of entries and reference predictors
@@ -96,7 +95,6 @@ class FolderChecks:
             self.folder,
             self.entries,
             unreadable_places=unreadable_places,
-            isolated=self.isolated,
         )
         self._check_successors()
         self._check_duplicates()

@@ -231,10 +231,6 @@ def open_model(
     check_installed("torch", extra="baselines")
     from lagbench.baselines.runner import WeightsRunner
 
-    if path.suffix == ".safetensors":
-        from lagbench.baselines.weights_check import check_in_child
-
-        check_in_child(path)
     return WeightsRunner(
         path,
         size=entry.size,

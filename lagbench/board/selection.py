@@ -99,7 +99,7 @@ def choose_entries(
                 raise UsageError(
                     "the entry has no model to run",
                     where=key,
-                    expected="weights.pt, safetensors or ONNX of each seed",
+                    expected="a .safetensors or .onnx file of each seed",
                     got="predictions only",
                     fix="its submitter may add one: "
                     f"{name_submit_command(entry.yaml_path, folder.path)}",

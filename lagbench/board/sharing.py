@@ -187,12 +187,12 @@ def _hashes_of_kept_weights(keeper: Entry) -> set[str]:
 
 
 def check_uses(
-    folder: Folder, entries: Sequence[Entry], *, isolated: bool
+    folder: Folder, entries: Sequence[Entry]
 ) -> Iterator[ValidationIssue]:
     """Yield options that models do not have, and weights used in the same way twice."""
     groups: dict[tuple[str, str, str], list[WeightsUse]] = {}
     uses = list_uses(entries)
-    checked_settings = _check_settings(folder, uses, isolated=isolated)
+    checked_settings = _check_settings(folder, uses)
     for use in uses:
         refused = checked_settings[use.where].refused
         if refused is not None:
@@ -226,7 +226,7 @@ def check_uses(
 
 
 def _check_settings(
-    folder: Folder, uses: Sequence[WeightsUse], *, isolated: bool
+    folder: Folder, uses: Sequence[WeightsUse]
 ) -> Mapping[str, CheckedSettings]:
     """Return the settings of each use as its model takes them, by ``use.where``.
 
@@ -235,7 +235,6 @@ def _check_settings(
     """
     settings_of_uses = {}
     uses_to_read = []
-    requests = []
     for use in uses:
         path = Path(use.weights.path)
         written = tuple(sorted(set(use.settings)))
@@ -244,21 +243,15 @@ def _check_settings(
             settings_of_uses[use.where] = CheckedSettings(effective=())
         elif use.settings and is_unchanged(folder, path, use.weights.sha256):
             uses_to_read.append(use)
-            requests.append((str((folder.path / path).absolute()), *use.settings))
-    if not requests or find_spec("torch") is None:
+    if not uses_to_read or find_spec("torch") is None:
         return settings_of_uses
 
-    from lagbench.baselines.weights_check import (
-        check_settings,
-        check_settings_in_child,
-    )
+    from lagbench.baselines.weights_file import inspect_weights
 
-    if isolated:
-        answers = check_settings_in_child(requests)
-    else:
-        answers = [check_settings(request) for request in requests]
-    for use, answer in zip(uses_to_read, answers, strict=True):
+    for use in uses_to_read:
+        file = inspect_weights(folder.path / use.weights.path)
         settings_of_uses[use.where] = CheckedSettings(
-            effective=tuple(answer["effective"]), refused=answer["refused"]
+            effective=file.list_effective_settings(use.settings),
+            refused=file.find_refusal(use.settings),
         )
     return settings_of_uses

@@ -3,8 +3,7 @@
 ``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them, and
 ``leaderboard reproduce`` runs them. A model is one of these files:
 
-weights/<split>/<size>/<method>_<seed>.pt            weights of `lagbench train`
-weights/<split>/<size>/<method>_<seed>.safetensors   weights with their recipe
+weights/<split>/<size>/<method>_<seed>.safetensors   weights of `lagbench train`
 weights/<split>/<size>/<method>_<seed>.onnx          a model of another code base
 
 A file with the ending .json beside it is the log of the training.
@@ -51,7 +50,7 @@ from .sharing import (
 if TYPE_CHECKING:
     from lagbench.baselines.weights_file import WeightsFile
 
-MOST_BYTES = 100_000_000
+MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
 good.
 """
@@ -287,9 +286,9 @@ def _require_fit(
         raise UsageError(
             "this is a checkpoint of a training, not the weights of a model",
             where=str(file.path),
-            expected="weights.pt",
+            expected="weights.safetensors",
             got="a checkpoint of a training",
-            fix="give the weights.pt beside it, and predictions that it made",
+            fix="give the weights.safetensors beside it, and predictions that it made",
         )
     data_set = (header.split, header.size, header.dataset_sha256)
     is_of_data = file.data_set == data_set
@@ -491,7 +490,6 @@ def check_weights(
     entries: Sequence[Entry],
     *,
     unreadable_places: Set[Place] = frozenset(),
-    isolated: bool = True,
 ) -> Iterator[ValidationIssue]:
     """Yield what is wrong with the weights of a board.
 
@@ -504,7 +502,6 @@ def check_weights(
         entries: entries that fit the schema.
         unreadable_places: places of entries that cannot be read: nothing is said of
             their weights.
-        isolated: whether a child process reads the recipes of shared weights.
     """
     keepers = {entry.place: entry for entry in entries}
     known_paths: set[Path] = set()
@@ -538,7 +535,7 @@ def check_weights(
                         what="the same weights twice",
                         expected="one place",
                     )
-    yield from check_uses(folder, entries, isolated=isolated)
+    yield from check_uses(folder, entries)
 
     stored_paths = folder.weight_files()
     for path in stored_paths:

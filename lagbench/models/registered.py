@@ -9,10 +9,9 @@ from typing import Any
 from lagbench.atomic import checked_path
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.checkpoint import Checkpoint, load, restore, save
+from lagbench.baselines.checkpoint import SUFFIX, Checkpoint, load, restore, save
 from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.recipe import validate_options
-from lagbench.baselines.safetensors_file import SUFFIX
 from lagbench.data.layout import expand_home
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError

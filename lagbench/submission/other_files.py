@@ -10,7 +10,7 @@ from lagbench.errors import UnreadableFileError
 BOARD_ENTRIES = "submissions"
 """Folder by which a leaderboard is known; see `lagbench.scoring.boards`."""
 
-MODEL_ENDINGS = (".onnx", ".pt", ".safetensors")
+MODEL_ENDINGS = (".onnx", ".safetensors")
 """Endings of the models that `lagbench predict` runs."""
 
 HEAD_BYTES = 256
@@ -68,9 +68,6 @@ def find_model_ending(path: Path) -> str | None:
     header_length = int.from_bytes(head[:8], "little")
     if head[8:9] == b"{" and header_length < path.stat().st_size:
         return ".safetensors"
-    # an archive of torch.save, whose first member is the pickle
-    if head.startswith(b"PK") and b"/data.pkl" in head:
-        return ".pt"
     # protobuf: field 1, the version of the format; then field 2, the producer
     if len(head) > 2 and head[0] == 0x08 and head[1] < 0x40 and head[2] == 0x12:
         return ".onnx"
