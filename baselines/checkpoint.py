@@ -105,8 +105,9 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     for name, tensor in tensors.items():
         if tensor.layout is not torch.strided or tensor.is_complex():
             raise UsageError(
-                f"{name!r} is no dense tensor of real numbers, which alone can be "
-                f"saved; register a buffer with persistent=False"
+                f"{name!r} is no dense tensor of real numbers; register a buffer with "
+                "persistent=False",
+                where=str(path),
             )
         # The format holds no two names for one memory.
         on_cpu = tensor.detach().cpu()
@@ -137,7 +138,8 @@ def load(path: str | Path) -> Checkpoint:
     ) as error:
         first_line = str(error).split("\n")[0]
         raise UnreadableFileError(
-            f"{path}: no weights of lagbench in a .safetensors file: {first_line[:200]}"
+            f"no weights of lagbench in a .safetensors file: {first_line[:200]}",
+            where=str(path),
         ) from error
 
     weights = {}
@@ -169,7 +171,8 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
         model = entry.model.build(checkpoint.options, checkpoint.info)
     except ValidationError as error:
         raise UnreadableFileError(
-            f"{where}: options of another version of {checkpoint.baseline}: {error}"
+            f"options of another version of {checkpoint.baseline}: {error}",
+            where=where,
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()
@@ -186,14 +189,14 @@ def load_weights(
     for name, value in weights.items():
         if not value.to(torch.float32).isfinite().all():
             raise UnreadableFileError(
-                f"{where}: {name} is not finite; take an earlier checkpoint"
+                f"{name} is not finite; take an earlier checkpoint", where=where
             )
     try:
         model.load_state_dict(dict(weights))
     except RuntimeError as error:
         one_line = " ".join(str(error).split())
         raise UnreadableFileError(
-            f"{where}: the weights do not fit the model: {one_line[:300]}"
+            f"the weights do not fit the model: {one_line[:300]}", where=where
         ) from None
 
 
@@ -231,11 +234,14 @@ def check_data(
     try:
         tier = registry.size(trained.split, size or trained.size)
     except UsageError as error:
-        raise DataError(f"{where}: trained on {trained.split}; {error}") from error
+        raise DataError(
+            f"no data of the training: {error.text}", where=where
+        ) from error
     if tier.name != trained.size and not entry.model.any_size:
         raise UsageError(
-            f"{where}: {entry.model.method} predicts only the size that it was trained "
-            f"on, {trained.size}"
+            f"{entry.model.method} predicts only the size that it was trained on, "
+            f"{trained.size}",
+            where=where,
         )
     target = read_dataset_info(trained.split, tier.name, root=root, registry=registry)
     if target.version.partition(".")[0] != trained.version.partition(".")[0]:
@@ -246,7 +252,8 @@ def check_data(
         warnings.warn(message, OtherVersionWarning, stacklevel=2)
     if target.box != trained.box or target.frame_interval != trained.frame_interval:
         raise UsageError(
-            f"{where}: {target.split} {target.size} {target.version} has another box "
-            f"or frame interval than the data of the training; train on it"
+            f"{target.split} {target.size} {target.version} has another box or frame "
+            "interval than the data of the training; train on it",
+            where=where,
         )
     return target

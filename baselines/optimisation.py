@@ -79,7 +79,9 @@ class Optimisation:
         for key, value in tensors.items():
             name, _, kind = key.rpartition("/")
             parameter = parameters.get(name)
-            shape = torch.Size() if kind == "step" else getattr(parameter, "shape", None)
+            shape = (
+                torch.Size() if kind == "step" else getattr(parameter, "shape", None)
+            )
             if parameter is None or value.shape != shape:
                 raise UnreadableFileError(
                     f"the state {key} of the optimiser does not fit the model; train "

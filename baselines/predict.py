@@ -124,7 +124,7 @@ def predict(
     checkpoint with the last state beside the best weights.
 
     Args:
-        checkpoint: weights.pt or checkpoint.pt of a training.
+        checkpoint: weights.safetensors or checkpoint.safetensors of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
         overwrite: whether to replace predictions of that name; files of another kind
             are never replaced.

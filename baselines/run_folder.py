@@ -34,7 +34,9 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.checkpoint = path / "checkpoint.safetensors"  # the last state, to go on from
+        self.checkpoint = (
+            path / "checkpoint.safetensors"
+        )  # the last state, to go on from
         # the best weights in bfloat16, to predict from
         self.weights = path / "weights.safetensors"
         self.log = path / "training.json"  # the log of the training

@@ -145,7 +145,7 @@ def train(
         recipe: variant of the recipe, or a YAML file of recipes.
         settings: changes to the recipe, as in ``training.steps=100``.
         seed: seed in place of the recipe's.
-        start: weights.pt to start from, perhaps of another size; random weights when
+        start: weights to start from, perhaps of another size; random weights when
             None.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.

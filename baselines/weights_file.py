@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lagbench.data.checksums import file_sha256
 import torch
 
+from lagbench.data.checksums import file_sha256
 from lagbench.submission.provenance import TrainingProvenance
 
 from .checkpoint import load

@@ -183,7 +183,7 @@ COMMANDS = """\
 ```
 lagbench generate --split cavity --size mini
 lagbench train --baseline neuralmpm --split cavity --size mini --seed 0
-lagbench predict runs/cavity/mini/neuralmpm-0/weights.pt -o predictions.nc
+lagbench predict runs/cavity/mini/neuralmpm-0/weights.safetensors -o predictions.nc
 lagbench score predictions.nc
 ```
 

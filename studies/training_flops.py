@@ -143,7 +143,7 @@ def count_entry(folder: Folder, entry: Entry, root: Path) -> Operations | None:
     """Return the operations of the first weights of an entry; None without any."""
     for prediction in entry.predictions:
         weights = prediction.weights
-        if weights is None or not weights.path.endswith(".pt"):
+        if weights is None or not weights.path.endswith(".safetensors"):
             continue
         if weights.shared_with is not None:
             continue  # the row of the other entry has this training

@@ -40,7 +40,7 @@ class ModelBoard:
     @property
     def weights(self) -> Path:
         """The weights on the board."""
-        return self.folder / f"weights/{self.split}/tiny/gns_0.pt"
+        return self.folder / f"weights/{self.split}/tiny/gns_0.safetensors"
 
     def shifted(self, distance: float) -> Path:
         """Write the predictions with every particle shifted a little."""
@@ -102,14 +102,14 @@ def make_bench(folder: Path, root: Path, split: str = SPLIT) -> ModelBoard:
         weights=round_weights(model),
         training={"step": 5, "recipe": recipe},
     )
-    save(folder / "weights.pt", checkpoint)
+    save(folder / "weights.safetensors", checkpoint)
     predict(
-        folder / "weights.pt",
+        folder / "weights.safetensors",
         folder / "predictions.nc",
         root=root,
         device="cpu",
         threads=1,
         method="gns",
     )
-    bench.submit(bench.predictions, weights=[folder / "weights.pt"])
+    bench.submit(bench.predictions, weights=[folder / "weights.safetensors"])
     return bench

@@ -400,7 +400,7 @@ def make_entry(
     author_count = 1 + len(name) % 3
     command = (
         f"lagbench train --baseline {method} --split cavity --seed 0\n"
-        "lagbench predict --checkpoint runs/cavity/full/checkpoint.pt -o "
+        "lagbench predict --checkpoint runs/cavity/full/checkpoint.safetensors -o "
         "predictions.nc"
     )
     budget = EntryBudget(

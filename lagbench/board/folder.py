@@ -96,7 +96,9 @@ def is_place_of_file(path: Path) -> bool:
     return path.suffix in ENDINGS.get(path.parts[0], ())
 
 
-def weights_path(place: Place, seed: int | None, like: str | Path = ".safetensors") -> Path:
+def weights_path(
+    place: Place, seed: int | None, like: str | Path = ".safetensors"
+) -> Path:
     """Return the path of the model of a seed, relative to the folder.
 
     Args:

@@ -123,7 +123,7 @@ pip install -c constraints.txt '.[generate,plots,baselines]'
 lagbench generate --split cavity --size mini
 # a model of ours, or write predictions.nc with a program of your own
 lagbench train --baseline neuralmpm --split cavity --size mini
-lagbench predict runs/cavity/mini/neuralmpm-0/weights.pt -o predictions.nc
+lagbench predict runs/cavity/mini/neuralmpm-0/weights.safetensors -o predictions.nc
 # scores, and adds the entry
 lagbench submit predictions.nc --from meta.yaml
 # what the pull request must pass

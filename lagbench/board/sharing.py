@@ -186,9 +186,7 @@ def _hashes_of_kept_weights(keeper: Entry) -> set[str]:
     return hashes
 
 
-def check_uses(
-    folder: Folder, entries: Sequence[Entry]
-) -> Iterator[ValidationIssue]:
+def check_uses(folder: Folder, entries: Sequence[Entry]) -> Iterator[ValidationIssue]:
     """Yield options that models do not have, and weights used in the same way twice."""
     groups: dict[tuple[str, str, str], list[WeightsUse]] = {}
     uses = list_uses(entries)

@@ -107,7 +107,7 @@ COMMANDS = (
         name="predict",
         target="predict:predict_command",
         summary="Predict the test scenarios with a trained model.",
-        example="predict runs/cavity/tiny/gns-0/weights.pt",
+        example="predict runs/cavity/tiny/gns-0/weights.safetensors",
     ),
     CommandEntry(
         name="bench",

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 WeightsArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="FILE", help="A trained model: weights.pt, safetensors or ONNX."
+        metavar="FILE",
+        help="A trained model: safetensors or ONNX.",
     ),
 ]
 PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]

@@ -52,7 +52,7 @@ def submit_command(
         list[Path] | None,
         option(
             "--weights FILE",
-            "weights.pt, safetensors or ONNX to keep beside the entry; at most one "
+            "safetensors or ONNX files to keep beside the entry; at most one "
             "for each seed.",
         ),
     ] = None,

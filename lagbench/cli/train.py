@@ -64,7 +64,7 @@ StartOption = Annotated[
     Path | None,
     option(
         "--start FILE",
-        "weights.pt to start from; they may be of another size.",
+        "weights.safetensors to start from; they may be of another size.",
     ),
 ]
 RunFolderOption = Annotated[

@@ -58,7 +58,6 @@ MAX_REASON = 200
 
 OTHER_ENDINGS = frozenset(
     {
-        ".pt",
         ".pth",
         ".ckpt",
         ".safetensors",

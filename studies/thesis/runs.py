@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 OTHER_RUN = "name another folder of runs with --runs, or remove this run"
 
-WEIGHTS_NAME = "weights.pt"
+WEIGHTS_NAME = "weights.safetensors"
 
 Run = tuple[str, RosterModel, int]
 """Split, model and seed."""
@@ -137,7 +137,7 @@ def score_committed(plan: Plan, split: str, model: RosterModel) -> None:
         committed_name = f"{model.name}-{plan.recipe}"
     weights_by_seed = {}
     weights_folder = plan.weights / split / plan.size
-    for path in weights_folder.glob(f"{committed_name}_*.pt"):
+    for path in weights_folder.glob(f"{committed_name}_*.safetensors"):
         seed_text = path.stem.removeprefix(f"{committed_name}_")
         if seed_text.isdecimal():
             weights_by_seed[int(seed_text)] = path

@@ -116,7 +116,7 @@ def test_an_interrupted_fit_begins_anew(
     assert result.exit_code == 130
     assert "the same command begins anew" in result.stderr
     assert "goes on" not in result.stderr
-    assert not list(Path("runs").rglob("weights.pt"))
+    assert not list(Path("runs").rglob("weights.safetensors"))
 
 
 @pytest.mark.slow
@@ -136,14 +136,15 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     )
     trained = lagbench(*train)
     assert (
-        "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
+        "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.safetensors"
+        in trained.stdout
     )
     assert "hint: tiny is for tests" in trained.stdout
     assert "was over before" in lagbench(*train).stdout
     assert "was over before" not in trained.stdout
     predict = (
         "predict",
-        "runs/curl-noise/tiny/gns-0/weights.pt",
+        "runs/curl-noise/tiny/gns-0/weights.safetensors",
         "--threads",
         "1",
         "--no-bench",
@@ -163,7 +164,9 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]
     silent = ("--no-bench", "--quiet", "--threads", "1", "--overwrite")
     assert (
-        lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", *silent).stdout
+        lagbench(
+            "predict", "runs/curl-noise/tiny/gns-0/checkpoint.safetensors", *silent
+        ).stdout
         == ""
     )
 
@@ -180,7 +183,7 @@ def test_the_speed_up_needs_the_solver(
         lambda name, *rest: None if name == "taichi" else find(name, *rest),
     )
     predicted = lagbench(
-        "predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1"
+        "predict", "runs/curl-noise/tiny/gns-0/weights.safetensors", "--threads", "1"
     )
     assert predicted.exit_code == 0
     assert "no speed-up" in predicted.stderr
@@ -232,14 +235,14 @@ def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
     """A pickle, a missing file and data of another version are refused with 3, 3 and
     4.
     """
-    (tmp_path / "bomb.pt").write_bytes(pickle.dumps(os.getcwd))
+    (tmp_path / "bomb.safetensors").write_bytes(pickle.dumps(os.getcwd))
     assert (
-        lagbench("predict", "bomb.pt").exit_code
-        == lagbench("predict", "none.pt").exit_code
+        lagbench("predict", "bomb.safetensors").exit_code
+        == lagbench("predict", "none.safetensors").exit_code
         == 3
     )
     lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
-    weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.pt"
+    weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.safetensors"
     content = torch.load(weights, weights_only=True)
     about = json.loads(content["about"])
     about["facts"]["dataset_sha256"] = "f" * 64
@@ -306,8 +309,11 @@ def test_a_local_split_is_predicted_by_its_folder(
         *("--recipe", "recipe.yaml", "--set", "training.validate_every=0", "-o", "run"),
     )
     assert trained.exit_code == 0, trained.output
-    assert f"next: lagbench predict run/weights.pt --split {folder} " in trained.stdout
-    weights = ("predict", "run/weights.pt", "--threads", "1", "--overwrite")
+    assert (
+        f"next: lagbench predict run/weights.safetensors --split {folder} "
+        in trained.stdout
+    )
+    weights = ("predict", "run/weights.safetensors", "--threads", "1", "--overwrite")
     lost = lagbench(*weights)
     assert lost.exit_code == 4
     assert "--split FOLDER" in lost.stderr
@@ -328,15 +334,22 @@ def test_a_local_split_is_predicted_by_its_folder(
 @pytest.mark.filterwarnings("default")
 def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) -> None:
     """Predicting before the end, in one line on stderr; and predicting from and
-    starting at checkpoint.pt.
+    starting at checkpoint.safetensors.
 
-    The latter where weights.pt lies beside it.
+    The latter where weights.safetensors lies beside it.
     """
     lagbench(
         "train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run"
     )
     early = (
-        *("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json"),
+        *(
+            "predict",
+            "run/weights.safetensors",
+            "--threads",
+            "1",
+            "--no-bench",
+            "--json",
+        ),
         "--overwrite",
     )
     assert lagbench(*early).stderr == ""
@@ -350,7 +363,7 @@ def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) ->
     (tmp_path / "run/training.json").write_text(told)
     predict = (
         "predict",
-        "run/checkpoint.pt",
+        "run/checkpoint.safetensors",
         "--threads",
         "1",
         "--no-bench",
@@ -358,12 +371,17 @@ def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) ->
         "--overwrite",
     )
     more = ("train", "--baseline", "mlp", *TINY, "--set", "training.steps=1", "--quiet")
-    for words in (predict, (*more, "--start", "run/checkpoint.pt", "-o", "more")):
+    for words in (
+        predict,
+        (*more, "--start", "run/checkpoint.safetensors", "-o", "more"),
+    ):
         done = lagbench(*words)
         assert done.exit_code == 0
-        assert "run/weights.pt" in done.stderr
-    assert lagbench(*more, "--start", "run/weights.pt", "-o", "best").stderr == ""
-    (tmp_path / "run/weights.pt").unlink()
+        assert "run/weights.safetensors" in done.stderr
+    assert (
+        lagbench(*more, "--start", "run/weights.safetensors", "-o", "best").stderr == ""
+    )
+    (tmp_path / "run/weights.safetensors").unlink()
     assert lagbench(*predict).stderr == ""
 
 
@@ -532,7 +550,8 @@ def test_two_processes_make_the_weights_of_one(
     )
     assert lagbench(*options("alone", 6, 2e-3)).exit_code == 0
     one, other = (
-        load(tmp_path / name / "checkpoint.pt").weights for name in ("shared", "alone")
+        load(tmp_path / name / "checkpoint.safetensors").weights
+        for name in ("shared", "alone")
     )
     assert one.keys() == other.keys()
     for name, value in one.items():

@@ -231,7 +231,7 @@ def test_no_image_turns_the_layers_of_a_force(root: Path, tmp_path: Path) -> Non
     info = read_dataset_info(SPLIT, "tiny", root=root)
     options = {"cells": 12, "width": 8, "symmetry": "mirror", "body_force": True}
     model = NeuralMPM.build(options, info)
-    weights = tmp_path / "weights.pt"
+    weights = tmp_path / "weights.safetensors"
     save_untrained(weights, "neuralmpm", model, info)
     predictions = tmp_path / "predictions.nc"
     average = "model.average=true"

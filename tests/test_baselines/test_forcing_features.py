@@ -400,7 +400,7 @@ def restored_from_old_weights(
         info=info(),
         weights=filled(model.state_dict()),
     )
-    path = folder / "weights.pt"
+    path = folder / "weights.safetensors"
     save(path, checkpoint)
     return restore(load(path))
 
@@ -601,7 +601,7 @@ def test_weights_that_see_no_force_go_on_without_it(
     options = dict(checkpoint.options)
     del options["body_force"]
     del options["obstacle"]
-    old = tmp_path / "old.pt"
+    old = tmp_path / "old.safetensors"
     save(old, replace(checkpoint, options=options))
     with pytest.warns(UnseenForcingWarning):
         further = train(

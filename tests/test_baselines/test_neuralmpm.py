@@ -791,7 +791,7 @@ def test_grids_that_stand_first_in_both_models_keep_their_weights(
 
     training_options = set(before.options.in_training)
     start = TrainingStart(
-        path=Path("earlier.pt"),
+        path=Path("earlier.safetensors"),
         info=before.info,
         weights=earlier_weights,
         options=before.options.model_dump(mode="json", exclude=training_options),

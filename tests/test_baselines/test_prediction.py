@@ -125,7 +125,7 @@ def run(
         all_options = {"start": start, **(model or {})}
         drift = Drift.build(all_options, info)
         record = {"step": 9, "recipe": RECIPE, **(training or {})}
-        weights = tmp_path / "weights.pt"
+        weights = tmp_path / "weights.safetensors"
         checkpoint = Checkpoint(
             baseline=baseline,
             options=drift.options.model_dump(),
@@ -271,7 +271,7 @@ def test_the_search_that_is_timed_is_the_models(
         "neighbours": 3,
     }
     model = find("gns").model.build(options, tiny_info)
-    weights = tmp_path / "weights.pt"
+    weights = tmp_path / "weights.safetensors"
     checkpoint = Checkpoint(
         baseline="gns",
         options=options,
@@ -341,7 +341,10 @@ def test_the_cost_of_a_rollout_that_diverges_is_that_of_the_frames_before(
     monkeypatch.setattr(Drift, "advance", lambda *given: advance(*given))
     monkeypatch.setattr(runner, "time", clock)
     weights_runner = WeightsRunner(
-        tmp_path / "weights.pt", size="tiny", root=generated.root, registry=unmeasured
+        tmp_path / "weights.safetensors",
+        size="tiny",
+        root=generated.root,
+        registry=unmeasured,
     )
     scenario_file = next(generated.folder.glob("test/*.nc"))
     assert weights_runner.time(scenario_file, 2) == 1.0
@@ -508,7 +511,7 @@ def test_missing_data_are_an_error(run: Predict, tmp_path: Path) -> None:
     run()
     output = tmp_path / "other.nc"
     with pytest.raises(DataError) as caught:
-        predict(tmp_path / "weights.pt", output, root=tmp_path / "nowhere")
+        predict(tmp_path / "weights.safetensors", output, root=tmp_path / "nowhere")
     assert str(caught.value.where).endswith("nowhere/curl-noise/tiny/v2")
 
 
@@ -516,8 +519,8 @@ def test_a_missing_checkpoint_is_unreadable(
     generated: GenerationResult, tmp_path: Path
 ) -> None:
     with pytest.raises(UnreadableFileError) as caught:
-        predict(tmp_path / "none.pt", tmp_path / "p.nc", root=generated.root)
-    assert str(caught.value.where).endswith("none.pt")
+        predict(tmp_path / "none.safetensors", tmp_path / "p.nc", root=generated.root)
+    assert str(caught.value.where).endswith("none.safetensors")
 
 
 def test_a_missing_device_is_a_usage_error(run: Predict) -> None:
@@ -653,7 +656,7 @@ def test_no_image_falls_sideways(
     root = tiny_split("fluid").root
     info = read_dataset_info("fluid", "tiny", root=root)
     model = NeuralMPM.build({"symmetry": "mirror"}, info)
-    weights = tmp_path / "weights.pt"
+    weights = tmp_path / "weights.safetensors"
     output = tmp_path / "p.nc"
     save_untrained(weights, "neuralmpm", model, info)
     with pytest.raises(UsageError) as caught:
@@ -701,7 +704,7 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "weights.pt",
+        "weights.safetensors",
         "training.nc",
         ".",
         "predictions.json",
@@ -731,7 +734,7 @@ def test_only_predictions_are_replaced(
         run(name=name)
     assert caught.value.where == "--output"
     assert log.read_text() == log_content
-    assert load(tmp_path / "weights.pt").baseline == "drift"
+    assert load(tmp_path / "weights.safetensors").baseline == "drift"
     assert (tmp_path / "scenario.nc").read_bytes() == scenario
 
 
@@ -794,7 +797,7 @@ def test_two_predictions_do_not_write_one_file_at_a_time(
         position = np.asarray(data["position"][:])
     assert not np.array_equal(position[:, 0], position[:, 1])
     files = sorted(path.name for path in tmp_path.iterdir())
-    assert files == ["predictions.json", "predictions.nc", "weights.pt"]
+    assert files == ["predictions.json", "predictions.nc", "weights.safetensors"]
     assert run(start=0.0, overwrite=True).path == first.path
 
 

@@ -202,7 +202,7 @@ def test_a_training_and_its_predictions_go_through_the_ends(
     )
     path = tmp_path / "predictions.nc"
     root = made.folder.parent
-    predict(run / "weights.pt", path, root=root, device="cpu")
+    predict(run / "weights.safetensors", path, root=root, device="cpu")
     with open_predictions(path) as predictions:
         prediction = predictions.frames(3, 11, 1)
     last = prediction[0].astype(np.float64)
@@ -255,7 +255,7 @@ def test_networks_of_whole_frames_train_on_equal_scenarios(
         device="cpu",
     )
     path = tmp_path / "predictions.nc"
-    predict(run / "weights.pt", path, root=tmp_path, device="cpu")
+    predict(run / "weights.safetensors", path, root=tmp_path, device="cpu")
     with open_predictions(path) as predictions:
         position = predictions.frames(3, 6, 6)
     assert position.shape == (6, 125, 3)
@@ -280,4 +280,4 @@ def test_other_models_say_that_they_know_no_such_box(
             device="cpu",
         )
     assert "the box of" in str(caught.value.where)
-    assert not (tmp_path / "run" / "weights.pt").exists()
+    assert not (tmp_path / "run" / "weights.safetensors").exists()

@@ -120,7 +120,7 @@ def stored(
             weights=weights or built.state_dict(),
             training=training,
         )
-        path = tmp_path / "start.pt"
+        path = tmp_path / "start.safetensors"
         save(path, checkpoint)
         return path
 
@@ -250,7 +250,7 @@ def test_a_fresh_training_keeps_its_start_where_every_step_is_worse(
     run("any", "steps=2", to="used")
     fresh = run("any", *settings, start=start, to="used", fresh=True)
     assert fresh.best_step == alone.best_step == 0
-    for name in ("weights.pt", "checkpoint.pt"):
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
         of_fresh = load(fresh.folder / name)
         of_alone = load(alone.folder / name)
         assert of_fresh.weights.keys() == of_alone.weights.keys()
@@ -274,11 +274,11 @@ def test_trainings_and_predictions_may_lie_in_the_home_folder(
     home_folder: Path,
 ) -> None:
     """As other files that functions of the package write."""
-    shutil.copy(stored(), home_folder / "start.pt")
-    result = run("any", *STILL, start="~/start.pt", output="~/trained")
-    assert result.weights == home_folder / "trained" / "weights.pt"
+    shutil.copy(stored(), home_folder / "start.safetensors")
+    result = run("any", *STILL, start="~/start.safetensors", output="~/trained")
+    assert result.weights == home_folder / "trained" / "weights.safetensors"
     prediction = predict(
-        "~/trained/weights.pt",
+        "~/trained/weights.safetensors",
         "~/made.nc",
         root=generated.root,
         registry=unmeasured,
@@ -397,7 +397,7 @@ def test_a_refused_start_leaves_the_folder_as_it_is(
     weights_before = first.weights.read_bytes()
     checkpoint_before = first.checkpoint.read_bytes()
     odd = {"a": torch.zeros(2), "calls": torch.zeros(())}
-    link = first.folder.with_name("link.pt")
+    link = first.folder.with_name("link.safetensors")
     link.symlink_to(first.checkpoint)
     refused = [
         ("any", first.weights),

@@ -375,7 +375,7 @@ def test_a_loss_that_is_not_finite_stops_the_training(run: Run, tmp_path: Path) 
         run("drift", "model.fail_at=6", "steps=9", "checkpoint_every=4")
     assert caught.value.where == "step 6"
     assert "motion" not in str(caught.value)
-    checkpoint = load(tmp_path / "run/checkpoint.pt")
+    checkpoint = load(tmp_path / "run/checkpoint.safetensors")
     assert checkpoint.training["step"] == 4
     assert torch.isfinite(checkpoint.weights["a"]).all()
     assert read_training_log(tmp_path / "run")["state"] == "failed"
@@ -413,7 +413,7 @@ def test_a_fresh_training_on_a_full_disk_leaves_the_earlier_one(
     with largest_file(1000), pytest.raises(WorkFailedError):
         run(baseline, fresh=True)
     after = read_folder(earlier.folder)
-    for name in ("checkpoint.pt", "weights.pt", "training.json"):
+    for name in ("checkpoint.safetensors", "weights.safetensors", "training.json"):
         assert after[name] == before[name]
 
 
@@ -496,35 +496,6 @@ def test_the_learning_rate_is_multiplied_by_the_processes() -> None:
     assert three.learning_rate == pytest.approx(3 * alone.learning_rate)
 
 
-@pytest.mark.parametrize(
-    "state",
-    [
-        {},
-        {"state": {}, "param_groups": []},
-        {"state": {}, "param_groups": [{"params": [0, 1, 2]}]},
-        {"state": 3, "param_groups": [{"params": [0]}]},
-    ],
-)
-def test_the_state_of_another_optimiser_is_refused(state: dict[str, Any]) -> None:
-    model = Drift.build({}, INFO)
-    with pytest.raises(UnreadableFileError):
-        Optimisation(model, TrainingOptions(), steps=5, optimizer_state=state)
-
-
-def test_averages_of_another_shape_are_refused() -> None:
-    """The optimiser would write beyond their memory."""
-    model = torch.nn.Linear(50, 3)
-    options = TrainingOptions()
-    training = Optimisation(model, options, steps=5)
-    model(torch.ones(1, 50)).sum().backward()
-    training.optimizer.step()
-    state = training.optimizer.state_dict()
-    Optimisation(model, options, steps=5, optimizer_state=state)
-    state["state"][0]["exp_avg"] = torch.zeros(3, 5)
-    with pytest.raises(UnreadableFileError):
-        Optimisation(model, options, steps=5, optimizer_state=state)
-
-
 def test_gradients_are_clipped(run: Run, steps_taken: list[Step]) -> None:
     """A gradient longer than `clip` is scaled to it before the optimiser sees it."""
     run("drift", "steps=2", "validate_every=0")
@@ -575,7 +546,7 @@ def test_the_mean_of_the_weights_is_published(
     checkpoint = load(result.checkpoint)
     assert float(checkpoint.weights["a"]) == pytest.approx(weights[-1], rel=1e-6)
     assert checkpoint.optimizer is not None
-    stored_mean = float(checkpoint.optimizer["state"][0]["mean"])
+    stored_mean = float(checkpoint.optimizer["a/mean"])
     assert stored_mean == pytest.approx(means[-1], rel=1e-6)
 
     assert result.best_step is not None
@@ -803,9 +774,9 @@ def test_a_full_disk_leaves_the_checkpoint_before(run: Run) -> None:
     larger = replace(checkpoint, weights=weights)
     with largest_file(10**5), pytest.raises(WorkFailedError) as caught:
         save(path, larger)
-    assert "checkpoint.pt" in str(caught.value)
+    assert "checkpoint.safetensors" in str(caught.value)
     names = {file.name for file in path.parent.iterdir() if file.is_file()}
-    assert names == {"checkpoint.pt", "training.json", "weights.pt"}
+    assert names == {"checkpoint.safetensors", "training.json", "weights.safetensors"}
     assert path.read_bytes() == content
 
 
@@ -975,7 +946,7 @@ def test_a_users_fit_gets_whole_scenarios_as_batches(
         squares += float((step[:-1] ** 2).sum())
     best = products / squares
     assert read_training_log(result.folder)["loss"]["best"] == pytest.approx(best)
-    exact = load(result.folder / "checkpoint.pt").weights["a"]
+    exact = load(result.folder / "checkpoint.safetensors").weights["a"]
     assert float(exact) == pytest.approx(best)
     reading = [report for report in reports if report.stage == "reading"]
     assert reading[-1].total == reading[-1].done == len(paths)

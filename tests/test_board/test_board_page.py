@@ -854,7 +854,7 @@ def test_weights_beside_the_entry_have_a_link_a_seed(board: Board) -> None:
     page = with_rows(board, row)
     links = re.findall(r'href="(weights/[^"]*)"', page)
     place = "/".join(entry.place)
-    assert links == [f"weights/{place}_0.pt", f"weights/{place}_1.pt"]
+    assert links == [f"weights/{place}_0.safetensors", f"weights/{place}_1.safetensors"]
 
 
 def test_skill_below_nothing_is_not_shaded_as_skill(board: Board) -> None:

@@ -144,7 +144,7 @@ def test_a_cost_of_an_earlier_run_does_not_stay(own: ModelBoard) -> None:
     other = PATH.replace("gns", "second")
     other_name = NAME.replace("gns", "second")
     shutil.copy(own.folder / PATH, own.folder / other)
-    own_weights = own.weights.with_name("second_0.pt")
+    own_weights = own.weights.with_name("second_0.safetensors")
     shutil.copy(own.weights, own_weights)
 
     def take_own_weights(content: Content) -> None:

@@ -188,7 +188,7 @@ def test_an_interruption_says_to_leave_out_what_deletes_the_work(
         ("leaderboard reproduce --all --no-record", "begins anew"),
         ("leaderboard check", "begins anew"),
         ("score predictions.nc", "begins anew"),
-        ("predict weights.pt", "begins anew"),
+        ("predict weights.safetensors", "begins anew"),
     ],
 )
 def test_an_interruption_says_what_the_same_command_does(

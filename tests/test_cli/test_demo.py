@@ -184,7 +184,7 @@ def test_a_training_of_another_version_is_trained_anew(
     """A damaged checkpoint, and one of another recipe, are no errors."""
     root = copied()
     run_demo(root, run)
-    checkpoint = root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.pt"
+    checkpoint = root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.safetensors"
     checkpoint.write_bytes(b"damaged")
     assert demo.demo_model(root=root).training.state == "finished"
 

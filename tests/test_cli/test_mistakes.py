@@ -167,7 +167,7 @@ MISTAKES = {
     "weights to start from that are none": f"{TRAIN} gns --start notes.txt",
     "an unknown size to train on": ("train curl-noise --size tinny --baseline gns"),
     "an ONNX file without its split": "predict model.onnx -o x.nc",
-    "weights that are not there": "predict weights.pt -o x.nc",
+    "weights that are not there": "predict weights.safetensors -o x.nc",
     "no leaderboard": "leaderboard check --board nothing",
     "no leaderboard to compare with": "compare good.nc still --board notes.txt",
     "a folder without scores": "compare . persistence",

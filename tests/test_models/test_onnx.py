@@ -612,7 +612,7 @@ def test_predictions_state_the_seed_that_is_given(
     with h5py.File(predictions) as file:
         assert file.attrs["seed"] == 3
 
-    weights = CliRunner().invoke(app, ["predict", "weights.pt", "--seed", "3"])
+    weights = CliRunner().invoke(app, ["predict", "weights.safetensors", "--seed", "3"])
     assert weights.exit_code == 2
     assert "--seed" in weights.output
 
@@ -655,9 +655,9 @@ def test_paths_of_an_onnx_model_may_begin_with_the_home_folder(
     command = CliRunner().invoke(app, [*words, "--output=~/command.nc"])
     assert command.exit_code == 0, command.output
     assert (home_folder / "command.nc").is_file()
-    weights = CliRunner().invoke(app, ["predict", "~/weights.pt"])
+    weights = CliRunner().invoke(app, ["predict", "~/weights.safetensors"])
     assert weights.exit_code == 3
-    assert str(home_folder / "weights.pt") in weights.output
+    assert str(home_folder / "weights.safetensors") in weights.output
 
 
 def test_a_model_may_be_exported_to_the_home_folder(
@@ -723,7 +723,7 @@ def test_an_entry_carries_an_onnx_model(
     refused = {
         path: "another file",
         predictions: "--overwrite",
-        tmp_path / "new.pt": "new.nc",
+        tmp_path / "new.safetensors": "new.nc",
     }
     for output, fix in refused.items():
         with pytest.raises(UsageError) as caught:

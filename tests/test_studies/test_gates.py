@@ -167,7 +167,7 @@ def board(model_board: ModelBoard, tmp_path: Path) -> Path:
 
 def change_weights(board: Path, suffix: str, baseline: str) -> Path:
     """Write the weights anew, with another baseline in their record."""
-    old = board / "weights/curl-noise/tiny/gns_0.pt"
+    old = board / "weights/curl-noise/tiny/gns_0.safetensors"
     checkpoint = replace(load(old), baseline=baseline)
     old.unlink()
     new = old.with_suffix(suffix)
@@ -181,7 +181,6 @@ def change_weights(board: Path, suffix: str, baseline: str) -> Path:
     return new
 
 
-@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
 def test_weights_say_themselves_that_they_are_a_graph_network(
     board: Path, suffix: str
 ) -> None:
@@ -199,7 +198,7 @@ def test_weights_of_other_models_have_no_gates(board: Path) -> None:
 
 
 def test_shared_weights_of_an_inactive_entry_are_measured_once(board: Path) -> None:
-    path = Path("weights/curl-noise/tiny/gns_0.pt")
+    path = Path("weights/curl-noise/tiny/gns_0.safetensors")
     entry = board / PATH
     content = yaml.safe_load(entry.read_text())
     content["predictions"][0]["weights"]["shared_with"] = NAME
@@ -215,7 +214,7 @@ def test_weights_that_are_missing_are_no_crash(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They end with the exit code of a file that cannot be read."""
-    absent = tmp_path / "absent.pt"
+    absent = tmp_path / "absent.safetensors"
     assert main(["--root", str(tmp_path), "--weights", str(absent)]) == 3
     assert str(absent) in capsys.readouterr().err
 

@@ -627,7 +627,7 @@ def test_side_by_side_as_one_after_the_other(
         for split, model, seed in other_runs:
             folder = asked.folder(split, model.name, seed)
             assert (folder / "scores.nc").is_file()
-            checkpoint = load_checkpoint(folder / "weights.pt")
+            checkpoint = load_checkpoint(folder / "weights.safetensors")
             weights[workers].append(checkpoint.weights)
     for alone, beside in zip(weights[1], weights[2], strict=True):
         for name, value in alone.items():

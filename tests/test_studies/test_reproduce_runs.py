@@ -36,7 +36,7 @@ REPOSITORY = Path(__file__).parents[2]
 ONLY = ("--only", "fig_5_22")
 """A figure that needs one run, of SuperGAT."""
 
-FILES = ("weights.pt", "training.json", "predictions.nc", "scores.nc")
+FILES = ("weights.safetensors", "training.json", "predictions.nc", "scores.nc")
 
 
 @pytest.fixture
@@ -343,7 +343,7 @@ def test_committed_weights_are_shown_without_training(
     assert reproduce(*ONLY, "--set", "training.steps=1") == 0
     weights.mkdir(parents=True)
     for source, target in (
-        ("weights.pt", "supergat_3.pt"),
+        ("weights.safetensors", "supergat_3.safetensors"),
         ("training.json", "supergat_3.json"),
     ):
         (run_folder / source).rename(weights / target)
@@ -376,7 +376,7 @@ def test_unusable_committed_weights_leave_nothing(
     assert reproduce(*without_training, str(tmp_path / "none")) == 0
     names = [path.name for path in runs_folder.iterdir()]
     assert names == ["reproduce"]
-    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.pt"
+    weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.safetensors"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"no weights")
     assert reproduce(*without_training, str(tmp_path / "weights")) == 3

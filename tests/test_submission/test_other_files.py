@@ -34,7 +34,7 @@ def write_model(path: Path, ending: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("ending", [".onnx", ".pt", ".safetensors"])
+@pytest.mark.parametrize("ending", [".onnx", ".safetensors"])
 def test_a_model_is_known_by_its_bytes_or_its_name(tmp_path: Path, ending: str) -> None:
     path = write_model(tmp_path / f"small{ending}", ending)
     unnamed = write_model(tmp_path / "small.nc", ending)

@@ -107,7 +107,7 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
     commands(
         "train --baseline mlp --split curl-noise --size tiny --set "
         "training.steps=2 -o run",
-        "predict run/weights.pt --no-bench",
+        "predict run/weights.safetensors --no-bench",
         "score predictions.nc",
     )
     assert (tmp_path / "predictions/scores.json").is_file()
