@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from lagbench.errors import UsageError
 from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, Status, Weights
-from .entry_file import is_unchanged, read_entry_if_valid
+from .entry_file import read_entry_if_valid
 from .folder import DEPTH, WEIGHTS, Folder, Place, entry_path
 from .issues import make_issue
 
@@ -186,11 +185,11 @@ def _hashes_of_kept_weights(keeper: Entry) -> set[str]:
     return hashes
 
 
-def check_uses(folder: Folder, entries: Sequence[Entry]) -> Iterator[ValidationIssue]:
+def check_uses(entries: Sequence[Entry]) -> Iterator[ValidationIssue]:
     """Yield options that models do not have, and weights used in the same way twice."""
     groups: dict[tuple[str, str, str], list[WeightsUse]] = {}
     uses = list_uses(entries)
-    checked_settings = _check_settings(folder, uses)
+    checked_settings = _check_settings(uses)
     for use in uses:
         refused = checked_settings[use.where].refused
         if refused is not None:
@@ -223,33 +222,10 @@ def check_uses(folder: Folder, entries: Sequence[Entry]) -> Iterator[ValidationI
                 )
 
 
-def _check_settings(
-    folder: Folder, uses: Sequence[WeightsUse]
-) -> Mapping[str, CheckedSettings]:
-    """Return the settings of each use as its model takes them, by ``use.where``.
-
-    The settings are returned as the entry writes them if torch is not installed. So are
-    those of a file that the entry does not name: another check reports that file.
-    """
+def _check_settings(uses: Sequence[WeightsUse]) -> Mapping[str, CheckedSettings]:
+    """Return the settings of each use as the entry writes them, by ``use.where``."""
     settings_of_uses = {}
-    uses_to_read = []
     for use in uses:
-        path = Path(use.weights.path)
         written = tuple(sorted(set(use.settings)))
         settings_of_uses[use.where] = CheckedSettings(effective=written)
-        if path.suffix == ".onnx":  # it has no options
-            settings_of_uses[use.where] = CheckedSettings(effective=())
-        elif use.settings and is_unchanged(folder, path, use.weights.sha256):
-            uses_to_read.append(use)
-    if not uses_to_read or find_spec("torch") is None:
-        return settings_of_uses
-
-    from lagbench.baselines.weights_file import inspect_weights
-
-    for use in uses_to_read:
-        file = inspect_weights(folder.path / use.weights.path)
-        settings_of_uses[use.where] = CheckedSettings(
-            effective=file.list_effective_settings(use.settings),
-            refused=file.find_refusal(use.settings),
-        )
     return settings_of_uses

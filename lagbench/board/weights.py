@@ -535,7 +535,7 @@ def check_weights(
                         what="the same weights twice",
                         expected="one place",
                     )
-    yield from check_uses(folder, entries)
+    yield from check_uses(entries)
 
     stored_paths = folder.weight_files()
     for path in stored_paths:
