@@ -1,1 +1,0 @@
-"""An attack on the readers of lagbench with seeded, mutated files."""
