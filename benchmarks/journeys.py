@@ -70,12 +70,11 @@ def trace_command(words: list[str]) -> Counter[Path]:
     with redirect_stdout(output), redirect_stderr(output):
         sys.setprofile(watch)
         try:
-            app(words, standalone_mode=False)
-        except SystemExit as done:
-            if done.code:
-                raise
+            exit_code = app(words)
         finally:
             sys.setprofile(None)
+    if exit_code:
+        raise SystemExit(output.getvalue())
     return Counter(file for file, _ in functions)
 
 

@@ -4,7 +4,7 @@
 
 checks the other commit out beside this one, runs both alternately in processes of their
 own and prints, per split, the particle-substeps per second of processor time (best of
-the rounds) of both and their ratio. ``lagbench bench solver`` times frames as
+the rounds) of both and their ratio. ``lagbench bench`` times frames as
 generation makes them, with the checks and the positions read out after each; the row
 ``kernels`` is ``whole_frame.py``, substeps alone. ``--cases`` names rows, also those of
 other splits that both commits have::

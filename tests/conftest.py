@@ -18,15 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import Browser, browser
-from click import Command
-from click.testing import CliRunner, Result
+from command_line import CliRunner, Result
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
 from registry_text import described_splits
 from score_bench import ScoreBench, bench_of
 from turns import leave_out_slow_tests
-from typer.main import get_command
 
 from lagbench.cli.program import app
 from lagbench.data.checksums import file_sha256
@@ -414,18 +412,11 @@ def run(
     """A function that runs lagbench with our splits and no recorded hashes."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-    command = _lagbench_command()
 
     def run_command(*words: object) -> Result:
-        return CliRunner().invoke(command, [str(word) for word in words])
+        return CliRunner().invoke(app, words)
 
     return run_command
-
-
-@functools.cache
-def _lagbench_command() -> Command:
-    """Return the command line, built from its signatures once for all tests."""
-    return get_command(app)
 
 
 @pytest.fixture

@@ -2,58 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import typer
+from cyclopts.types import PositiveInt
 
 from lagbench.data.local import locate_new
 from lagbench.errors import UsageError, format_count
 
-from .options import (
-    JsonFlag,
-    NewSizeOption,
-    QuietFlag,
-    SplitOption,
-    choose_split,
-    option,
-)
+from .options import JsonFlag, NewSizeOption, QuietFlag
 from .output import print_result
 from .solver_bench import bench_solver
 
 
 def bench_command(
-    subject: Annotated[
-        str, typer.Argument(metavar="WHAT", help="What to measure: solver.")
-    ],
-    split: SplitOption = None,
+    split: str,
+    *,
     size: NewSizeOption = None,
-    frames: Annotated[
-        int, option("--frames N", "Number of frames to time.", min=1)
-    ] = 20,
+    frames: PositiveInt = 20,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Measure how long our solver takes for a frame on this machine.
 
     The result is the processor time per frame of one scenario on one core.
+
+    Args:
+        split: Name of the split.
+        frames: Number of frames to time.
     """
-    if subject != "solver":
-        raise UsageError(
-            "there is no such bench",
-            where="WHAT",
-            expected="solver",
-            got=subject,
-            fix="lagbench bench solver",
-        )
-    tier = locate_new(choose_split(None, split), size).size
+    tier = locate_new(split, size).size
     if not tier.simulated:
-        raise UsageError(
-            "a local split cannot be simulated",
-            where="--split",
-            expected="a split that a generator makes",
-            got=tier.split,
-            fix="name a split of ours; `lagbench list` shows them",
-        )
+        raise UsageError("a local split cannot be simulated; lagbench list shows ours")
     result = bench_solver(tier.split, tier.name, frames=frames)
     particles = format_count(result.particles, "particle")
     substeps = format_count(result.substeps, "substep")

@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
 
 import lagbench
 from lagbench.data.local import locate_split
 from lagbench.data.registry import Registry, Split, default_path, load
 from lagbench.errors import escape_line
 
-from .options import (
-    JsonFlag,
-    RootOption,
-    SplitArgument,
-    SplitOption,
-    choose_split,
-    option,
-)
+from .options import JsonFlag, RootOption
 from .output import print_result
 
 # Title and year of this version, as in CITATION.cff.
@@ -50,9 +42,9 @@ TEX_ESCAPES = {
 
 
 def cite_command(
-    split_argument: SplitArgument = None,
-    split_option: SplitOption = None,
-    bibtex: Annotated[bool, option("--bibtex", "Print the BibTeX entry only.")] = False,
+    split: str | None = None,
+    *,
+    bibtex: bool = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -60,12 +52,15 @@ def cite_command(
 
     Without a split it prints how to cite lagbench itself. The authors of other people's
     splits are those who made the data, so no author is printed for them.
+
+    Args:
+        split: Name of the split; without it, lagbench itself.
+        bibtex: Print the BibTeX entry only.
     """
-    if split_argument is None and split_option is None:
+    if split is None:
         _cite_program(bibtex=bibtex, as_json=as_json)
         return
 
-    split = choose_split(split_argument, split_option)
     name, _, registry = locate_split(split, root=root)
     entry = registry.split(name)
     hashes = {}

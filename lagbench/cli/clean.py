@@ -2,47 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 from lagbench.make.clean import clean
 
-from .options import (
-    JsonFlag,
-    QuietFlag,
-    RootOption,
-    accept_split,
-    option,
-)
+from .options import JsonFlag, QuietFlag, RootOption
 from .output import format_bytes, print_result
 
-RemovedSizeOption = Annotated[
-    str | None,
-    option("--size NAME", "tiny, mini or full; needed if several have data here."),
-]
 
-
-@accept_split
 def clean_command(
     split: str,
-    size: RemovedSizeOption = None,
+    *,
+    size: str | None = None,
     root: RootOption = None,
-    leftovers: Annotated[
-        bool,
-        option("--leftovers", "Remove only temporary files of interrupted commands."),
-    ] = False,
-    force: Annotated[
-        bool,
-        option(
-            "--force", "Also remove a local split, which lagbench cannot make again."
-        ),
-    ] = False,
-    dry_run: Annotated[
-        bool, option("--dry-run", "Print the files without removing them.")
-    ] = False,
+    leftovers: bool = False,
+    force: bool = False,
+    dry_run: bool = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Remove one data set, or only its temporary files."""
+    """Remove one data set, or only its temporary files.
+
+    Args:
+        split: Name of the split.
+        size: tiny, mini or full; needed if several have data here.
+        leftovers: Remove only temporary files of interrupted commands.
+        force: Also remove a local split, which lagbench cannot make again.
+        dry_run: Print the files without removing them.
+    """
     result = clean(
         split, size, root=root, leftovers=leftovers, force=force, dry_run=dry_run
     )

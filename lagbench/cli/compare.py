@@ -4,55 +4,47 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
+from cyclopts import Parameter
 
 from lagbench.scoring.compare import compare
 from lagbench.scoring.tables import comparison_lines, comparison_tables
 
 from .options import (
+    ExpectedSplitOption,
     FoundBoardOption,
     JsonFlag,
     QuietFlag,
     RootOption,
     WorkersOption,
-    option,
 )
 from .output import print_json, print_line, print_tables
-from .validate import ExpectedSplitOption
 
 
 def compare_command(
-    first: Annotated[
-        str,
-        typer.Argument(
-            metavar="A",
-            help="A predictions.nc, scores.json or scores.nc; or a folder of the "
-            "scores of one method, with one or several seeds; or an entry of the "
-            "leaderboard, as in cavity/mini/gns.",
-        ),
-    ],
-    second: Annotated[
-        str,
-        typer.Argument(
-            metavar="B",
-            help="A predictions.nc or its scores; or the name of a reference predictor "
-            "or of an entry of the leaderboard.",
-        ),
-    ],
-    metric: Annotated[
-        list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
-    ] = None,
+    first: str,
+    second: str,
+    /,
+    *,
+    metric: list[str] | None = None,
     split: ExpectedSplitOption = None,
     board: FoundBoardOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
-    every: Annotated[bool, option("--all", "Show every metric.")] = False,
+    every: Annotated[bool, Parameter(name="--all")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Compare two methods with statistical tests and confidence intervals.
 
     The comparison runs over the test scenarios, and over seeds where there are several.
+
+    Args:
+        first: A predictions.nc, scores.json or scores.nc; or a folder of the scores of
+            one method, with one or several seeds; or an entry of the leaderboard, as in
+            cavity/mini/gns.
+        second: The same, or the name of a reference predictor.
+        metric: Metric to compare by; repeatable.
+        every: Show every metric.
     """
     result = compare(
         first,
@@ -70,7 +62,7 @@ def compare_command(
             print_line(f"{result.first}: {first}")
             print_line(f"{result.second}: {second}")
         every = every or bool(metric)
-        print_tables(comparison_tables(result, every=every), is_narrow=True)
+        print_tables(comparison_tables(result, every=every))
         for line in comparison_lines(result, every=every):
             print_line(line)
         print_line(result.verdict)

@@ -94,6 +94,7 @@ class ModelResult:
 
 
 def demo_command(
+    *,
     root: RootOption = None,
     workers: WorkersOption = None,
     as_json: JsonFlag = False,
@@ -196,7 +197,7 @@ def explain_missing_model(registry: Registry) -> str | None:
     try:
         require_libraries(TRAINING_LIBRARIES)
     except UsageError as error:
-        return f"{error.what}; {error.fix}"
+        return error.text
     return None
 
 

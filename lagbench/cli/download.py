@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from cyclopts import Parameter
+
 from lagbench.data.layout import format_ids
 from lagbench.exchange.downloading import DownloadResult, download
 
@@ -15,42 +17,33 @@ from .options import (
     ScenariosOption,
     SubsetOption,
     WorkersOption,
-    accept_split,
-    option,
 )
 from .output import format_bytes, print_note, print_result, progress_bar
 
 
-@accept_split
 def download_command(
     split: str,
+    *,
     size: NewSizeOption = None,
-    mirror: Annotated[
-        str | None,
-        option(
-            "--from URL",
-            "Address of a store or of archives; by default the mirrors of the split.",
-        ),
-    ] = None,
+    mirror: Annotated[str | None, Parameter(name="--from")] = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,
-    connections: Annotated[
-        int, option("--connections N", "Files to download at the same time.", min=1)
-    ] = 4,
     or_generate: Annotated[
-        bool,
-        option(
-            "--or-generate/--no-generate",
-            "Simulate scenarios that no store has; with --no-generate end with an "
-            "error instead.",
-        ),
+        bool, Parameter(name="--or-generate", negative="--no-generate")
     ] = True,
     workers: WorkersOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Download a split and check its content; simulate missing scenarios."""
+    """Download a split and check its content; simulate missing scenarios.
+
+    Args:
+        split: Name of the split.
+        mirror: Address of a store or of archives; by default the mirrors of the split.
+        or_generate: Simulate scenarios that no store has; with --no-generate end with
+            an error instead.
+    """
     with progress_bar(quiet=quiet) as progress:
         result = download(
             split,
@@ -59,7 +52,6 @@ def download_command(
             subset=subset,
             scenarios=scenarios,
             root=root,
-            connections=connections,
             or_generate=or_generate,
             workers=workers,
             progress=progress,

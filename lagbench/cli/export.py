@@ -5,67 +5,49 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from cyclopts import Parameter
+
 from lagbench.data.local import locate
 from lagbench.errors import format_count
 from lagbench.exchange.exporting import ExportResult, export
 
 from .options import (
     JsonFlag,
+    OutputOption,
+    OverwriteFlag,
     PresentSizeOption,
     QuietFlag,
     RootOption,
-    accept_split,
-    option,
 )
 from .output import format_bytes, print_result, progress_bar
 
 
-@accept_split
 def export_command(
     split: str,
+    *,
     size: PresentSizeOption = None,
-    file_format: Annotated[
-        str, option("--format NAME", "gns-npz or lagrangebench-h5.")
-    ] = "gns-npz",
-    output: Annotated[
-        Path | None,
-        option(
-            "--output -o FOLDER",
-            "Folder of the new files; by default SPLIT-SIZE-FORMAT here.",
-        ),
-    ] = None,
+    file_format: Annotated[str, Parameter(name="--format")] = "gns-npz",
+    output: OutputOption = None,
     root: RootOption = None,
-    from_walls: Annotated[
-        bool | None,
-        option(
-            "--from-walls/--unit-box",
-            "For lagrangebench-h5: the origin of the positions is the corner of the "
-            "lower walls, or that of the unit box, as in lagbench. Default: the walls "
-            "in full boxes, with moving walls and with periodic axes, else the unit "
-            "box.",
-        ),
-    ] = None,
-    wall_particles: Annotated[
-        bool,
-        option(
-            "--wall-particles",
-            "Add particles that move with the walls; only for two-dimensional boxes "
-            "with four walls.",
-        ),
-    ] = False,
-    overwrite: Annotated[
-        bool,
-        option(
-            "--overwrite --force",
-            "Replace an earlier export, or write beside other files.",
-        ),
-    ] = False,
+    from_walls: Annotated[bool | None, Parameter(negative="--unit-box")] = None,
+    wall_particles: bool = False,
+    overwrite: OverwriteFlag = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Write a split in the file format of another code base.
 
     The folder holds the subsets train, valid and test, and a file of metadata.
+
+    Args:
+        split: Name of the split, or folder of a local one.
+        file_format: gns-npz or lagrangebench-h5.
+        output: Folder of the new files; by default SPLIT-SIZE-FORMAT here.
+        from_walls: For lagrangebench-h5: the origin of the positions is the corner of
+            the lower walls, or that of the unit box, as in lagbench. Default: the walls
+            in full boxes, with moving walls and with periodic axes, else the unit box.
+        wall_particles: Add particles that move with the walls; only for two-dimensional
+            boxes with four walls.
     """
     tier = locate(split, size, root=root).size
     folder = output or Path(f"{tier.split}-{tier.name}-{file_format}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 from lagbench.data.drawn import drawn_registry, drawn_root
 from lagbench.data.layout import format_ids, url_of
@@ -13,18 +12,15 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.inventory import recording_hint
 
 from .options import (
+    DrawSeedOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
     RootOption,
     ScenariosOption,
     SchedulerOption,
-    SplitArgument,
-    SplitOption,
     SubsetOption,
     WorkersOption,
-    choose_split,
-    option,
 )
 from .output import (
     format_bytes,
@@ -36,66 +32,51 @@ from .output import (
 
 
 def generate_command(
-    split_argument: SplitArgument = None,
-    split_option: SplitOption = None,
+    split: str,
+    *,
     size: NewSizeOption = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
-    device: Annotated[
-        str, option("--device NAME", "cpu, parallel (all CPU threads) or cuda.")
-    ] = "cpu",
+    device: str = "cpu",
     scheduler: SchedulerOption = None,
-    gather: Annotated[
-        list[Path] | None,
-        option(
-            "--gather FOLDER",
-            "Take finished scenarios from another root folder; repeatable.",
-        ),
-    ] = None,
-    force: Annotated[
-        bool, option("--force", "Simulate finished scenarios again.")
-    ] = False,
-    dry_run: Annotated[
-        bool, option("--dry-run", "Print the cost only: bytes, time, free disk.")
-    ] = False,
-    draw_seed: Annotated[
-        str | None,
-        option(
-            "--draw-seed HEX",
-            "Simulate new test scenarios, drawn from this seed of 64 hexadecimal "
-            "digits.",
-        ),
-    ] = None,
+    gather: list[Path] | None = None,
+    dry_run: bool = False,
+    draw_seed: DrawSeedOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Simulate a split and write its files.
 
     An interrupted call goes on where it stopped.
+
+    Args:
+        split: Name of the split.
+        device: cpu, parallel (all CPU threads) or cuda.
+        gather: Take finished scenarios from another root folder; repeatable.
+        dry_run: Print the cost only: bytes, time, free disk.
     """
-    split = choose_split(split_argument, split_option)
     if size is None and not quiet:
         print_note(_describe_default_size(split, root))
     registry = None
+    folder: str | Path | None = root
     if draw_seed is not None:
         chosen = locate_new(split, size, root=root)
         size = chosen.size.name
         registry = drawn_registry(chosen.registry, split, size, draw_seed)
-        root = drawn_root(root, draw_seed)
+        folder = drawn_root(root, draw_seed)
     with progress_bar(quiet=quiet or dry_run) as progress:
         result = generate(
             split,
             size,
             subset=subset,
             scenarios=scenarios,
-            root=root,
+            root=folder,
             workers=workers,
             device=device,
             scheduler=scheduler,
             gather=gather or (),
-            force=force,
             dry_run=dry_run,
             progress=progress,
             on_wait=lambda holder: print_note(f"waiting for {holder}"),

@@ -5,9 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from lagbench.data.box import describe_bounds
 from lagbench.data.layout import (
@@ -22,7 +20,7 @@ from lagbench.data.registry import Registry, Size, Split, load
 from lagbench.errors import LagbenchError, escape_line, hide_credentials
 from lagbench.make.inventory import Overview, overview
 
-from .options import JsonFlag, RootOption, accept_split, choose_split, option
+from .options import JsonFlag, RootOption
 from .output import (
     format_bytes,
     format_seconds,
@@ -56,25 +54,16 @@ LEGEND = (
 
 
 def list_command(
-    split_argument: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="SPLIT",
-            help="One split, by its name or folder; all splits by default.",
-        ),
-    ] = None,
-    split_option: Annotated[
-        str | None, option("--split NAME", "The same as SPLIT.")
-    ] = None,
-    root: RootOption = None,
-    as_json: JsonFlag = False,
+    split: str | None = None, *, root: RootOption = None, as_json: JsonFlag = False
 ) -> None:
     """List all splits and sizes, their cost, and the data on this machine.
 
     For one split it also shows the scores of the reference predictors.
+
+    Args:
+        split: One split, by its name or folder; all splits by default.
     """
-    if split_argument is not None or split_option is not None:
-        split = choose_split(split_argument, split_option)
+    if split is not None:
         _list_split(split, root=root, as_json=as_json)
         return
     folder = resolve_root(root)
@@ -82,7 +71,7 @@ def list_command(
     if as_json:
         print_json({"root": folder, "sizes": overviews})
         return
-    print_table("", COLUMNS, map(_format_row, overviews), is_narrow=True)
+    print_table("", COLUMNS, map(_format_row, overviews))
     for line in LEGEND:
         print_line(line)
     for line in _describe_times(overviews):
@@ -108,7 +97,7 @@ def _list_split(split: str, *, root: str | Path | None, as_json: bool) -> None:
 
     _print_title(name, entry)
     rows = [_format_row(size_overview)[1:] for size_overview in overviews]
-    print_table("", COLUMNS[1:], rows, is_narrow=True)
+    print_table("", COLUMNS[1:], rows)
     for line in (*LEGEND, *_describe_times(overviews)):
         print_line(line)
     print_line("")
@@ -197,16 +186,19 @@ def _format_row(entry: Overview) -> tuple[object, ...]:
     )
 
 
-@accept_split
 def info_command(
     split: str,
-    size: Annotated[
-        str | None, option("--size NAME", "One size; all sizes by default.")
-    ] = None,
+    *,
+    size: str | None = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Show the parameters, sizes, cost and local data of a split."""
+    """Show the task, sizes, parameters and local data of a split.
+
+    Args:
+        split: Name of the split, or folder of a local one.
+        size: One size; all sizes by default.
+    """
     name, folder, registry = locate_split(split, root=root)
     entry = registry.split(name)
     all_sizes = [registry.size(name, size_name) for size_name in entry.sizes]
@@ -225,14 +217,15 @@ def info_command(
     description = textwrap.fill(entry.description, TEXT_WIDTH, break_on_hyphens=False)
     _print_title(name, entry)
     print_line(f"{description}\n")
+    for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
+        for line in _describe_size(shown_size, size_overview):
+            print_line(line)
+    print_line("")
     print_table("Sizes", COLUMNS, map(_format_row, overviews))
     for line in _describe_times(overviews):
         print_line(line)
     print_line("")
     _print_parameters(entry, all_sizes)
-    for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
-        for line in _describe_size(shown_size, size_overview):
-            print_line(line)
 
 
 def _split_as_json(entry: Split) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Annotated
 
-import typer
+from cyclopts import Parameter
+from cyclopts.types import PositiveInt
 
 from lagbench.atomic import check_output_file, write_atomically
 from lagbench.board.blind import BlindScore, score_blind
@@ -43,17 +44,13 @@ from lagbench.scoring.references import sizes_with_test_files
 from .options import (
     DEFAULT_BOARD,
     BoardOption,
+    DrawSeedOption,
     FoundBoardOption,
     JsonFlag,
     NewSizeOption,
     OverwriteFlag,
     QuietFlag,
     RootOption,
-    SplitArgument,
-    SplitOption,
-    accept_split,
-    choose_split,
-    option,
 )
 from .output import (
     format_bytes,
@@ -67,20 +64,33 @@ from .output import (
 from .solver_bench import try_bench
 from .stderr import print_on_stderr
 
-REMARK_WIDTH = 16  # characters to which remarks may shrink beside the other columns
+EveryFlag = Annotated[
+    bool, Parameter(name="--all", help="Take every entry that has a model.")
+]
+EntrySplitOption = Annotated[
+    str | None, Parameter(help="With --all: entries of this split only.")
+]
+EntrySizeOption = Annotated[
+    str | None, Parameter(help="With --all: entries of this size only.")
+]
+AgainFlag = Annotated[
+    bool, Parameter(help="Also run models that have a recorded result.")
+]
 
 
 def build_command(
+    *,
     board: BoardOption = DEFAULT_BOARD,
-    check: Annotated[
-        bool, option("--check", "Write nothing; fail if the page is out of date.")
-    ] = False,
+    check: bool = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Draw the leaderboard's page: one self-contained index.html.
 
     The same submissions give the same bytes.
+
+    Args:
+        check: Write nothing; fail if the page is out of date.
     """
     result = build(board, check=check)
     state = "up to date"
@@ -92,60 +102,34 @@ def build_command(
     print_result(result, [line], as_json=as_json, quiet=quiet)
 
 
-BaseOption = Annotated[
-    str | None,
-    option("--base REF", "Report changes to entries that this git commit has."),
-]
-OwnOption = Annotated[
-    list[str] | None,
-    option("--own METHOD", "With --base: an entry that is yours; repeatable."),
-]
-PageFlag = Annotated[
-    bool,
-    option(
-        "--page", "Also check that the files index.html and schema.json are up to date."
-    ),
-]
-RescoredOption = Annotated[
-    list[Path] | None,
-    option("--predictions FILE", "Score an entry's predictions again; repeatable."),
-]
-RecordFlag = Annotated[
-    bool,
-    option("--record", "With --predictions: add confirmed entries to verified.yaml."),
-]
-MeasuredRootOption = Annotated[
-    str | None,
-    option(
-        "--root FOLDER",
-        "Folder of all data sets. Without --predictions, the shipped scores of "
-        "reference predictors are measured again on these data.",
-    ),
-]
-MeasuredSplitOption = Annotated[
-    str | None, option("--split NAME", "With --root: measure on this split only.")
-]
-MeasuredSizeOption = Annotated[
-    str | None, option("--size NAME", "With --root: measure on this size only.")
-]
-
-
 def check_command(
+    *,
     board: FoundBoardOption = None,
-    base: BaseOption = None,
-    own: OwnOption = None,
-    page: PageFlag = False,
-    predictions: RescoredOption = None,
-    recording: RecordFlag = False,
-    root: MeasuredRootOption = None,
-    split: MeasuredSplitOption = None,
-    size: MeasuredSizeOption = None,
+    base: str | None = None,
+    own: list[str] | None = None,
+    page: bool = False,
+    predictions: list[Path] | None = None,
+    recording: Annotated[bool, Parameter(name="--record")] = False,
+    root: str | None = None,
+    split: str | None = None,
+    size: str | None = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
-) -> None:
+) -> int:
     """Check all entries, score files and aggregates of the leaderboard.
 
     Every pull request runs these checks.
+
+    Args:
+        base: Report changes to entries that this git commit has.
+        own: With --base: an entry that is yours; repeatable.
+        page: Also check that the files index.html and schema.json are up to date.
+        predictions: Score an entry's predictions again; repeatable.
+        recording: With --predictions: add confirmed entries to verified.yaml.
+        root: Folder of all data sets. Without --predictions, the shipped scores of
+            reference predictors are measured again on these data.
+        split: With --root: measure on this split only.
+        size: With --root: measure on this size only.
     """
     if (split or size) and not root:
         raise UsageError(
@@ -185,7 +169,7 @@ def check_command(
             print_on_stderr(str(issue))
     lines = _describe_check(result, recording=recording)
     print_result(result, lines, as_json=as_json, quiet=quiet)
-    raise typer.Exit(result.exit_code)
+    return result.exit_code
 
 
 def _sizes_to_measure(root: str, split: str | None, size: str | None) -> list[Size]:
@@ -243,18 +227,21 @@ def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
     yield f"{result.folder}: {entries}, {state}"
 
 
-@accept_split
 def picture_command(
     split: str,
+    *,
     size: NewSizeOption = None,
-    output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path(
-        "cost.svg"
-    ),
+    output: Annotated[Path, Parameter(alias="-o")] = Path("cost.svg"),
     overwrite: OverwriteFlag = False,
     board: FoundBoardOption = None,
     quiet: QuietFlag = False,
 ) -> None:
-    """Draw the accuracy of models against their cost as an SVG file."""
+    """Draw the accuracy of models against their cost as an SVG file.
+
+    Args:
+        split: Name of the split.
+        output: SVG file to write.
+    """
     tier = locate_new(split, size).size
     if output.suffix.lower() != ".svg":
         raise UsageError(
@@ -278,51 +265,26 @@ def picture_command(
 
 
 def reproduce_command(
-    entries: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="ENTRY", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
-        ),
-    ] = None,
-    every: Annotated[
-        bool, option("--all", "Reproduce every entry that has a model.")
-    ] = False,
-    split: Annotated[
-        str | None, option("--split NAME", "With --all: entries of this split only.")
-    ] = None,
-    size: Annotated[
-        str | None, option("--size NAME", "With --all: entries of this size only.")
-    ] = None,
-    scenarios: Annotated[
-        int | None,
-        option("--scenarios N", "Predict a sample of N scenarios; all by default."),
-    ] = None,
-    costs: Annotated[
-        bool, option("--costs", "Measure costs only, on a quiet machine.")
-    ] = False,
-    no_costs: Annotated[bool, option("--no-costs", "Measure no costs.")] = False,
-    again: Annotated[
-        bool, option("--again", "Also run models that have a recorded result.")
-    ] = False,
+    entries: list[str] | None = None,
+    /,
+    *,
+    every: EveryFlag = False,
+    split: EntrySplitOption = None,
+    size: EntrySizeOption = None,
+    scenarios: int | None = None,
+    costs: bool = False,
+    no_costs: bool = False,
+    again: AgainFlag = False,
     recording: Annotated[
-        bool, option("--record/--no-record", "Write the result to verified.yaml.")
+        bool, Parameter(name="--record", negative="--no-record")
     ] = True,
-    threads: Annotated[
-        int, option("--threads N", "Threads of a model on the CPU.", min=1)
-    ] = 1,
-    draw_seed: Annotated[
-        str | None,
-        option(
-            "--draw-seed HEX",
-            "Score the models on the new scenarios of `generate --draw-seed HEX`; "
-            "nothing is recorded.",
-        ),
-    ] = None,
+    threads: PositiveInt = 1,
+    draw_seed: DrawSeedOption = None,
     board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
-) -> None:
+) -> int:
     """Run the models of entries again, compare scores, measure costs.
 
     Exit code 0: all scores agree
@@ -331,6 +293,14 @@ def reproduce_command(
     3: a model cannot be read
     4: data are missing
     5: out of memory or disk
+
+    Args:
+        entries: SPLIT/SIZE/METHOD, as in cavity/mini/gns.
+        scenarios: Predict a sample of so many scenarios; all by default.
+        costs: Measure costs only, on a quiet machine.
+        no_costs: Measure no costs.
+        recording: Write the result to verified.yaml.
+        threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
         raise UsageError(
@@ -361,7 +331,7 @@ def reproduce_command(
                 progress=progress,
             )
         print_result(scores, _describe_blind(scores), as_json=as_json, quiet=quiet)
-        return
+        return 0
     folder = find_board(board)
     with progress_bar(quiet=quiet or as_json) as progress:
         if recording and not quiet:
@@ -386,7 +356,7 @@ def reproduce_command(
             print_on_stderr(f"{failure.entry}: {failure.error}")
     lines = _describe_reproduced(result, with_scores=not costs, with_costs=not no_costs)
     print_result(result.to_plain(), lines, as_json=as_json, quiet=quiet)
-    raise typer.Exit(result.exit_code)
+    return result.exit_code
 
 
 def _describe_blind(scores: Sequence[BlindScore]) -> Iterator[str]:
@@ -463,32 +433,19 @@ def _name_fix_of_difference(entry_path: PurePath, board: Path) -> str:
 
 
 def shift_command(
-    entries: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="ENTRY", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
-        ),
-    ] = None,
-    every: Annotated[
-        bool, option("--all", "Score every entry that has a model.")
-    ] = False,
-    split: Annotated[
-        str | None, option("--split NAME", "With --all: entries of this split only.")
-    ] = None,
-    size: Annotated[
-        str | None, option("--size NAME", "With --all: entries of this size only.")
-    ] = None,
-    again: Annotated[
-        bool, option("--again", "Also run models that have a recorded result.")
-    ] = False,
-    threads: Annotated[
-        int, option("--threads N", "Threads of a model on the CPU.", min=1)
-    ] = 1,
+    entries: list[str] | None = None,
+    /,
+    *,
+    every: EveryFlag = False,
+    split: EntrySplitOption = None,
+    size: EntrySizeOption = None,
+    again: AgainFlag = False,
+    threads: PositiveInt = 1,
     board: FoundBoardOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
-) -> None:
+) -> int:
     """Score models of entries on shift, scenarios unlike those of train.
 
     The models predict the subset, and the scores go to shift.yaml.
@@ -498,6 +455,10 @@ def shift_command(
     3: a model cannot be read
     4: data are missing
     5: out of memory or disk
+
+    Args:
+        entries: SPLIT/SIZE/METHOD, as in cavity/mini/gns.
+        threads: Threads of a model on the CPU.
     """
     if bool(entries) == every:
         raise UsageError(
@@ -527,7 +488,7 @@ def shift_command(
     print_result(
         result.to_plain(), _describe_shift(result), as_json=as_json, quiet=quiet
     )
-    raise typer.Exit(result.exit_code)
+    return result.exit_code
 
 
 def _describe_shift(result: ShiftResult) -> Iterator[str]:
@@ -548,28 +509,22 @@ def _describe_shift(result: ShiftResult) -> Iterator[str]:
 
 
 def show_command(
-    split_argument: SplitArgument = None,
-    split_option: SplitOption = None,
-    size: Annotated[
-        str | None, option("--size NAME", "tiny, mini or full; all by default.")
-    ] = None,
-    metric: Annotated[
-        list[str] | None, option("--metric NAME", "Metric to show; repeatable.")
-    ] = None,
-    wide: Annotated[
-        bool,
-        option(
-            "--wide",
-            "Show variants, deviations and the first metrics of each data set.",
-        ),
-    ] = False,
+    split: str | None = None,
+    *,
+    size: str | None = None,
+    metric: list[str] | None = None,
+    wide: bool = False,
     board: FoundBoardOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Print the tables of the leaderboard."""
-    split = None
-    if split_argument or split_option:
-        split = choose_split(split_argument, split_option)
+    """Print the tables of the leaderboard.
+
+    Args:
+        split: Name of the split; all by default.
+        size: tiny, mini or full; all by default.
+        metric: Metric to show; repeatable.
+        wide: Show variants, deviations and the first metrics of each data set.
+    """
     folder = find_board(board, reads=True)
     data_sets = Folder(folder).data_sets()
     chosen = choose_data_sets(data_sets, split, size, board=folder)
@@ -581,11 +536,7 @@ def show_command(
         print_json(to_plain(model))
         return
 
-    print_tables(
-        tables(model, metric or (), wide=wide),
-        is_narrow=True,
-        last_column=REMARK_WIDTH,
-    )
+    print_tables(tables(model, metric or (), wide=wide))
     if model.tabs:
         return
     if data_sets:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from cyclopts import Parameter
 
 from lagbench.data.box import describe_bounds
 from lagbench.data.layout import parse_ids
@@ -17,109 +17,73 @@ from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
-from .options import JsonFlag, QuietFlag, option
+from .options import JsonFlag, OutputOption, QuietFlag
 from .output import print_result, print_warning, progress_bar
 
-OutputOption = Annotated[
-    Path,
-    option("--output -o FOLDER", "New folder; its last part is the split's name."),
-]
-AdoptedOutputOption = Annotated[
-    Path | None,
-    option("--output -o FOLDER", "New folder; its last part is the split's name."),
-]
 DescribeOption = Annotated[
     Path | None,
-    option(
-        "--describe FILE",
-        "YAML file that describes the data (docs/exchange.md); options replace its "
-        "values.",
+    Parameter(
+        help="YAML file that describes the data (docs/exchange.md); options replace "
+        "its values."
     ),
 ]
 RadiusOption = Annotated[
     float | None,
-    option(
-        "--radius LENGTH",
-        "Connectivity radius of graph models; at most half a period of the box.",
+    Parameter(
+        help="Connectivity radius of graph models; at most half a period of the box."
     ),
 ]
-IntervalOption = Annotated[
-    float | None, option("--frame-interval SECONDS", "Time between two frames.")
-]
+IntervalOption = Annotated[float | None, Parameter(help="Time between two frames.")]
 BoundsOption = Annotated[
     str | None,
-    option(
-        "--bounds X0,X1,Y0,Y1[,Z0,Z1]",
-        "Lowest and highest position of the box along each axis.",
+    Parameter(
+        help="Lowest and highest position of the box along each axis, as in 0,2,0,1."
     ),
 ]
 PeriodicOption = Annotated[
     str | None,
-    option(
-        "--periodic AXES", "Axes along which the box is periodic, as in x,y; or none."
-    ),
+    Parameter(help="Axes along which the box is periodic, as in x,y; or none."),
 ]
 RescaleFlag = Annotated[
-    bool,
-    option("--rescale", "Scale positions so that they fit the unit box."),
+    bool, Parameter(help="Scale positions so that they fit the unit box.")
 ]
 InputFramesOption = Annotated[
-    int | None,
-    option("--input-frames N", "Frames that a model is given; 6 by default."),
+    int | None, Parameter(help="Frames that a model is given; 6 by default.")
 ]
 HorizonOption = Annotated[
     int | None,
-    option("--horizon N", "Frames to predict; by default all after the given ones."),
+    Parameter(help="Frames to predict; by default all after the given ones."),
 ]
 InterestOption = Annotated[
     str | None,
-    option(
-        "--frames-of-interest FRAMES",
-        "Frames whose scores are shown, as in 15,25; by default the last one.",
+    Parameter(
+        help="Frames whose scores are shown, as in 15,25; by default the last one."
     ),
 ]
 CellsOption = Annotated[
     int | None,
-    option(
-        "--cells N",
-        "Cells of the score grid across a length of 1: 4 to 4096, in a unit cube to "
-        "270.",
+    Parameter(
+        help="Cells of the score grid across a length of 1: 4 to 4096, in a unit cube "
+        "to 270."
     ),
 ]
 FullBoxFlag = Annotated[
     bool | None,
-    option(
-        "--full-box/--free-surface",
-        "Whether material fills the box. Then the error of the vorticity ranks, else "
-        "the distance of particle clouds.",
+    Parameter(
+        negative="--free-surface",
+        help="Whether material fills the box. Then the error of the vorticity ranks, "
+        "else the distance of particle clouds.",
     ),
 ]
 
 
 def import_command(
-    ctx: typer.Context,
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER", help="Folder of train, valid, test and metadata."
-        ),
-    ],
-    output: OutputOption,
-    file_format: Annotated[
-        str | None,
-        option(
-            "--format NAME",
-            "gns-npz or lagrangebench-h5; by default the one whose files the folder "
-            "holds.",
-        ),
-    ] = None,
-    kinds: Annotated[
-        str | None,
-        option(
-            "--kinds LIST",
-            "Material of each particle kind, as in 3=jelly; 0=drop leaves out kind 0.",
-        ),
-    ] = None,
+    source: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(alias="-o")],
+    file_format: Annotated[str | None, Parameter(name="--format")] = None,
+    kinds: str | None = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
@@ -136,10 +100,16 @@ def import_command(
 ) -> None:
     """Make a local split from the data of another code base.
 
-    For files in neither format there is `lagbench adopt`.
-
     You train and score models on a local split as on any other split.
+
+    Args:
+        source: Folder of train, valid, test and metadata.
+        output: New folder; its last part is the split's name.
+        file_format: gns-npz or lagrangebench-h5; by default the one whose files the
+            folder holds.
+        kinds: Material of each particle kind, as in 3=jelly; 0=drop leaves out kind 0.
     """
+    options = _data_options(locals())
     with progress_bar(quiet=quiet) as progress:
         local_split = import_split(
             source,
@@ -147,38 +117,21 @@ def import_command(
             output=output,
             kinds=parse_kinds(kinds),
             progress=progress,
-            **_data_options(ctx.params),
+            **options,
         )
     _print_local_split(local_split, as_json=as_json, quiet=quiet)
 
 
 def adopt_command(
-    ctx: typer.Context,
-    sources: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE", help=".npy, .npz or .nc files, or a folder of them."
-        ),
-    ],
-    output: AdoptedOutputOption = None,
+    sources: list[Path],
+    /,
+    *,
+    output: OutputOption = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
-    valid: Annotated[
-        int | None,
-        option(
-            "--valid N",
-            "Number of trajectories for valid; by default a tenth, and at least one.",
-        ),
-    ] = None,
-    test: Annotated[
-        int | None,
-        option(
-            "--test N",
-            "Number of trajectories for test; by default a tenth, and at least six; of "
-            "fewer than 18 trajectories a third, and at least one.",
-        ),
-    ] = None,
+    valid: int | None = None,
+    test: int | None = None,
     bounds: BoundsOption = None,
     periodic: PeriodicOption = None,
     rescale: RescaleFlag = False,
@@ -193,7 +146,15 @@ def adopt_command(
     """Make a local split from your own trajectories.
 
     The trajectories are NumPy arrays or netCDF files.
+
+    Args:
+        sources: .npy, .npz or .nc files, or a folder of them.
+        output: New folder; its last part is the split's name.
+        valid: Number of trajectories for valid; by default a tenth, and at least one.
+        test: Number of trajectories for test; by default a tenth, and at least six; of
+            fewer than 18 trajectories a third, and at least one.
     """
+    options = _data_options(locals())
     with progress_bar(quiet=quiet) as progress:
         local_split = adopt(
             sources,
@@ -201,7 +162,7 @@ def adopt_command(
             valid=valid,
             test=test,
             progress=progress,
-            **_data_options(ctx.params),
+            **options,
         )
     _print_local_split(local_split, as_json=as_json, quiet=quiet)
 

@@ -1,28 +1,15 @@
-"""Options of the commands train and predict, and the libraries that they need."""
+"""The libraries and the next commands of train and predict."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
 
 from lagbench.data.layout import quote_root
 from lagbench.data.local import locate_split
 from lagbench.data.registry import NO_GENERATOR
 from lagbench.errors import WorkFailedError, check_installed
 from lagbench.work.machine import address_space_limit
-
-from .options import option
-
-DeviceOption = Annotated[str, option("--device NAME", "cpu, cuda, or auto.")]
-ThreadsOption = Annotated[
-    int | None,
-    option(
-        "--threads N",
-        "CPU threads; by default OMP_NUM_THREADS, or else a share of the cores.",
-        min=1,
-    ),
-]
 
 PREDICTION_LIBRARIES = ("torch", "torch_geometric")
 TRAINING_LIBRARIES = (*PREDICTION_LIBRARIES, "lightning_fabric")

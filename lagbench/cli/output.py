@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 
     from lagbench.submission.issues import ValidationResult
 
-WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
 PIPE_WIDTH = 120  # width of the output where it is no terminal [characters]
-GAP = 3  # characters between two columns
-NARROW_GAP = 2  # in narrow tables
-LAST_COLUMN = 24  # characters to which the last column, which wraps, may shrink
 
 SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
 
@@ -74,7 +70,7 @@ def format_seconds(seconds: float) -> str:
 def print_line(text: str, *, quiet: bool = False) -> None:
     """Print a line on stdout unless the user asked for silence."""
     if not quiet:
-        typer.echo(escape_unprintable(text))
+        print(escape_unprintable(text))
 
 
 def print_warning(text: str) -> None:
@@ -89,9 +85,24 @@ def print_note(text: str) -> None:
 
 def print_json(value: object) -> None:
     """Print a value, a dataclass too, as one JSON object on stdout."""
-    plain_value = _to_plain(value)
-    text = json.dumps(plain_value, indent=2, sort_keys=True, allow_nan=False)
-    typer.echo(text)
+    print(
+        json.dumps(value, indent=2, sort_keys=True, allow_nan=False, default=_to_plain)
+    )
+
+
+def _to_plain(value: Any) -> object:  # noqa: ANN401
+    """Return a value in types that JSON has; what is in it may still need this."""
+    if dataclasses.is_dataclass(value):
+        fields = dataclasses.fields(value)
+        return {field.name: getattr(value, field.name) for field in fields}
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, (set, frozenset)):
+        return list(value)
+    message = f"no JSON for {type(value).__name__}"
+    raise TypeError(message)
 
 
 def print_result(
@@ -105,7 +116,7 @@ def print_result(
         print_json(value)
     elif not quiet:
         for line in lines:
-            typer.echo(escape_unprintable(line))
+            print_line(line)
 
 
 def print_errors(result: ValidationResult) -> None:
@@ -119,96 +130,26 @@ def print_errors(result: ValidationResult) -> None:
         print_on_stderr("\n".join(lines))
 
 
-def split_table(
-    table: Table,
-    width: int = WIDTH,
-    *,
-    gap: int = GAP,
-    last_column: int = LAST_COLUMN,
-) -> Iterator[Table]:
-    """Yield a table in blocks that are no wider than a width.
-
-    Columns have so many spaces between them as ``gap`` says. The last column may shrink
-    to ``last_column`` characters.
-
-    Each block begins with the key columns, which say what a row is. The first block has
-    the title.
-    """
-    columns = list(zip(table.columns, *table.rows, strict=True))
-    column_widths = [_column_width(column) for column in columns]
-    column_widths[-1] = min(column_widths[-1], last_column)
-    key_width = sum(column_widths[: table.keys]) + gap * table.keys
-
-    # numbers of the columns of each block, without the key columns
-    column_groups: list[list[int]] = [[]]
-    block_width = key_width
-    for number in range(table.keys, len(columns)):
-        column_width = column_widths[number]
-        if column_groups[-1] and block_width + column_width > width:
-            column_groups.append([])
-            block_width = key_width
-        column_groups[-1].append(number)
-        block_width += column_width + gap
-
-    title = table.title
-    for column_group in column_groups:
-        block_columns = columns[: table.keys]
-        block_columns += [columns[number] for number in column_group]
-        headings, *rows = zip(*block_columns, strict=True)
-        yield Table(title, headings, tuple(rows), table.keys)
-        title = ""
-
-
-def _column_width(cells: Iterable[str]) -> int:
-    """Return the length of the longest line of a column, its heading included."""
-    lines: list[str] = []
-    for cell in cells:
-        lines += cell.split("\n")
-    return max(len(line) for line in lines)
-
-
-def print_tables(
-    tables: Iterable[Table], *, is_narrow: bool = False, last_column: int = LAST_COLUMN
-) -> None:
-    """Print tables, each in blocks that fit."""
-    gap = NARROW_GAP if is_narrow else GAP
+def print_tables(tables: Iterable[Table]) -> None:
+    """Print tables, one below the other."""
     for table in tables:
-        for block in split_table(table, gap=gap, last_column=last_column):
-            print_table(
-                block.title,
-                block.columns,
-                block.rows,
-                is_narrow=is_narrow,
-                last_column=last_column,
-            )
+        print_table(table.title, table.columns, table.rows)
 
 
 def print_table(
-    title: str,
-    columns: Sequence[str],
-    rows: Iterable[Sequence[object]],
-    *,
-    is_narrow: bool = False,
-    last_column: int = LAST_COLUMN,
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> None:
-    """Print a table on stdout.
+    """Print a table on stdout; columns of numbers are set flush right.
 
-    Only the last column wraps: it takes the width that is left, but ``last_column``
-    characters at least. Columns of numbers are set flush right. A narrow table
-    has two spaces between columns instead of three.
+    Only the last column wraps. On a narrow terminal lines run on to the next: a number
+    cut short would be worse.
     """
-    cells = []
-    for row in rows:
-        cells.append([escape_unprintable(str(cell)) for cell in row])
+    cells = [[escape_unprintable(str(cell)) for cell in row] for row in rows]
     table = DrawnTable(
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0) if is_narrow else (0, 1),
-        pad_edge=False,
-        show_edge=False,
+        box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False
     )
     last = len(columns) - 1
     for number, heading in enumerate(columns):
-        # also where all cells are empty, or where there are no rows
         is_numeric = all(row[number][:1] in "0123456789-" for row in cells)
         table.add_column(
             Text(heading),
@@ -218,57 +159,17 @@ def print_table(
     for texts in cells:
         table.add_row(*map(Text, texts))
 
-    # On a narrow terminal long lines run on to the next: a number cut short would be
-    # worse.
-    gap = NARROW_GAP if is_narrow else GAP
-    least_width = _least_width(columns, cells, gap=gap, last_column=last_column)
-    width = max(_output_width(), least_width)
-    console = Console(width=width)
+    console = Console(soft_wrap=True)
+    width = console.width
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        width = PIPE_WIDTH  # equal files everywhere
+    options = console.options.update(max_width=10_000)
+    least_width = Measurement.get(console, options, table).minimum
+    console.width = max(width, least_width)
     if title:
         # beside the table, not in it: a table wraps its title to its own width
         console.print(Text(escape_unprintable(title), style="table.title"))
     console.print(table, "")  # and an empty line
-
-
-def _output_width() -> int:
-    """Return the width of the terminal, or that of the variable COLUMNS.
-
-    Where there is neither, a fixed one gives equal files everywhere.
-    """
-    console = Console()
-    if console.is_terminal or os.environ.get("COLUMNS", "").isdecimal():
-        return console.width
-    return PIPE_WIDTH
-
-
-def _least_width(
-    columns: Sequence[str],
-    cells: Sequence[Sequence[str]],
-    *,
-    gap: int,
-    last_column: int,
-) -> int:
-    widths = []
-    for column in zip(columns, *cells, strict=True):
-        widths.append(max(map(len, column)))
-    widths[-1] = min(widths[-1], last_column)
-    return sum(widths) + gap * len(widths)
-
-
-def _to_plain(value: object) -> object:
-    """Return a value in the types that JSON has."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {}
-        for field in dataclasses.fields(value):
-            fields[field.name] = _to_plain(getattr(value, field.name))
-        return fields
-    if isinstance(value, Mapping):
-        return {str(key): _to_plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_to_plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    return value
 
 
 # --- progress: a bar where a person watches, else a line now and then -----------------

@@ -7,26 +7,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from cyclopts import Parameter
+from cyclopts.types import NonNegativeInt, PositiveInt
 
 from lagbench.data.layout import quote_root
 from lagbench.data.registry import load
 from lagbench.errors import UsageError, check_regular, format_count
 from lagbench.work.machine import available_cores
 
-from .model_options import (
-    PREDICTION_LIBRARIES,
-    DeviceOption,
-    ThreadsOption,
-    require_libraries,
-)
+from .model_options import PREDICTION_LIBRARIES, require_libraries
 from .options import (
+    DeviceOption,
     JsonFlag,
     OverwriteFlag,
     QuietFlag,
     RootOption,
     ScoredSubsetOption,
-    option,
+    ThreadsOption,
 )
 from .output import print_result, progress_bar
 from .solver_bench import SolverBench, try_bench
@@ -37,79 +34,43 @@ if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.models.predict_onnx import OnnxPredictionResult
 
-WeightsArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="FILE",
-        help="A trained model: safetensors or ONNX.",
-    ),
-]
-PredictionsOption = Annotated[Path, option("--output -o FILE", "File to write.")]
-PredictedSplitOption = Annotated[
-    str | None,
-    option(
-        "--split NAME",
-        "Split to predict: the folder of a local split; or a name, for an ONNX file "
-        "that does not state its split.",
-    ),
-]
-PredictedSizeOption = Annotated[
-    str | None,
-    option("--size NAME", "Size to predict; by default that of the training."),
-]
-ModelChangesOption = Annotated[
-    list[str] | None,
-    option(
-        "--set KEY=VALUE",
-        "Change the model, as in model.average=true; repeatable.",
-    ),
-]
-BatchOption = Annotated[
-    int | None,
-    option(
-        "--batch N",
-        "Scenarios to predict together; by default 1 on a CPU, all on a GPU.",
-        min=1,
-    ),
-]
-MethodOption = Annotated[
-    str | None, option("--method NAME", "Name of the method on a leaderboard.")
-]
-TrainingSeedOption = Annotated[
-    int | None,
-    option(
-        "--seed N",
-        "Seed of the training of an ONNX file, which does not state it; 0 by default.",
-        min=0,
-        max=LARGEST_SEED,
-    ),
-]
-BenchFlag = Annotated[
-    bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
-]
-
 
 def predict_command(
-    checkpoint: WeightsArgument,
-    output: PredictionsOption = Path("predictions.nc"),
+    checkpoint: Path,
+    /,
+    *,
+    output: Annotated[Path, Parameter(alias="-o")] = Path("predictions.nc"),
     overwrite: OverwriteFlag = False,
-    split: PredictedSplitOption = None,
-    size: PredictedSizeOption = None,
+    split: str | None = None,
+    size: str | None = None,
     subset: ScoredSubsetOption = "test",
-    settings: ModelChangesOption = None,
+    settings: Annotated[list[str] | None, Parameter(name="--set")] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
-    batch: BatchOption = None,
-    method: MethodOption = None,
-    seed: TrainingSeedOption = None,
-    bench: BenchFlag = True,
+    batch: PositiveInt | None = None,
+    method: str | None = None,
+    seed: NonNegativeInt | None = None,
+    bench: Annotated[bool, Parameter(negative="--no-bench")] = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Predict the test scenarios with a trained model.
 
     The predictions go into a predictions.nc.
+
+    Args:
+        checkpoint: A trained model: safetensors or ONNX.
+        output: File to write.
+        split: Split to predict: the folder of a local split; or a name, for an ONNX
+            file that does not state its split.
+        size: Size to predict; by default that of the training.
+        settings: Change the model, as in model.average=true; repeatable.
+        batch: Scenarios to predict together; by default 1 on a CPU, all on a GPU.
+        method: Name of the method on a leaderboard.
+        seed: Seed of the training of an ONNX file, which does not state it; 0 by
+            default.
+        bench: Time our solver too, for the speed-up.
     """
     solver_clock = _SolverClock(quiet=quiet)
     time_solver = solver_clock if bench else None

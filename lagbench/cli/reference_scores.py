@@ -51,4 +51,4 @@ def print_references(
     columns = ("reference", "kind", *size_names)
     metric = ranking_metric(sizes[0])
     print_line(f"{metric} of the reference predictors: lower is better")
-    print_table("", columns, rows, is_narrow=True)
+    print_table("", columns, rows)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from cyclopts import Parameter
 
 from lagbench.data.local import locate_split
 from lagbench.errors import UsageError
@@ -23,52 +23,29 @@ from lagbench.submission.issues import ValidationResult
 from lagbench.submission.validation import validate
 
 from .options import (
+    ExpectedSplitOption,
     JsonFlag,
+    OutputOption,
     QuietFlag,
     RootOption,
     SchedulerOption,
     WorkersOption,
-    option,
 )
 from .output import print_errors, print_json, print_line, print_tables, progress_bar
-from .validate import ExpectedSplitOption
 
 
 def score_command(
-    predictions: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILE", help="A predictions.nc; several with --report."),
-    ],
+    predictions: list[Path],
+    /,
+    *,
     split: ExpectedSplitOption = None,
     root: RootOption = None,
-    output: Annotated[
-        Path | None,
-        option(
-            "--output -o FOLDER",
-            "Folder of the scores; by default gns/ beside gns.nc. With several files, "
-            "each gets a folder in it, named after the file.",
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        option("--report FOLDER", "Write index.html with all figures there."),
-    ] = None,
+    output: OutputOption = None,
+    report: Path | None = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    extras: Annotated[
-        str,
-        option(
-            "--extras NAMES",
-            "Also compute the metrics of these extras, as in transport.",
-        ),
-    ] = "",
-    every: Annotated[
-        bool, option("--all", "Show every metric, frame of interest and scenario.")
-    ] = False,
-    all_references: Annotated[
-        bool,
-        option("--all-references", "Show all reference predictors, not only the best."),
-    ] = False,
+    extras: str = "",
+    every: Annotated[bool, Parameter(name="--all")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -76,6 +53,14 @@ def score_command(
 
     It shows the skill and the first metrics beside those of the best reference
     predictor.
+
+    Args:
+        predictions: A predictions.nc; several with --report.
+        output: Folder of the scores; by default gns/ beside gns.nc. With several files,
+            each gets a folder in it, named after the file.
+        report: Write index.html with all figures there.
+        extras: Also compute the metrics of these extras, as in transport.
+        every: Show every metric, frame of interest, scenario and reference predictor.
     """
     extra_names = tuple(name for name in extras.split(",") if name)
     check_extras(extra_names)
@@ -115,7 +100,7 @@ def score_command(
         if as_json:
             _print_cards_as_json(cards)
         elif not quiet:
-            _print_cards(cards, every=every, all_references=all_references)
+            _print_cards(cards, every=every)
     if page is not None:
         print_line(f"report: {page}", quiet=quiet or as_json)
 
@@ -145,12 +130,10 @@ def _print_cards_as_json(cards: Sequence[ScoreCard]) -> None:
         print_json([card.as_json() for card in cards])
 
 
-def _print_cards(
-    cards: Sequence[ScoreCard], *, every: bool, all_references: bool
-) -> None:
+def _print_cards(cards: Sequence[ScoreCard], *, every: bool) -> None:
     for card in cards:
-        if every or all_references:
-            print_tables(card_tables(card, every=every, all_references=all_references))
+        if every:
+            print_tables(card_tables(card, every=True, all_references=True))
             lines = flag_lines(card, every=every)
         else:
             print_tables([brief_table(card)])
@@ -158,9 +141,7 @@ def _print_cards(
         for line in lines:
             print_line(line)
         print_line(f"written: {', '.join(map(str, card.files))}")
-    if all_references and not every:
-        print_line("more: --all shows every metric")
-    elif not every:
+    if not every:
         print_line("more: --all shows every metric, frame of interest and scenario")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from cyclopts import Parameter
 
 from lagbench.board.entry_file import read_meta
 from lagbench.board.folder import SHIFT, VERIFIED
@@ -21,51 +21,22 @@ from .options import (
     QuietFlag,
     RootOption,
     WorkersOption,
-    option,
 )
 from .output import print_errors, print_result, print_warning, progress_bar
 
 
 def submit_command(
-    predictions: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILE", help="A predictions.nc for each seed."),
-    ],
-    source: Annotated[
-        Path | None,
-        option(
-            "--from FILE",
-            "YAML file that describes the method, see docs/submitting.md; other "
-            "options override it.",
-        ),
-    ] = None,
-    method: Annotated[
-        str | None, option("--method ID", "Name of the entry, as in my-model.")
-    ] = None,
-    authors: Annotated[
-        list[str] | None, option("--author NAME", "Author; repeatable.")
-    ] = None,
-    command: Annotated[
-        str | None, option("--command TEXT", "Command that makes the predictions.")
-    ] = None,
-    weights: Annotated[
-        list[Path] | None,
-        option(
-            "--weights FILE",
-            "safetensors or ONNX files to keep beside the entry; at most one "
-            "for each seed.",
-        ),
-    ] = None,
-    replace: Annotated[
-        bool, option("--replace", "Replace the entry of that name.")
-    ] = False,
-    add: Annotated[
-        bool,
-        option("--add", "Add seeds to the entry of that name; keep its other seeds."),
-    ] = False,
-    new_board: Annotated[
-        bool, option("--new-board", "Begin a leaderboard in the folder of --board.")
-    ] = False,
+    predictions: list[Path],
+    /,
+    *,
+    source: Annotated[Path | None, Parameter(name="--from")] = None,
+    method: str | None = None,
+    authors: Annotated[list[str] | None, Parameter(name="--author")] = None,
+    command: str | None = None,
+    weights: list[Path] | None = None,
+    replace: bool = False,
+    add: bool = False,
+    new_board: bool = False,
     board: BoardOption = DEFAULT_BOARD,
     root: RootOption = None,
     workers: WorkersOption = None,
@@ -75,6 +46,18 @@ def submit_command(
     """Score predictions and add them to a leaderboard as an entry.
 
     The entry and its score files go into the leaderboard's folder.
+
+    Args:
+        predictions: A predictions.nc for each seed.
+        source: YAML file that describes the method, see docs/submitting.md; other
+            options override it.
+        method: Name of the entry, as in my-model.
+        authors: Author; repeatable.
+        command: Command that makes the predictions.
+        weights: Weights or ONNX to keep beside the entry; at most one for each seed.
+        replace: Replace the entry of that name.
+        add: Add seeds to the entry of that name; keep its other seeds.
+        new_board: Begin a leaderboard in the folder of --board.
     """
     description = {
         "method": method,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from cyclopts import Parameter
+
 from lagbench.errors import format_count
 from lagbench.submission.writer import template
 
@@ -15,26 +17,27 @@ from .options import (
     QuietFlag,
     RootOption,
     ScoredSubsetOption,
-    accept_split,
-    option,
 )
 from .output import format_bytes, print_result
 
 
-@accept_split
 def template_command(
     split: str,
+    *,
     size: PresentSizeOption = None,
     subset: ScoredSubsetOption = "test",
-    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
-        "predictions.nc"
-    ),
+    output: Annotated[Path, Parameter(alias="-o")] = Path("predictions.nc"),
     overwrite: OverwriteFlag = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Write a valid predictions.nc for you to fill in; in it nothing moves."""
+    """Write a valid predictions.nc for you to fill in; in it nothing moves.
+
+    Args:
+        split: Name of the split, or folder of a local one.
+        output: File to write.
+    """
     result = template(
         split, size, subset=subset, output=output, overwrite=overwrite, root=root
     )

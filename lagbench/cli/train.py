@@ -5,118 +5,76 @@ from __future__ import annotations
 import os
 import shlex
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from cyclopts import Parameter
+from cyclopts.types import NonNegativeInt, PositiveInt
 
 from lagbench.data.local import locate
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, UsageError, format_count
+from lagbench.errors import LagbenchError, format_count
 from lagbench.scoring.scorability import check_scorability
 from lagbench.submission.budget import EQUAL_MINUTES
 
 from .model_options import (
     TRAINING_LIBRARIES,
-    DeviceOption,
-    ThreadsOption,
     data_option,
     require_libraries,
 )
 from .options import (
+    DeviceOption,
     JsonFlag,
+    OutputOption,
     PresentSizeOption,
     QuietFlag,
     RootOption,
-    accept_split,
-    option,
+    ThreadsOption,
 )
 from .output import format_seconds, print_result, print_warning, progress_bar
-from .typed_settings import advise_on_baselines
 
 if TYPE_CHECKING:
     from lagbench.baselines.train import TrainingResult
 
 SECONDS_PER_LINE = 10.0  # time between two lines of progress that go to a file [s]
 
-BaselineOption = Annotated[
-    str | None,
-    option("--baseline NAME", "Reference model, as in gns; see docs/baselines.md."),
-]
-RecipeOption = Annotated[
-    str | None,
-    option("--recipe NAME", "Variant of the recipe, as in short; or a YAML file."),
-]
-RecipeChangesOption = Annotated[
-    list[str] | None,
-    option(
-        "--set KEY=VALUE",
-        "Change the recipe, as in training.steps=100; repeatable.",
-    ),
-]
-SeedOption = Annotated[
-    int | None, option("--seed N", "Seed of all random numbers.", min=0)
-]
-StartOption = Annotated[
-    Path | None,
-    option(
-        "--start FILE",
-        "weights.safetensors to start from; they may be of another size.",
-    ),
-]
-RunFolderOption = Annotated[
-    Path | None,
-    option(
-        "--output -o FOLDER",
-        "Folder of the run; by default in runs/, named after recipe, baseline and "
-        "seed.",
-    ),
-]
-FreshFlag = Annotated[
-    bool, option("--fresh", "Start anew and replace an earlier training.")
-]
-ProcessesOption = Annotated[
-    int,
-    option(
-        "--processes N", "Processes of the training, each with its own device.", min=1
-    ),
-]
 
-
-@accept_split
 def train_command(
     split: str,
-    baseline: BaselineOption = None,
+    *,
+    baseline: str,
     size: PresentSizeOption = None,
-    recipe: RecipeOption = None,
-    settings: RecipeChangesOption = None,
-    seed: SeedOption = None,
-    start: StartOption = None,
+    recipe: str | None = None,
+    settings: Annotated[list[str] | None, Parameter(name="--set")] = None,
+    seed: NonNegativeInt | None = None,
+    start: Path | None = None,
     root: RootOption = None,
-    output: RunFolderOption = None,
-    fresh: FreshFlag = False,
+    output: OutputOption = None,
+    fresh: bool = False,
     device: DeviceOption = "auto",
-    processes: ProcessesOption = 1,
+    processes: PositiveInt = 1,
     threads: ThreadsOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Train a reference model.
 
-    An interrupted call goes on where it stopped.
-    Only a fit (VAR, hybrids) begins anew.
+    An interrupted call goes on where it stopped. Only a fit (VAR, hybrids) begins anew.
+
+    Args:
+        split: Name of the split, or folder of a local one.
+        baseline: Reference model, as in gns; see docs/baselines.md.
+        recipe: Variant of the recipe, as in short; or a YAML file.
+        settings: Change the recipe, as in training.steps=100; repeatable.
+        seed: Seed of all random numbers.
+        start: Weights to start from; they may be of another size.
+        output: Folder of the run; by default in runs/, named after recipe, baseline and
+            seed.
+        fresh: Start anew and replace an earlier training.
+        processes: Processes of the training, each with its own device.
     """
-    if baseline is None:
-        raise UsageError(
-            "no model is named",
-            where="--baseline",
-            expected="the name of a reference model; docs/baselines.md lists them",
-            got="nothing",
-            fix=advise_on_baselines(sys.argv) or "name one, as in --baseline gns",
-        )
     require_libraries(TRAINING_LIBRARIES)
     # Torch takes seconds to load, so the data are looked for before. Of several
     # processes only the first does it, for an error to be printed once.
@@ -198,14 +156,14 @@ def _errors_of_one_process(*, is_helper: bool) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if is_helper:
-            raise typer.Exit(128 + signal.SIGINT) from None
+            raise SystemExit(128 + signal.SIGINT) from None
         raise
     except LagbenchError as error:
         is_first_of_machine = os.environ.get("LOCAL_RANK", "0") == "0"
         # An error with a cause, as where memory is full, befell this process only.
         if is_first_of_machine or error.__cause__ is not None:
             raise
-        raise typer.Exit(error.exit_code) from error
+        raise SystemExit(error.exit_code) from error
 
 
 def _has_mini(split: str) -> bool:

@@ -1,36 +1,29 @@
-"""The command validate, and the option that says which split predictions are for."""
+"""The command validate."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from lagbench.submission.validation import validate
 
-from .options import JsonFlag, QuietFlag, RootOption, option
+from .options import ExpectedSplitOption, JsonFlag, QuietFlag, RootOption
 from .output import print_result
-
-ExpectedSplitOption = Annotated[
-    str | None,
-    option(
-        "--split NAME",
-        "Refuse predictions for another split; a local split is named by its folder.",
-    ),
-]
 
 
 def validate_command(
-    predictions: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A predictions.nc.")
-    ],
+    predictions: Path,
+    /,
+    *,
     split: ExpectedSplitOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
-) -> None:
-    """Check a predictions.nc; print every error and how to fix it."""
+) -> int:
+    """Check a predictions.nc; print every error and how to fix it.
+
+    Args:
+        predictions: A predictions.nc.
+    """
     result = validate(predictions, split=split, root=root)
     print_result(result, [str(result)], as_json=as_json, quiet=quiet)
-    raise typer.Exit(result.exit_code)
+    return result.exit_code

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from cyclopts.types import NonNegativeInt
 
 from lagbench.make.inventory import recording_hint
 from lagbench.make.verify import VerificationResult, verify
@@ -15,35 +15,30 @@ from .options import (
     ScenariosOption,
     SubsetOption,
     WorkersOption,
-    accept_split,
-    option,
 )
 from .output import print_json, print_line, print_table, print_warning, progress_bar
 
 
-@accept_split
 def verify_command(
     split: str,
+    *,
     size: PresentSizeOption = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
-    regenerate: Annotated[
-        int,
-        option(
-            "--regenerate K",
-            "Simulate K scenarios again and compare them with the files.",
-            min=0,
-        ),
-    ] = 0,
-    complete: Annotated[
-        bool, option("--complete", "Fail if a scenario is missing.")
-    ] = False,
+    regenerate: NonNegativeInt = 0,
+    complete: bool = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Hash the files of a split and compare them with the recorded hashes."""
+    """Hash the files of a split and compare them with the recorded hashes.
+
+    Args:
+        split: Name of the split, or folder of a local one.
+        regenerate: Simulate so many scenarios again and compare them with the files.
+        complete: Fail if a scenario is missing.
+    """
     with progress_bar(quiet=quiet) as progress:
         result = verify(
             split,

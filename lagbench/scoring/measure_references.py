@@ -9,7 +9,7 @@ another subset, which then must be there. With --predictor
 only these references are measured anew, from the start; the others, and all costs, stay
 as they are. Without it each measured scenario is saved under the root folder: an
 interrupted run continues where it stopped. Last a frame of each reference and of the
-solver itself (``lagbench bench solver``) is timed on one core; with --costs nothing
+solver itself (``lagbench bench``) is timed on one core; with --costs nothing
 else is done. Shipped scores are checked by ``lagbench leaderboard check --root
 FOLDER``.
 """

@@ -223,7 +223,7 @@ def compare_with_solvers(
         return None, (
             f"the predictions do not state {' and '.join(missing)}; `lagbench "
             "predict` without --no-bench states both; for another model `lagbench "
-            "bench solver` times our solver on its machine"
+            "bench` times our solver on its machine"
         )
     ratio = compute_against_classical(
         [submission], solvers, seconds=costs, seconds_per_frame=seconds

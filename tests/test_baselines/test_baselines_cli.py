@@ -18,10 +18,9 @@ from unittest.mock import Mock
 import netCDF4
 import pytest
 import torch
-from click.testing import Result
+from command_line import CliRunner, Result
 from hostile_onnx import straight_on
 from turns import of_this_turn
-from typer.testing import CliRunner
 
 from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 import yaml
+from command_line import Result
 from conftest import SIZE, SPLIT
-from typer.testing import Result
 
 from lagbench.board.entry import Entry, EntryBudget, Meta
 from lagbench.board.issues import CHECKS

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import yaml
+from command_line import CliRunner
 from sample_boards import make_board
-from typer.testing import CliRunner
 
 from lagbench.board.build import Scope, collect
 from lagbench.board.cost import CostPoint, draw, find_front, points_of

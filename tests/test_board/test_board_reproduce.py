@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import CliRunner, Result
 from model_board import NAME, PATH, ModelBoard
 from numpy.typing import NDArray
-from typer.testing import CliRunner, Result
 
 from lagbench.board.check import CheckResult
 from lagbench.board.entry import Entry, Level, Verification

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 import yaml
+from command_line import Result
 from hostile_onnx import straight_on
 from model_board import ModelBoard, make_bench
-from typer.testing import Result
 
 import lagbench
 from lagbench.baselines.predict import predict

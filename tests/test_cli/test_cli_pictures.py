@@ -10,8 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command_line import Result
 from conftest import SIZE, SPLIT
-from typer.testing import Result
 
 import lagbench
 from lagbench.errors import UsageError
@@ -93,31 +93,6 @@ def test_a_file_is_replaced_only_on_request(
     replaced = run(*words, *data_set, "--overwrite")
     assert replaced.exit_code == 0, replaced.output
     assert Path(name).read_bytes()[:3] in {b"\x89PN", b"GIF"}
-
-
-@pytest.mark.slow
-def test_a_sheet_may_go_to_the_home_folder(
-    run: Run,
-    generated: GenerationResult,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Shells do not expand --output=~/sheet.png."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    words = ("plot", SPLIT, "--size", SIZE, "--root", generated.root, "--sheet")
-    result = run(*words, "--output=~/sheet.png")
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_a_device_is_no_place_for_a_picture(
-    run: Run, generated: GenerationResult
-) -> None:
-    """It would be replaced by a file."""
-    file = generated.folder / "test" / "0003.nc"
-    result = run("plot", file, "-o", "/dev/null", "--overwrite")
-    assert result.exit_code == 2, result.output
-    assert Path("/dev/null").is_char_device()
 
 
 def test_two_files_become_one_film(
@@ -208,34 +183,6 @@ def test_a_file_beside_an_id_is_refused(
     assert "--scenario" in result.stderr
 
 
-def test_a_third_scenario_of_a_film_is_refused(
-    run: Run, generated: GenerationResult
-) -> None:
-    """One of the second file and --beside would be left out in silence."""
-    file = generated.folder / "test" / "0003.nc"
-    result = run("animate", file, file, "--beside", 4)
-    assert result.exit_code == 2, result.output
-    assert "--beside" in result.stderr
-
-
-def test_whole_numbers_of_numpy_name_scenarios_and_steps(
-    generated: GenerationResult, tmp_path: Path
-) -> None:
-    """A film takes every whole number for what it is."""
-    film = lagbench.animate(
-        SPLIT,
-        size=SIZE,
-        root=generated.root,
-        beside=np.int64(4),
-        every=np.array(13),
-        output=tmp_path / "film.gif",
-        quiet=True,
-    )
-    assert film.is_file()
-    with pytest.raises(UsageError):
-        lagbench.animate(SPLIT, size=SIZE, root=generated.root, output=film)
-
-
 @pytest.mark.parametrize(("option", "number"), [("--scenario", 4), ("--frame", 5)])
 def test_a_sheet_refuses_the_choice_of_one(
     option: str, number: int, run: Run, generated: GenerationResult, tmp_path: Path
@@ -247,17 +194,3 @@ def test_a_sheet_refuses_the_choice_of_one(
     assert result.exit_code == 2, result.output
     assert option in result.stderr
     assert not sheet.exists()
-
-
-def test_the_command_takes_fractions_of_pixels_per_inch_as_python_does(
-    run: Run, generated: GenerationResult, tmp_path: Path
-) -> None:
-    file = generated.folder / "test" / "0003.nc"
-    options = {"frame": 5, "kind": "speed"}
-    drawn = lagbench.plot(file, output=tmp_path / "python.png", dpi=72.5, **options)
-    typed = tmp_path / "command.png"
-    words = ("plot", file, "--frame", 5, "--kind", "speed", "-o", typed)
-    result = run(*words, "--dpi", 72.5)
-    assert result.exit_code == 0, result.output
-    assert typed.read_bytes() == drawn.read_bytes()
-    assert run(*words, "--dpi", "nan").exit_code == 2

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from command_line import Result
 from conftest import SIZE, SPLIT
 from turns import PROGRAMS
-from typer.testing import Result
 
 from lagbench.cli import demo
 from lagbench.cli.solver_bench import SolverBench

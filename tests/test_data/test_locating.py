@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import platformdirs
 import pytest
+from command_line import CliRunner
 from exchange_readers import straight_runs
 from scenario_factory import make_key
-from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.program import app

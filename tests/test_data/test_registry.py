@@ -752,7 +752,7 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
     install_waves(tmp_path, f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
-        "from lagbench.cli.program import app; app()"
+        "from lagbench.__main__ import app; app()"
     )
     command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
     done = subprocess.run(

@@ -17,15 +17,14 @@ from typing import Any
 
 import pytest
 import yaml
+from command_line import options_of
 from score_bench import ScoreBench
 from simple_models import install
 from turns import PROGRAMS
-from typer.main import get_command
 
 import lagbench
 from lagbench.baselines.predict import predict
 from lagbench.baselines.train import train
-from lagbench.cli.program import app
 from lagbench.data import registry
 from lagbench.data.yamlfile import read_yaml
 from lagbench.make.generate import GenerationResult, generate
@@ -143,7 +142,6 @@ def test_every_command_of_the_pages_exists() -> None:
     """Each `lagbench ...` line in a shell block names a command and options that it
     has.
     """
-    commands = dict(get_command(app).commands)  # type: ignore[attr-defined]
     for page in PAGES:
         shell_blocks = blocks(page.read_text(), "(?:bash|console)")
         for line in "\n".join(shell_blocks).splitlines():
@@ -151,13 +149,8 @@ def test_every_command_of_the_pages_exists() -> None:
             words = code.split()
             if not words or words[0] != "lagbench":
                 continue
-            command = commands[words[1]]
-            if hasattr(command, "commands"):
-                command = command.commands[words[2]]
-            options = {"--help"}
-            for parameter in command.loaded.params:
-                options.update(parameter.opts)
-                options.update(parameter.secondary_opts)  # as in --no-record
+            name = words[1:3] if words[1] == "leaderboard" else words[1:2]
+            options = {"--help", *options_of(*name)}
             for word in words:
                 if word.startswith("-"):
                     option, _, _ = word.partition("=")
@@ -237,13 +230,7 @@ def test_every_option_of_score_is_described() -> None:
         if line.startswith("| `"):
             _, cell, *_ = line.split("|")
             described.update(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cell))
-    score = get_command(app).commands["score"].loaded  # type: ignore[attr-defined]
-    options = set()
-    for parameter in score.params:
-        for option in parameter.opts:
-            if option.startswith("-"):
-                options.add(option)
-    assert described == options - {"--help"}
+    assert described == options_of("score")
 
 
 @pytest.fixture

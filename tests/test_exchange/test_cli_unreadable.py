@@ -12,9 +12,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_readers import straight_runs
 from exchange_writers import write_gns, write_h5
-from typer.testing import Result
 
 Run = Callable[..., Result]
 

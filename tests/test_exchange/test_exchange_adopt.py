@@ -21,11 +21,11 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_readers import straight_runs
 from file_size_limit import largest_file
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from typer.testing import Result
 
 import lagbench
 from lagbench.data.box import Box

@@ -19,9 +19,9 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
+from command_line import CliRunner
 from exchange_readers import straight_runs
 from exchange_writers import METADATA, write_gns, write_h5
-from typer.testing import CliRunner
 
 from lagbench.cli.program import app
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError

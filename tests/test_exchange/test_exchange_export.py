@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_readers import (
     Trajectory,
     frame_statistics,
@@ -26,7 +27,6 @@ from exchange_readers import (
     straight_runs,
 )
 from numpy.testing import assert_allclose, assert_array_equal
-from typer.testing import Result
 
 import lagbench
 from lagbench.data.manifest import read_manifest, write_manifest

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_readers import read_gns, read_h5, straight_runs
 from exchange_writers import SUBSETS, write_gns, write_h5
 from numpy.testing import assert_array_equal
-from typer.testing import Result
 
 import lagbench
 from lagbench.data.local import locate

@@ -10,9 +10,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_writers import SUBSETS, write_metadata
 from numpy.typing import NDArray
-from typer.testing import Result
 
 import lagbench
 from lagbench.data.local import locate

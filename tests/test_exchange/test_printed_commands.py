@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import Result
 from exchange_readers import straight_runs
-from typer.testing import Result
 
 from lagbench.baselines.catalogue import list_names
 

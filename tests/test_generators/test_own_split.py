@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import Result
 from scenario_draws import changed
-from typer.testing import Result
 
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario

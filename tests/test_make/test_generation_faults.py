@@ -192,7 +192,7 @@ def test_two_generations_at_once(
     assert result.dataset_sha256 == generated.dataset_sha256
 
 
-CALL = "from lagbench.cli.program import app; app()"
+CALL = "from lagbench.__main__ import app; app()"
 
 INTERRUPTED = f"""
 import os, signal

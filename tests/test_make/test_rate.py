@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import Result
+from command_line import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, Size, load

@@ -13,11 +13,11 @@ import h5py
 import netCDF4
 import numpy as np
 import pytest
+from command_line import CliRunner
 from conftest import SIZE, SPLIT
 from hypothesis import given
 from hypothesis import strategies as st
 from rewritten_files import forge, mend_manifest
-from typer.testing import CliRunner
 
 from lagbench.cli.program import app
 from lagbench.data.manifest import Manifest, read_manifest

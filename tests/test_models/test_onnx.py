@@ -15,6 +15,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from command_line import CliRunner
 from hostile_onnx import (
     REFUSED,
     STOPPED,
@@ -24,7 +25,6 @@ from hostile_onnx import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from lagbench.baselines.particle_grid import ParticleGrid
 from lagbench.board.check import check_board

@@ -6,21 +6,18 @@ import dataclasses
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import netCDF4
 import pytest
-import typer
+from command_line import Result
 from conftest import SIZE, SPLIT
-from typer.main import get_command
-from typer.testing import Result
 
 import lagbench
 from lagbench import submission
-from lagbench.cli.program import app
 from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring import score
@@ -185,57 +182,6 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda _: True))
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("terminal")
-def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
-    """No line is wider, with every metric and every reference too."""
-    run("score", predictions)
-    board = Path(lagbench.__file__).parents[1] / "leaderboard"
-    dataset = f"{SPLIT} --size {SIZE}"
-    for command in (
-        f"score {predictions}",
-        f"score {predictions} --all --all-references",
-        f"compare {predictions.parent} analog --all",
-        "list",
-        "info cavity",
-        f"info {dataset}",
-        f"verify {dataset}",
-        f"leaderboard show --board {board}",
-    ):
-        result = run(*command.split())
-        assert result.exit_code == 0, result.output
-        assert result.stdout
-        assert find_wide_lines(result.stdout) == [], command
-
-
-def list_commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
-    """Yield the words of every command below a group."""
-    for name, command in group.commands.items():
-        words = (*before, name)
-        if hasattr(command, "commands"):
-            yield from list_commands(command, *words)
-        else:
-            yield words
-
-
-@pytest.mark.usefixtures("terminal")
-@pytest.mark.parametrize(
-    "words",
-    [
-        (),
-        ("leaderboard",),
-        *list_commands(get_command(app)),
-    ],
-    ids=" ".join,
-)
-def test_help_fits_eighty_columns(run: Run, words: tuple[str, ...]) -> None:
-    """The help of each command, and of those above."""
-    result = run(*words, "--help")
-    assert result.exit_code == 0
-    # In help texts a colon makes no remark.
-    assert find_wide_lines(result.stdout.replace(":", ".")) == []
-
-
 def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) -> None:
     """It claims no significance, in words and as null in JSON."""
     run("score", predictions)
@@ -381,7 +327,7 @@ def test_a_reader_that_leaves_early_leaves_the_report(
     def raise_broken_pipe(*_: object, **__: object) -> None:
         raise BrokenPipeError
 
-    monkeypatch.setattr(typer, "echo", raise_broken_pipe)
+    monkeypatch.setattr("lagbench.cli.score.print_line", raise_broken_pipe)
     report = predictions.parent / "report"
     assert run("score", predictions, "--report", report).exit_code == 141
     assert (report / "index.html").is_file()

@@ -15,8 +15,8 @@ from typing import Any
 import netCDF4
 import numpy as np
 import pytest
+from command_line import Result
 from score_bench import ScoreBench, half_right, still, straight
-from typer.testing import Result
 
 from lagbench.cli import output
 from lagbench.errors import DataError, UnreadableFileError, UsageError

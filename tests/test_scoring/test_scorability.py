@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import CliRunner
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.program import app

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import CliRunner
 from conftest import SIZE, SPLIT
 from exchange_readers import straight_runs
 from faulty_server import Mirror, serving
 from numpy.testing import assert_array_equal
 from object_stores import Store, holding
-from typer.testing import CliRunner
 
 import lagbench
 from lagbench.cli.program import app

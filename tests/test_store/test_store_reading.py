@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 import xarray as xr
+from command_line import Result
 from conftest import SIZE, SPLIT
 from object_stores import Store, files, holding, machine
-from typer.testing import Result
 
 import lagbench
 from lagbench.baselines.dataset_info import read_dataset_info
