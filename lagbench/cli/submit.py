@@ -54,7 +54,7 @@ def submit_command(
         method: Name of the entry, as in my-model.
         authors: Author; repeatable.
         command: Command that makes the predictions.
-        weights: Weights or ONNX to keep beside the entry; at most one for each seed.
+        weights: Files to keep beside the entry; at most one for each seed.
         replace: Replace the entry of that name.
         add: Add seeds to the entry of that name; keep its other seeds.
         new_board: Begin a leaderboard in the folder of --board.
